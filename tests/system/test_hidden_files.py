@@ -1,30 +1,25 @@
-"""Temporary files: no process leaves any behind that the next one would not remove."""
+"""Hidden files: no process leaves any behind that stops the next one or stays after it."""
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
-import sys
-import tempfile
+from collections.abc import Callable
 from pathlib import Path
 
+import filelock
 import pytest
 
 from helpers.signals import start
-from napari_shadowinv._system import hidden_files
-from napari_shadowinv._system.hidden_files import hidden_name, locked, sweep, temporary_folder
+from napari_shadowinv._system.hidden_files import hidden_name, locked
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import check_output, replacing
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 
-
-@pytest.fixture(autouse=True)
-def unswept(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let this process look into a folder again."""
-    monkeypatch.setattr(hidden_files, "_swept", set())
-
+REFUSED = r"store is being written by another process, which holds \S+\.store\.lock: wait for"
 
 # A process started by nohup ignores SIGHUP, as do the ones it starts.
 DEFAULT_SIGNALS = """
@@ -43,14 +38,34 @@ WRITE = """
         draft.write_text("half")
         stall()
 """
-KEEP = """
-    import sys, tempfile
-    tempfile.tempdir = sys.argv[1]
-    from napari_shadowinv._system.hidden_files import temporary_folder
-    with temporary_folder("shadowinv") as folder:
-        (folder / "inner").mkdir()
+WITHOUT_LOCKS = """
+    import errno, fcntl, warnings
+    def flock(*arguments):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+    fcntl.flock = flock
+    warnings.simplefilter("ignore")
+"""
+HOLD = """
+    import sys
+    from pathlib import Path
+    from napari_shadowinv._system.hidden_files import locked
+    with locked(Path(sys.argv[1])):
         stall()
 """
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def end(process: subprocess.Popen[str]) -> None:
+    process.kill()
+    process.wait()
+
+
+def check_refused(path: Path, words: str = REFUSED) -> None:
+    with pytest.raises(FileFormatError, match=words), locked(path):
+        pass
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -58,7 +73,7 @@ def test_signal_while_writing_leaves_nothing(tmp_path: Path, number: int) -> Non
     process = start(DEFAULT_SIGNALS + WRITE, tmp_path / "a.tif")
     process.send_signal(number)
     assert process.wait(60) == 128 + number
-    assert list(tmp_path.iterdir()) == []
+    assert names_in(tmp_path) == []
 
 
 def test_ignored_signal_does_not_stop_writing(tmp_path: Path) -> None:
@@ -68,39 +83,87 @@ def test_ignored_signal_does_not_stop_writing(tmp_path: Path) -> None:
     assert (tmp_path / "a.tif").read_text() == "half"
 
 
-@pytest.mark.parametrize("body", [WRITE, KEEP])
-def test_litter_of_a_killed_process_is_swept(tmp_path: Path, body: str) -> None:
-    process = start(body, tmp_path / "a.tif" if body is WRITE else tmp_path)
-    (litter,) = tmp_path.iterdir()
-    sweep(tmp_path)
-    assert litter.exists()
-    process.kill()
-    process.wait()
-    hidden_files._swept.clear()
-    with replacing(tmp_path / "b.tif") as draft:
+@pytest.mark.parametrize("name", ["a.tif", "n" * 251 + ".tif"])
+def test_who_writes_a_file_next_removes_what_a_killed_process_left(
+    tmp_path: Path, name: str
+) -> None:
+    process = start(WRITE, tmp_path / name)
+    with (
+        pytest.raises(FileFormatError, match="is being written by another process"),
+        replacing(tmp_path / name),
+    ):
+        pass
+    end(process)
+    assert len(names_in(tmp_path)) == 2
+    with replacing(tmp_path / name) as draft:
+        assert not draft.exists()
         draft.write_text("all")
-    assert [path.name for path in tmp_path.iterdir()] == ["b.tif"]
+    assert names_in(tmp_path) == [name]
+    assert (tmp_path / name).read_text() == "all"
+
+
+@pytest.mark.parametrize("preamble", ["", WITHOUT_LOCKS])
+def test_lock_of_a_killed_process_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preamble: str
+) -> None:
+    if preamble:
+        without_locks(monkeypatch, errno.ENOSYS)
+    process = start(preamble + HOLD, tmp_path / "store")
+    check_refused(tmp_path / "store")
+    end(process)
+    with locked(tmp_path / "store"):
+        assert names_in(tmp_path) == [".store.lock"]
+    assert names_in(tmp_path) == []
+
+
+def without_locks(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    def flock(*arguments: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("fcntl.flock", flock)
+
+
+def test_file_system_that_refuses_a_lock_is_named_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_locks(monkeypatch, errno.ENOLCK)
+    check_refused(tmp_path / "store", r"\.store\.lock cannot be locked \(No locks available\)")
+
+
+def test_one_process_cannot_take_a_lock_twice(tmp_path: Path) -> None:
+    with locked(tmp_path / "store"):
+        check_refused(tmp_path / "store")
+    with locked(tmp_path / "store"):
+        check_refused(tmp_path / "store")
+
+
+def test_links_are_not_followed(tmp_path: Path) -> None:
+    lock, theirs = tmp_path / ".store.lock", tmp_path / "theirs"
+    theirs.write_text("theirs")
+    lock.hardlink_to(theirs)
+    with locked(tmp_path / "store"):
+        pass
+    assert theirs.read_text() == "theirs"
+    for target in (theirs, tmp_path / "nowhere"):
+        lock.symlink_to(target)
+        check_refused(tmp_path / "store", r"\.store\.lock cannot be locked .*: remove that file")
+        lock.unlink()
+    assert names_in(tmp_path) == ["theirs"]
+    assert theirs.read_text() == "theirs"
 
 
 @pytest.mark.parametrize(
     ("holder", "step"),
-    [
-        (hidden_files, "_open_lock"),
-        (hidden_files, "_try_lock"),
-        (hidden_files, "_write_owner"),
-        (Path, "unlink"),
-    ],
+    [(filelock.FileLock, "acquire"), (filelock.FileLock, "release"), (os, "unlink")],
 )
 @pytest.mark.usefixtures("usual_ctrl_c")
 def test_lock_is_removed_whenever_a_signal_comes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, holder: object, step: str
 ) -> None:
-    work = getattr(holder, step)
+    work: Callable[..., object] = getattr(holder, step)
 
     def interrupted(*arguments: object) -> object:
-        if step == "unlink":
-            signal.raise_signal(signal.SIGINT)
-            return work(*arguments)
+        signal.raise_signal(signal.SIGINT)
         result = work(*arguments)
         signal.raise_signal(signal.SIGINT)
         return result
@@ -108,60 +171,23 @@ def test_lock_is_removed_whenever_a_signal_comes(
     monkeypatch.setattr(holder, step, interrupted)
     with pytest.raises(KeyboardInterrupt), locked(tmp_path / "a.shadowinv.zarr"):
         pass
-    assert list(tmp_path.iterdir()) == []
-
-
-def dead_process() -> int:
-    process = subprocess.Popen([sys.executable, "-c", ""])
-    process.wait()
-    return process.pid
-
-
-def test_sweep_keeps_files_of_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pid, owner, start_code = dead_process(), hidden_files._owner(), "abcd"
-    names = [
-        f".a-{owner}-{os.getpid()}-{hidden_files._start_of(os.getpid())}-01234567.tif",
-        f".a-{'0' * 8}-{pid}-{start_code}-01234567.tif",
-        f"a-{owner}-{pid}-{start_code}-01234567.tif",
-        ".a-01234567.tif",
-        ".hidden",
-    ]
-    for name in names:
-        (tmp_path / name).write_text("theirs")
-    ours = tmp_path / f".a-{owner}-{pid}-{start_code}-01234567.tif"
-    ours.write_text("ours")
-    sweep(tmp_path)
-    assert not ours.exists()
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(names)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports starts of processes")
-def test_number_of_a_process_may_be_used_again(tmp_path: Path) -> None:
-    owner = hidden_files._owner()
-    stale = tmp_path / f".a-{owner}-{os.getpid()}-ffff-01234567"
-    stale.mkdir()
-    (stale / "file").touch()
-    sweep(tmp_path)
-    assert not stale.exists()
-
-
-def test_link_is_removed_and_not_followed(tmp_path: Path) -> None:
-    target = tmp_path / "target"
-    target.mkdir()
-    (target / "file").touch()
-    link = tmp_path / f".a-{hidden_files._owner()}-{dead_process()}-abcd-01234567"
-    link.symlink_to(target)
-    sweep(tmp_path)
-    assert not os.path.lexists(link)
-    assert (target / "file").exists()
+    monkeypatch.undo()
+    assert names_in(tmp_path) == []
+    with locked(tmp_path / "a.shadowinv.zarr"):
+        pass
 
 
 @pytest.mark.parametrize("name", ["a" * 251 + ".tif", "ä" * 125 + ".tif", "x.shadowinv.zarr"])
 def test_hidden_name_fits_the_file_system(tmp_path: Path, name: str) -> None:
-    hidden = hidden_name(tmp_path / name, Path(name).suffix)
+    hidden = hidden_name(tmp_path / name, f".part{Path(name).suffix}")
     assert len(os.fsencode(hidden.name)) <= 255
     assert hidden.suffix == Path(name).suffix
     hidden.touch()
+
+
+def test_long_names_that_begin_alike_have_different_hidden_names(tmp_path: Path) -> None:
+    first, second = (hidden_name(tmp_path / ("n" * 250 + end), ".lock") for end in "ab")
+    assert first != second
 
 
 def test_long_name_is_written_and_one_too_long_refused(tmp_path: Path) -> None:
@@ -171,10 +197,3 @@ def test_long_name_is_written_and_one_too_long_refused(tmp_path: Path) -> None:
     assert path.read_text() == "all"
     with pytest.raises(FileFormatError, match="its name has 256 bytes, expected at most 255"):
         check_output(tmp_path / ("n" * 252 + ".txt"))
-
-
-def test_temporary_folder_ends_with_its_block(monkeypatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    with temporary_folder("shadowinv") as folder:
-        assert folder.parent == tmp_path
-    assert list(tmp_path.iterdir()) == []

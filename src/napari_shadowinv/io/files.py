@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES, hidden_name, sweep
+from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES, hidden_name, locked
 from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.safety import check_regular
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -196,7 +196,8 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     Raises
     ------
     FileFormatError
-        As `check_output`, before the block and again after it; and if there is no room.
+        As `check_output`, before the block and again after it; if another process is writing the
+        file; and if there is no room.
 
     Examples
     --------
@@ -208,10 +209,10 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     'done'
     """
     path = check_output(path, overwrite)
-    sweep(path.parent)
-    temporary = hidden_name(path, path.suffix)
-    with clear_up_when_terminated():
+    temporary = hidden_name(path, f".part{path.suffix}")
+    with clear_up_when_terminated(), locked(path):
         try:
+            temporary.unlink(missing_ok=True)  # left by a killed process
             yield temporary
             # Someone else may have written the file during the work.
             check_output(path, overwrite)

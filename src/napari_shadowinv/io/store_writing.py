@@ -28,7 +28,7 @@ import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from napari_shadowinv._system.hidden_files import hidden_name, sweep
+from napari_shadowinv._system.hidden_files import hidden_name
 from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -258,17 +258,20 @@ class Contents:
 
 
 def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
-    """Create a store with all its shots pending; it appears completely or not at all."""
+    """Create a store with all its shots pending; it appears completely or not at all.
+
+    The run must hold the store's lock.
+    """
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
-    sweep(path.parent)
-    new = hidden_name(path)
+    new, old = hidden_name(path, ".new"), hidden_name(path, ".old")
+    for left in (new, old):  # by a killed process
+        shutil.rmtree(left, ignore_errors=True)
     try:
         with _as_store_errors(path):
             # Zarr writes in a thread of its own, which would go on behind our back.
             with defer_interrupts():
                 _write_template(new, contents)
-            old = hidden_name(path)
             if path.exists():
                 os.replace(path, old)
             os.replace(new, path)

@@ -19,9 +19,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from importlib import import_module
 from multiprocessing import resource_tracker
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._system.machine import available_threads, defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
@@ -43,7 +43,7 @@ def local_client(count: int) -> Iterator[Any]:
         if os.environ.get(_TRIMMING) == str(environment.get(_TRIMMING)):
             opened.callback(os.environ.setdefault, _TRIMMING, os.environ.pop(_TRIMMING))
         # Data spilled to disk when memory is short could be exchanged for code.
-        spill_folder = str(opened.enter_context(temporary_folder("shadowinv")))
+        spill_folder = opened.enter_context(TemporaryDirectory(prefix="shadowinv-"))
         opened.enter_context(dask.config.set({"temporary-directory": spill_folder}))
         # A partly started cluster cannot be closed.
         with defer_interrupts(), _hidden_from_workers():

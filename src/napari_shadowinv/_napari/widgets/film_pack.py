@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from functools import lru_cache, partial
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,6 @@ from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, mask_of, new_shapes
 from napari_shadowinv._napari.widgets._results import ResultLayers
-from napari_shadowinv._system.hidden_files import temporary_folder
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.pack import FILM_TYPES
@@ -286,9 +285,9 @@ class FilmPack(panels.ToolPanel):
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Compute dose and fluence of each film of the pack."
         super().__init__(napari_viewer, "film-pack", panels.RunPanel("Film pack", "Run", tip))
-        resources = ExitStack()
-        self._scratch = resources.enter_context(temporary_folder("film-pack"))
-        qt.when_destroyed(self, resources.close)
+        scratch = TemporaryDirectory(prefix="film-pack-")
+        qt.when_destroyed(self, scratch.cleanup)
+        self._scratch = Path(scratch.name)
         self._folders = count(1)
         self.fit_images = ResultLayers(self.viewer, self)
         self._build()
