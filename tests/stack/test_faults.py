@@ -451,3 +451,17 @@ def test_the_disk_full_while_writing(make_night, small_disk):
 
 def shot_of(name: str) -> int:
     return int(Path(name).parts[2])
+
+
+def test_the_next_run_removes_the_hidden_files_of_killed_ones(night, out):
+    for ending in ("new", "old"):
+        left = out.with_name(f".{out.name}.{ending}")
+        left.mkdir()
+        (left / "zarr.json").write_text("half")
+    out.with_name(f".{out.name}.lock").touch()
+    night.run(out)
+    assert not list(out.parent.glob(".*"))
+    for ending in ("lock", "part.json"):
+        (out / f".zarr.json.{ending}").write_text("half")
+    assert (night.run(out).status == DONE).all()
+    assert not list(out.rglob(".*"))

@@ -282,14 +282,14 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
 
 
 def remove_unfinished(path: Path) -> None:
-    """Remove the halves of chunks that killed processes left in a store.
+    """Remove the halves of chunks and of its description that killed processes left in a store.
 
     The run must hold the store's lock. A worker of an earlier run that still writes loses its
     chunk, and its shot stays pending.
     """
     for folder, _, names in os.walk(path):
         for name in names:
-            if name.endswith(".partial"):
+            if name.endswith(".partial") or name.startswith(".zarr.json."):
                 Path(folder, name).unlink(missing_ok=True)
 
 
