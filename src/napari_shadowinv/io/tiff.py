@@ -295,7 +295,7 @@ def _missing_pixels(tiff: Any, page: Any, array: AnyArray) -> BoolArray:
     except ValueError:
         fill = math.nan
     is_fill = np.equal(array, np.float32(fill) if array.dtype == np.float32 else fill)
-    missing: BoolArray = is_fill if array.ndim == 2 else is_fill.all(axis=-1)
+    missing: BoolArray = np.asarray(is_fill if array.ndim == 2 else is_fill.all(axis=-1))
     if array.ndim == 3 and _without_alpha(page, array) is not array:
         missing |= array[..., -1] == 0
     return missing
