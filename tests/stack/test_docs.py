@@ -26,6 +26,7 @@ def folder(night, tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
     for index, image in enumerate(night.images):
         tifffile.imwrite(f"shots/shot_{index}.tif", image.astype("float32"))
+        Path(f"shots/shot_{index}.npy").unlink()  # a watch takes one kind
     tifffile.imwrite("reference.tif", night.source.astype("float32"))
     return tmp_path
 

@@ -1,4 +1,4 @@
-"""What HDF5 files say about the values of their images.
+"""Conventions of HDF5 files for the values of images.
 
 - values without packing: `decode_values`; an image with its mask, notes and pixel size:
   `read_meaning`

@@ -223,7 +223,7 @@ class Watch:
         """Count the files that are no shots in a sentence."""
         self._left_out = self._arrivals.left_out
         counts = counts_text(self._left_out) or "none"
-        self.report(note=f"Left out: {counts}; choose others by a pattern of names (--pattern)")
+        self.report(note=f"Left out: {counts}; choose others by a pattern of names")
 
     def _is_over(self) -> bool:
         idle, most = self._options.idle, self._options.max_shots
