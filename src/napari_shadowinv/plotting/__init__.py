@@ -6,6 +6,7 @@
 - tests of one static field: `left_out_figure`, `windows_figure`
 - planned experiments: `plan_figure`, `sweep_figure`
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
+- a style of their own, whatever a user's matplotlibrc says: `own_style`
 - a stack as a movie: `write_film`
 
 The figures use matplotlib's objects and no pyplot, so they neither need a window nor
@@ -15,6 +16,7 @@ disturb the figures of a notebook.
 from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure, windows_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
+from napari_shadowinv.plotting._panels import own_style
 from napari_shadowinv.plotting._plan_figure import plan_figure, sweep_figure
 from napari_shadowinv.plotting._product_figure import make_logarithmic, products_figure
 from napari_shadowinv.plotting.figures import (
@@ -30,6 +32,7 @@ __all__ = [
     "in_few_colours",
     "left_out_figure",
     "make_logarithmic",
+    "own_style",
     "pack_figure",
     "plan_figure",
     "products_figure",

@@ -135,13 +135,13 @@ def panel_size(shape: Sequence[int]) -> tuple[float, float]:
 
 
 @contextmanager
-def own_style() -> Iterator[None]:
+def own_style(style: Any = _STYLE) -> Iterator[None]:
     """Draw, or save, in the style of all pages, whatever the user's matplotlibrc says."""
     from matplotlib import rc_context, rcdefaults, rcParams
 
     with rc_context():
         rcdefaults()
-        rcParams.update(_STYLE)
+        rcParams.update(style)
         yield
 
 

@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib import rc_context
+from matplotlib.text import Text
 from qtpy.QtWidgets import QFileDialog, QLabel
 
 from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_inversion
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, ModelPicker
+from napari_shadowinv._napari.widgets._qt import Plot
 from napari_shadowinv.analysis.paths import measure_peak
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.beam import displacement_from_potential
@@ -348,6 +351,18 @@ def test_a_profile_has_true_units_on_both_axes(profile: Any, qtbot: Any) -> None
     axes = profile.plot.figure.axes
     assert {axis.get_ylabel() for axis in axes} == {"nm", "T"}
     assert axes[-1].get_xlabel() == "distance (µm)"
+
+
+def test_a_plot_ignores_the_settings_of_other_figures(qtbot: Any) -> None:
+    plot = Plot(200)
+    qtbot.addWidget(plot)
+    with rc_context({"text.usetex": True}):
+        (axis,) = plot.fresh_axes()
+        axis.plot([0, 1], [0, 1], label="a_b")
+        axis.set_xlabel("50 % of a_b")  # no text that TeX takes
+        plot.add_legend(axis)
+        plot.figure.canvas.draw()
+    assert not any(text.get_usetex() for text in plot.figure.findobj(Text))
 
 
 def test_measures_of_a_gaussian_are_those_of_its_formula() -> None:

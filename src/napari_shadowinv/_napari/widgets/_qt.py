@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from itertools import groupby
 from typing import Any, TypeVar
 
@@ -255,6 +255,13 @@ def _settings() -> QSettings:
     )
 
 
+def _plain_style() -> AbstractContextManager[None]:
+    """Draw in matplotlib's own style, whatever the user's matplotlibrc says."""
+    from napari_shadowinv.plotting import own_style
+
+    return own_style({})
+
+
 class Plot(QWidget):
     """A figure, created at the first drawing."""
 
@@ -274,7 +281,8 @@ class Plot(QWidget):
         self.ink, self.paper = self._colours()
         self.figure.clear()
         self.figure.set_facecolor(self.paper)
-        axes = list(self.figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
+        with _plain_style():
+            axes = list(self.figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
         for axis in axes:
             axis.set_facecolor(self.paper)
             axis.tick_params(colors=self.ink, which="both", labelsize=8)
@@ -285,7 +293,8 @@ class Plot(QWidget):
 
     def add_legend(self, holder: Any, size: int = 8, **keywords: Any) -> None:
         colours = {"labelcolor": self.ink, "facecolor": self.paper, "edgecolor": self.ink}
-        holder.legend(fontsize=size, **colours, **keywords)
+        with _plain_style():
+            holder.legend(fontsize=size, **colours, **keywords)
 
     def draw(self) -> None:
         self._canvas.draw_idle()
@@ -295,10 +304,17 @@ class Plot(QWidget):
         from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
         from matplotlib.figure import Figure
 
-        self.figure = Figure(layout="constrained")
         # matplotlib's class is untyped.
-        canvas: Any = FigureCanvasQTAgg
-        self._canvas = canvas(self.figure)
+        untyped: Any = FigureCanvasQTAgg
+
+        class Canvas(untyped):
+            def draw(self) -> None:
+                with _plain_style():  # also of labels that are made when they are drawn
+                    super().draw()
+
+        with _plain_style():
+            self.figure = Figure(layout="constrained")
+            self._canvas = Canvas(self.figure)
         self._canvas.setMinimumSize(100, 100)
         self.layout().addWidget(self._canvas)
 
