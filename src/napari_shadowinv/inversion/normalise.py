@@ -130,7 +130,7 @@ def mask_unlit(
     if any(plane.shape != shot.shape for plane in planes.values()):
         return lit, []  # refused later, as are values that are not finite
     values = {name: np.where(usable, plane, 0.0) for name, plane in planes.items()}
-    if not all(np.abs(plane).max() < _BRIGHTEST for plane in values.values()):
+    if not all(float(np.abs(plane).max()) < _BRIGHTEST for plane in values.values()):
         return lit, []
     cautions = []
     for name, plane in values.items():
