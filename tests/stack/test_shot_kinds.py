@@ -12,7 +12,16 @@ import tifffile
 import xarray as xr
 import zarr
 
-from napari_shadowinv import invert_stack, read, run_stack, synthetic_image
+from napari_shadowinv import (
+    InversionOptions,
+    Recipe,
+    RunOptions,
+    invert,
+    invert_stack,
+    read,
+    run_stack,
+    synthetic_image,
+)
 from napari_shadowinv.io.store import DONE
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.stack._shots import find_shots
@@ -111,3 +120,25 @@ def test_slice_of_shots_holds_its_shots(kind, images, tmp_path):
     assert len(part) == 2
     for shot, image in zip(part, images[1:3], strict=True):
         np.testing.assert_array_equal(shot.images.read()[0], image)
+
+
+def test_each_shot_has_the_mask_of_its_own_file(images: np.ndarray, tmp_path: Path) -> None:
+    shots = images.copy()
+    for index, path in enumerate(write_files(shots, tmp_path)):
+        shots[index, : index + 1] = -9999  # no light: the file says that it is no value
+        tifffile.imwrite(path, shots[index], extratags=[(42113, "s", 0, "-9999", True)])
+    options = InversionOptions(n_sites=150)
+    run_stack(
+        str(tmp_path / "shot_*.tif"),
+        tmp_path / "a.shadowinv.zarr",
+        Recipe(options=options),
+        run=RunOptions(variables=("potential", "mask"), dtype="float64"),
+    )
+    stored = read(tmp_path / "a.shadowinv.zarr")
+    for index, image in enumerate(images):
+        usable = np.ones(SHAPE, bool)
+        usable[: index + 1] = False
+        alone = invert(image, mask=usable, options=options)
+        np.testing.assert_array_equal(stored["mask"][index], usable)
+        potential = alone.potential - stored["potential"][index].values
+        assert np.ptp(potential[usable]) < 1e-3 * np.ptp(alone.potential)

@@ -20,7 +20,7 @@ class _StoreOptions(CheckedModel, allow_inf_nan=False):
     variables: tuple[str, ...] | None = Field(
         default=None,
         description="Variables to store; on the command line, separated by commas. Default: "
-        "potential, displacement and caustic, at a million pixels 13 MB per shot before "
+        "potential, displacement, caustic and mask, at a million pixels 14 MB per shot before "
         "compression; of a fit, potential, displacement and its error bars.",
         json_schema_extra={"metavar": "NAMES"},
     )

@@ -59,7 +59,6 @@ from napari_shadowinv.stack._shots import (
     find_shots,
     find_source,
     first_image,
-    first_mask,
     read_shot,
     reader_text,
     table_shots,
@@ -81,7 +80,7 @@ MAX_TRIED_SHOTS = 10  # at the beginning of a stack
 _DECIDING_SHOTS = 3
 
 # Variables that are stored of an inversion, and of a fit, by default.
-STORED = ("potential", "displacement", "caustic")
+STORED = ("potential", "displacement", "caustic", "mask")
 FITTED = ("potential", "displacement", "displacement_uncertainty")
 
 
@@ -171,9 +170,7 @@ class Stack:
         """Return whether all shots share a variable, which is stored once."""
         if self.beam is None or self.task.by_row:
             return False
-        return name in ("sites", "site_mass", "mask") or (
-            name == "source" and self.beam.source is not None
-        )
+        return name in ("sites", "site_mass") or (name == "source" and self.beam.source is not None)
 
     @property
     def shot_task(self) -> AnyTask:
@@ -381,18 +378,17 @@ def _describe_inputs(
         stack_shots = find_shots(shots, reader=reader, shape=image_shape)
     if sources is not None:
         check_shape("source", sources.shape, stack_shots.shape, "shots")
-    mask = join_masks(mask, lit)
+    mask = join_masks(mask, stack_shots.mask, lit)
     usable = None if mask is None else check_mask(mask, stack_shots.shape)
     bare = None if source_mask is None else check_mask(source_mask, stack_shots.shape)
     if recipe.setup is not None:
         check_spacing(shots, "shots", recipe.setup.pixel_sizes)
     if recipe.fit is None and not recipe.steps:
         check_memory(stack_shots.shape, bytes_per_pixel(recipe.options), "an inversion")
-    blank, lit = np.ones(stack_shots.shape), stack_shots.mask
-    shot = Radiograph(blank if lit is None else np.where(lit, blank, np.nan), mask=lit)
+    blank = np.ones(stack_shots.shape)
     inputs = collect_inputs(
         recipe.model_copy(update={"source": recipe.estimate}),
-        shot,
+        Radiograph(blank),
         source=None if sources is None else blank,
         mask=usable,
         source_mask=bare,
@@ -446,8 +442,7 @@ def _describe_table(
         image = first_image(items)
         assert isinstance(image.image, Radiograph)
         return Shots(items, image.image.shape), image.setup
-    shots = Shots(items, shape or usual_shape(items), mask=first_mask(items))
-    return shots, _row_of(items[0]).setup
+    return Shots(items, shape or usual_shape(items)), _row_of(items[0]).setup
 
 
 def _shared_beam(inputs: Inputs, source: AnyArray | None) -> Beam | None:
@@ -512,7 +507,6 @@ def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
     return {
         "sites": level.sites - plan.margin_width,
         "site_mass": level.mass * plan.unit,
-        "mask": np.ones(beam.shape, bool) if beam.mask is None else beam.mask,
         "source": None if beam.source is None else check_source(beam.source, beam.mask),
     }
 

@@ -216,7 +216,7 @@ def run_stack(
     """
     path = check_store_path(out)
     run = as_model(RunOptions, run, "run")
-    variables = stored_variables(run.variables, recipe, mask)
+    variables = stored_variables(run.variables, recipe)
     stack = describe_stack(
         shots, recipe, source, mask, source_mask, reader, variables, run.warm_start
     )
@@ -262,16 +262,12 @@ def run_stack(
 
 
 def stored_variables(
-    variables: Collection[str] | None, recipe: Recipe | None, mask: ArrayLike | None
+    variables: Collection[str] | None, recipe: Recipe | None
 ) -> Collection[str] | None:
     """Return the variables to store; None for the defaults of a fit."""
     check_instance(recipe, Recipe, "recipe")
     is_fit = recipe is not None and recipe.fit is not None
-    if variables is not None or is_fit:
-        return variables
-    # Without it, fields under a mask would count as data.
-    has_mask = mask is not None or (recipe is not None and recipe.mask is not None)
-    return (*STORED, "mask") if has_mask else STORED
+    return STORED if variables is None and not is_fit else variables
 
 
 class _Run:

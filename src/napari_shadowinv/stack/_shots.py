@@ -13,7 +13,6 @@ import inspect
 import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -25,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import PLANE, join_masks, unpack_array, unpack_planes
 from napari_shadowinv._system.validation import map_paths
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.fitting import FitShot
@@ -63,10 +62,6 @@ class ImageReference:
     def shape(self) -> tuple[int, ...]:
         """Return the shape of the image, which has to be read."""
         return np.shape(self.read()[0])
-
-    def mask(self) -> BoolArray | None:
-        """Return the pixels that can be used, if the image's file says so."""
-        return None
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Return whether the image still agrees with the metadata from `load`."""
@@ -121,24 +116,25 @@ class FileReference(ImageReference):
         part = (self.page, self.variable)
         return (str(self.path), normalize_token(self.reader), *part, *file_stamp.values())
 
+    def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
+        values, usable, metadata = self._read_masked()
+        return (FitShot(Radiograph(values, mask=usable)),), metadata
+
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
+        values, _, metadata = self._read_masked()
+        return values, metadata
+
+    def _read_masked(self) -> tuple[AnyArray, BoolArray | None, dict[str, Any]]:
         parts = {"page": self.page, "variable": self.variable}
         options: dict[str, Any] = {name: part for name, part in parts.items() if part is not None}
         warnings: list[Caution] = []
         if "warnings" in inspect.signature(self.reader).parameters:
             options["warnings"] = warnings
-        image = _plain_image(self.reader(self.path, **options))
+        image, usable = unpack_array(self.reader(self.path, **options), "the shot")
         metadata: dict[str, Any] = {"warnings": warnings} if warnings else {}
         if self.page is not None:
-            return image, {"sha256": checksum(image), **metadata}
-        return image, {**stamp(self.path), "sha256": sha256(self.path), **metadata}
-
-    def mask(self) -> BoolArray | None:
-        is_ours = getattr(self.reader, "func", self.reader) is read_shot
-        if not is_ours or format_of(self.path) is not HDF5:
-            return None
-        variable = self.variable or getattr(self.reader, "keywords", {}).get("variable")
-        return read_frame(Frame(self.path, "", self.page, variable)).mask
+            return image, usable, {"sha256": checksum(image), **metadata}
+        return image, usable, {**stamp(self.path), "sha256": sha256(self.path), **metadata}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare a file as in a table's rows, and a page by its checksum."""
@@ -189,13 +185,7 @@ class RowsReference(ImageReference):
         return (replace(image, setup=self.setup),), metadata
 
     def shape(self) -> tuple[int, ...]:
-        return self._first().shape
-
-    def mask(self) -> BoolArray | None:
-        return self._first().mask if format_of(self.rows[0].file) is HDF5 else None
-
-    def _first(self) -> Radiograph:
-        return read_part(self.rows[0].file, self.channel, self.variable)
+        return read_part(self.rows[0].file, self.channel, self.variable).shape
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare the rows, and existing files by size and time or checksum."""
@@ -279,7 +269,7 @@ def read_shot(
     channel: str | int | None = None,
     variable: str | None = None,
     warnings: list[Caution] | None = None,
-) -> FloatArray:
+) -> ArrayLike:
     """Read the image of a shot; this is the default reader.
 
     Parameters
@@ -293,25 +283,20 @@ def read_shot(
 
     Returns
     -------
-    ndarray, shape (H, W)
+    ndarray or MaskedArray, shape (H, W)
+        Masked where the file says that pixels do not count.
     """
     shot = read_frame(Frame(path, str(path), page, variable), channel=channel)
     if warnings is not None:
         warnings.extend(file_doubts(shot))
-    return shot.image
+    return shot.image if shot.mask is None else np.ma.MaskedArray(shot.image, ~shot.mask)
 
 
 def file_doubts(shot: Radiograph) -> list[Caution]:
     """Return the reasons to doubt the image of a file in a stack."""
-    ignored = ["source"] if shot.source is not None else []
-    if shot.mask is not None and np.isfinite(shot.image).all():  # else the stack has the mask, too
-        ignored.append("mask")
-    if not ignored:
+    if shot.source is None:
         return list(shot.warnings)
-    text = (
-        f"the file contains its own {' and '.join(ignored)}, which a stack ignores: pass one for "
-        "the whole stack"
-    )
+    text = "the file contains its own source, which a stack ignores: pass one for the whole stack"
     return [*shot.warnings, Caution("file", text)]
 
 
@@ -349,7 +334,7 @@ class Shots:
     shape: tuple[int, int]  # that they should have
     coordinate: Any = None  # values of the coordinate ``shot`` of an xarray object
     array: Any = None  # the same images as one dask array, chunks of one shot, if they came so
-    mask: BoolArray | None = None  # pixels that can be used, by masked arrays or the first file
+    mask: BoolArray | None = None  # pixels that can be used, if they came as masked arrays
 
     def __len__(self) -> int:
         return len(self.items)
@@ -379,15 +364,15 @@ def find_shots(
 ) -> Shots:
     """Return references to the shots of an array, of files or of a list."""
     if isinstance(shots, Shots):
-        return replace(shots, shape=shape or usual_shape(shots.items), mask=first_mask(shots.items))
+        return replace(shots, shape=shape or usual_shape(shots.items))
     if isinstance(shots, (str, Path)):
         items = _shots_at(str(shots), reader)
-        return Shots(items, shape or usual_shape(items), mask=first_mask(items))
+        return Shots(items, shape or usual_shape(items))
     if hasattr(shots, "dims") and hasattr(shots, "coords"):
         return _from_xarray(shots)
     if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
         items = _shots_of_files(shots, reader)
-        return Shots(items, shape or usual_shape(items), mask=first_mask(items))
+        return Shots(items, shape or usual_shape(items))
     if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
         shapes = {np.shape(item) for item in shots}
         if len(shapes) > 1:
@@ -462,13 +447,6 @@ def usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
     if len(usual) != 2:
         raise InputError(f"shots have shape {usual}, expected (y, x): choose one channel or plane")
     return usual[0], usual[1]
-
-
-def first_mask(items: Sequence[Shot]) -> BoolArray | None:
-    """Return the mask in the file of the first shot that can be read, None without one."""
-    with suppress(FileFormatError):
-        return _read_first(items, lambda shot: shot.images.mask(), 1)[0]
-    return None
 
 
 def _read_first(items: Sequence[Shot], read: Callable[[Shot], Value], count: int) -> list[Value]:

@@ -232,7 +232,8 @@ class InvertTask(Task):
             inputs = self._inputs_of_row(image, image.image, beam, source)
         else:
             values = np.asarray(image.image.image, dtype=np.float64)
-            shot = replace(self.inputs.shot, image=values, source=source)
+            usable = join_masks(self.inputs.shot.mask, image.image.mask)
+            shot = replace(self.inputs.shot, image=values, source=source, mask=usable)
             inputs = replace(self.inputs, shot=shot)
         recipe = inputs.recipe
         ready = recipe.prepare(inputs.shot, should_stop)
@@ -266,8 +267,7 @@ class InvertTask(Task):
             image.image / (row.brightness or 1.0),
             path=image.path,
             metadata=image.metadata,
-            # The beam of all has the mask of all.
-            mask=None if row.mask is None else image.mask,
+            mask=image.mask,
         )
         # A common source is already in the beam.
         recipe_source = self.estimate if beam is None else common.recipe.source

@@ -485,7 +485,7 @@ def watch_stack(
     watch = as_model(WatchOptions, watch, "watch")
     place = checked_folder(folder, watch.pattern)
     path = check_store_path(out)
-    variables = stored_variables(watch.variables, recipe, mask)
+    variables = stored_variables(watch.variables, recipe)
 
     def describe(arrived: Shots) -> Stack:
         return describe_stack(arrived, recipe, source, mask, source_mask, reader, variables)
