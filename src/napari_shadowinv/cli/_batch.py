@@ -125,10 +125,10 @@ def run_batch(
             ("written", str(store.path)),
         ]
         say(two_columns("Batch", rows))
-    _exit_unless_reliable(store)
+    exit_unless_reliable(store)
 
 
-def _exit_unless_reliable(store: StackStore) -> None:
+def exit_unless_reliable(store: StackStore) -> None:
     """Exit with an error code if a shot is not done, or its result is not reliable.
 
     Shots that were skipped on purpose do not count.
@@ -494,6 +494,6 @@ def run_watch(
     if not quiet:
         say(text)
     if done:
-        _exit_unless_reliable(StackStore(out))
+        exit_unless_reliable(StackStore(out))
     elif failed:
         raise typer.Exit(EXIT_FAILED_SHOTS)
