@@ -205,7 +205,7 @@ def test_the_newest_packages_are_tested_every_night() -> None:
 def test_the_containers_are_built_and_run_as_the_documentation_says() -> None:
     runs = "\n".join(step.get("run", "") for step in steps_of("containers"))
     page = (ROOT / "docs" / "batch.md").read_text("utf-8")
-    (section,) = re.findall(r"### In a container\n(.*?)\n### ", page, re.DOTALL)
+    (section,) = re.findall(r"### In a container\n(.*?)\n##", page, re.DOTALL)
     commands = re.findall(r"^    (.*)$", section, re.MULTILINE)
     assert len(commands) == 4
     for command in commands:

@@ -133,7 +133,7 @@ def _picture_html(plane: FloatArray) -> str:
     stops = np.linspace(0, 1, len(_COLOURS))
     channels = [np.interp(share, stops, channel) for channel in zip(*_COLOURS, strict=True)]
     pixels = np.stack([*channels, 255.0 * is_shown], axis=-1).astype(np.uint8)
-    data = base64.b64encode(iio.imwrite("<bytes>", pixels, extension=".png")).decode()
+    data = base64.b64encode(iio.imwrite("<bytes>", pixels, plugin="pillow", format="PNG")).decode()
     return f'<img src="data:image/png;base64,{data}" width="{_PICTURE_PX}">'
 
 

@@ -631,8 +631,8 @@ def test_variables_of_matlab_and_hdf5(folder: Path, refused: Callable[..., None]
     with h5py.File("shots.h5", "w") as file:
         file.update({"day/shot": image, "day/beam": source, "day/d": BLOB.displacement})
     expected = invert(image, source=source).displacement
-    for name, group in (("shots.mat", ""), ("shots.h5", "day/")):
-        refused("invert", name, "--overwrite", names=(name, "variable", f"{group}shot"))
+    for name, group, remedy in (("shots.mat", "", "variable"), ("shots.h5", "day/", "::/name")):
+        refused("invert", name, "--overwrite", names=(name, remedy, f"{group}shot"))
         refused("info", name, "--variable", "shop", names=(name, "'shop'", f"{group}beam"))
         arguments = ["--variable", f"{group}shot", "--source-variable", f"{group}beam"]
         result = shadowinv("invert", name, *arguments, "--overwrite")

@@ -66,7 +66,7 @@ def nearly_all_masked() -> FloatArray:
     ("changes", "sentence"),
     [
         ({"images": [[1, 2], [3]]}, "images are no stack of numbers: expected planes"),
-        ({"images": "film.tif"}, "images are no stack of numbers"),
+        ({"images": "film.tif"}, "expected an array: read it first"),
         ({"images": np.ones(40)}, r"images have shape \(40,\): expected \(images, height, width\)"),
         ({"images": np.ones((0, 40, 40))}, r"images have shape \(0, 40, 40\)"),
         ({"images": np.ones((2, 40, 20))}, r"shape \(40, 20\): expected 32 pixels or more"),

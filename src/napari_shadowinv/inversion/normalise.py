@@ -124,6 +124,7 @@ def mask_unlit(
 ) -> tuple[BoolArray | None, list[Caution]]:
     """Mask the pixels without light, by `mask_gaps` and `mask_dark`; the source was recorded."""
     shot = check_plane(image, "image", _SMALLEST_SIDE)
+    check_memory(shot.shape, _BYTES_PER_PIXEL, "an inversion")
     usable = check_mask(mask, shot.shape)
     lit: BoolArray | None = None if mask is None else usable
     planes = {"image": shot} if source is None else {"image": shot, "source": np.asarray(source)}

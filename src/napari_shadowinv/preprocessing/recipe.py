@@ -26,7 +26,6 @@ from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter, HotPixelFilter
-from napari_shadowinv.preprocessing.image_checks import mask_gaps
 from napari_shadowinv.preprocessing.steps import Choice, Dark, Radiograph, Step, choices_of
 
 _MIN_VISIBLE_SHARE = 0.1  # of an object under the source mask, for the inversion to see it
@@ -195,6 +194,8 @@ class Recipe(CheckedModel):
 
         Gaps of the detector are masked before the steps, which would change their values.
         """
+        from napari_shadowinv.preprocessing.image_checks import mask_gaps  # imports scipy.fft
+
         for plane, name in ((shot.image, "image"), (shot.source, "source")):
             if plane is not None:
                 mask, doubts = mask_gaps(plane, shot.mask, name)
