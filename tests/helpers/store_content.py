@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 # Values that are new in each run
-_ATTRIBUTES = ("created", "store_id", "metadata_sha256")
+_ATTRIBUTES = ("created", "store_id")
 _ENTRIES = ("seconds", "stages")  # of a shot's report
 
 
@@ -37,7 +37,7 @@ def whole_content(store: Path) -> dict[str, Any]:
             (length,) = struct.unpack("<I", raw[4:8])
             report = json.loads(raw[8 : 8 + length] or b"{}")
             entries = {k: v for k, v in report.items() if k not in _ENTRIES}
-            files[key] = json.dumps({**entries, "place": report.get("place", [None])[1:]})
+            files[key] = json.dumps(entries)
         elif key.startswith("seconds/c/"):
             files[key] = "times"
     return files

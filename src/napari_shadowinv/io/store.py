@@ -11,7 +11,7 @@ be written again. So workers can write at the same time, and any of them may die
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
@@ -32,19 +32,15 @@ from napari_shadowinv.inversion.variables import (
 from napari_shadowinv.io.files import check_folder_of
 from napari_shadowinv.io.formats import STORE
 from napari_shadowinv.io.shot_columns import joined_columns
-from napari_shadowinv.io.store_checksums import (
-    FIXED,
-    SEAL,
-    CheckedStore,
+from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
+from napari_shadowinv.io.store_damage import (
     Damage,
-    Layout,
     Status,
-    check_seal,
-    describes_arrays,
+    as_dask,
     find_damage,
     is_along_shots,
+    read_values,
 )
-from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
 from napari_shadowinv.physics.units import place_label
 
 if TYPE_CHECKING:
@@ -97,19 +93,13 @@ def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[Column, ...]:
     return *columns_of(ROWS, kind), *joined
 
 
-def _read_document(path: Path) -> dict[str, Any]:
-    """Return the description of a store, empty for a folder of another kind."""
+def read_attributes(path: Path) -> dict[str, Any]:
+    """Return the attributes of a store, empty for a folder of another kind."""
     try:
-        document = dict(json.loads(small_text(path / "zarr.json", "metadata of a store")))
-        return document if isinstance(document["attributes"], dict) else {}
+        return dict(json.loads(small_text(path / "zarr.json", "metadata of a store"))["attributes"])
     except Exception:
         # The error on opening it says more about the damage.
         return {}
-
-
-def read_attributes(path: Path) -> dict[str, Any]:
-    """Return the attributes of a store, empty for a folder of another kind."""
-    return dict(_read_document(path).get("attributes", {}))
 
 
 class StackStore:
@@ -138,18 +128,12 @@ class StackStore:
                 f"{path} does not exist: expected a stack of shots, name{STORE_SUFFIX}; check the "
                 "path"
             )
-        document = _read_document(path)
-        check_seal(path / "zarr.json", document)
-        self.attributes = document.get("attributes", {})
+        self.attributes = read_attributes(path)
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is not a stack of shots: expected name{STORE_SUFFIX}")
-        self.field = fitted_field(self.attributes)
-        self.columns = columns_of_store(self.attributes)
-        self._layout = Layout.of(path, document)
+        self.field, self.columns = _contents(path, self.attributes)
         self._arrays = _open_readable(path)
         self.names = tuple(map(str, self._values("name").tolist()))
-        if self._layout is None:
-            self.statuses()
 
     def statuses(self) -> AnyArray:
         """Return PENDING, DONE, FAILED, DAMAGED or SKIPPED for each shot."""
@@ -174,48 +158,12 @@ class StackStore:
 
     @cached_property
     def damage(self) -> Damage:
-        """Return the lost, exchanged or damaged files; none in a store without checksums."""
-        if self._layout is None:
-            return Damage()
-        damage = find_damage(self._layout, every_byte=self._every_byte)
-        return Damage(damage.shots, (*damage.files, *self._exchanged(damage)))
-
-    @property
-    def has_checksums(self) -> bool:
-        """Whether the store has checksums, by which damage is noticed."""
-        return self._layout is not None
-
-    def _exchanged(self, damage: Damage) -> Iterator[str]:
-        """Name files with values of many shots that disagree with the shots' reports."""
-        assert self._layout is not None
-        columns = {column.key: column for column in self.columns}
-        for name, length in self._layout.of_many_shots.items():
-            for first in range(0, len(self.names), length):
-                end = min(first + length, len(self.names))
-                sound = [index for index in range(first, end) if index in damage.noted]
-                key = f"{name}/c/{first // length}"
-                if not sound or key in damage.keys:
-                    continue
-                values = self._values(name, slice(first, end)).tolist()
-                column = columns.get(name)
-                # Numbers of one shot only: others may have been computed again since.
-                if not all(
-                    _agrees(values[index - first], damage.noted[index], name, column)
-                    for index in (sound if column is None else sound[:1])
-                ):
-                    yield f"{key} does not belong to shots {first} to {end - 1}"
+        """Return the lost and damaged files."""
+        is_copy = "store_id" not in self.attributes  # by another program, of what was read here
+        return find_damage(self.path, self._arrays, every_byte=self._every_byte, is_copy=is_copy)
 
     def _values(self, name: str, which: Any = ...) -> AnyArray:
-        return _values(self.path, self._arrays[name], which)
-
-
-def _agrees(value: Any, noted: Mapping[str, Any], name: str, column: Column | None) -> bool:
-    """Return whether a value agrees with the shot's report; a column may not be filled yet."""
-    if column is None:
-        expected = [noted.get(name, value)]
-    else:
-        expected = [column.kind(column.of(noted)), column.kind(column.fill)]
-    return value in expected or json.dumps(value) in map(json.dumps, expected)  # NaN is not NaN
+        return read_values(self.path / name, self._arrays[name], which)
 
 
 def check_files(store: StackStore) -> None:
@@ -228,8 +176,13 @@ def check_files(store: StackStore) -> None:
 
 
 @as_file_errors
+def _contents(_: Path, attributes: Mapping[Any, Any]) -> tuple[str | None, tuple[Column, ...]]:
+    return fitted_field(attributes), columns_of_store(attributes)
+
+
+@as_file_errors
 def _open_readable(path: Path) -> dict[str, Any]:
-    arrays: dict[str, Any] = dict(zarr.open_group(CheckedStore(path), mode="r").arrays())
+    arrays: dict[str, Any] = dict(zarr.open_group(path, mode="r").arrays())
     names = arrays["name"]
     shots = names.shape[0]
     lengths = {array.shape[0] for array in arrays.values() if is_along_shots(array)}
@@ -243,29 +196,32 @@ def _open_readable(path: Path) -> dict[str, Any]:
 
 
 @as_file_errors
-def _values(path: Path, array: Any, which: Any) -> AnyArray:
-    return np.asarray(array[which])
-
-
-@as_file_errors
 def _parse_reports(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
     return [dict(json.loads(text)) if text else {} for text in texts]
 
 
 def open_dataset(path: Path) -> xarray.Dataset:
-    """Open the arrays of a Zarr folder lazily; each file is checked before it is read."""
+    """Open the arrays of a Zarr folder lazily; an error on reading names the damaged chunk."""
     import xarray as xr
 
     # No variable is a time, whatever its unit. While a store grows, only the folder's consolidated
     # metadata give all arrays the same length.
-    dataset: xr.Dataset = xr.open_zarr(
-        CheckedStore(path),
-        chunks={},
+    dataset = xr.open_dataset(
+        path,
+        engine="zarr",
+        chunks=None,
+        cache=False,
         decode_times=False,
         mask_and_scale=False,
-        consolidated=describes_arrays(path),
+        consolidated=_describes_arrays(path),
     )
-    return dataset
+    stored = {k: v for k, v in dataset.variables.items() if k not in dataset.indexes}
+    return dataset.assign({name: as_dask(path / str(name), v) for name, v in stored.items()})
+
+
+def _describes_arrays(path: Path) -> bool:
+    """Return whether a folder has its own copy of the descriptions of its arrays."""
+    return zarr.open_group(path, mode="r").metadata.consolidated_metadata is not None
 
 
 @as_file_errors
@@ -282,8 +238,8 @@ def read_stack(path: Path) -> xarray.Dataset:
     xarray.Dataset
         Dimensions shot, y, x and component. ``status`` is 0 where a shot is pending, 1 done,
         2 failed, 3 damaged, 4 skipped in a watched folder; the values of shots that are not done
-        are NaN, and damaged shots cannot be read. Where shots have different setups, ``setup`` has
-        one for each shot, empty until the shot is done.
+        are NaN, as are lost ones. Where shots have different setups, ``setup`` has one for each
+        shot, empty until the shot is done.
 
     Raises
     ------
@@ -295,8 +251,7 @@ def read_stack(path: Path) -> xarray.Dataset:
     if dataset.sizes["shot"] > len(store.names):  # grown since
         dataset = dataset.isel(shot=slice(len(store.names)))
     check_files(store)
-    # They hold for this folder, not for datasets derived from this one.
-    dataset.attrs = {k: v for k, v in dataset.attrs.items() if k not in (SEAL, FIXED)}
+    dataset.attrs.pop("store_id", None)  # of this folder, not of datasets derived from it
     setup = setup_from_dataset(dataset)
     complete = _with_fields(with_own_setups(dataset), setup)
     # The folder's own order is arbitrary.

@@ -45,18 +45,8 @@ from napari_shadowinv.io.store import (
     columns_of_store,
     read_attributes,
 )
-from napari_shadowinv.io.store_checksums import (
-    FIXED,
-    Layout,
-    chunk_file,
-    fixed_keys,
-    is_along_shots,
-    note_shot,
-    reseal,
-    seal,
-    stored_checksum,
-)
 from napari_shadowinv.io.store_columns import Column
+from napari_shadowinv.io.store_damage import chunk_file, fields_of, is_along_shots
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
 _SMALL = 64  # values that are not worth compressing
@@ -99,29 +89,26 @@ class ShotWriter:
 
     @classmethod
     def of(cls, store: StackStore) -> ShotWriter:
-        return cls(store.path, store.attributes["store_id"], len(store.names))
+        return cls(store.path, store.attributes.get("store_id", ""), len(store.names))
 
     def write(
         self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int = DONE
     ) -> None:
         """Write a shot and its report; it has its status when this returns, pending if it fails."""
-        attributes = read_attributes(self.path)
-        if attributes.get("store_id") != self.store_id:
+        if read_attributes(self.path).get("store_id", "") != self.store_id:
             raise StoreError(
                 f"{self.path} is missing or is not the store the run started with: all workers "
                 "must share one file system, and the store must not be replaced during the run"
             )
         group = self.arrays()
         with _as_store_errors(self.path):
-            layout = Layout.of_open(self.path, self.store_id, group)
-            for name in layout.of_each_shot:
-                if name in arrays:
-                    group[name][index : index + 1] = np.asarray(arrays[name])[np.newaxis]
+            for name, array in fields_of(group).items():
+                if name in arrays or status == DONE:  # one that is not there has been lost
+                    values = arrays.get(name, array.fill_value)
+                    array[index : index + 1] = np.broadcast_to(values, (1, *array.shape[1:]))
                 else:  # without its chunk, it is read as the fill value
-                    chunk_file(self.path, group[name], index).unlink(missing_ok=True)
-            copied = [column.key for column in columns_of_store(attributes)]
-            text = json.dumps({**report, **note_shot(layout, group, index, copied)})
-            group["report"][index : index + 1] = np.array([text], dtype=object)
+                    chunk_file(self.path, array, index).unlink(missing_ok=True)
+            group["report"][index : index + 1] = np.array([json.dumps(report)], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
 
     def skip(self, index: int) -> None:
@@ -134,8 +121,7 @@ class ShotWriter:
         group = self.arrays()
         with _as_store_errors(self.path):
             group["status"][index : index + 1] = np.int8(PENDING)
-            layout = Layout.of_open(self.path, self.store_id, group)
-            for name in ("report", *layout.of_each_shot):
+            for name in ("report", *fields_of(group)):
                 chunk_file(self.path, group[name], index).unlink(missing_ok=True)
 
     def write_columns(
@@ -333,7 +319,7 @@ def _changing_description(path: Path) -> Iterator[dict[str, Any]]:
     yield document
     with replacing(path / "zarr.json", overwrite=True) as draft:
         # Without indentation, which takes ten times as long, for each shot of a watched folder.
-        draft.write_text(json.dumps(reseal(document)), encoding="utf-8")
+        draft.write_text(json.dumps(document), encoding="utf-8")
 
 
 def _write_template(path: Path, contents: Contents) -> None:
@@ -348,11 +334,6 @@ def _write_template(path: Path, contents: Contents) -> None:
         # The warning is that other programs may not know this: they read the arrays' own metadata.
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(path)
-    file = path / "zarr.json"
-    document = json.loads(file.read_text(encoding="utf-8"))
-    fixed = {key: stored_checksum(path / key) for key in fixed_keys(document)}
-    document["attributes"][FIXED] = json.dumps(fixed)
-    file.write_text(json.dumps(seal(document), indent=2), encoding="utf-8")
 
 
 def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Variable]:

@@ -34,8 +34,8 @@ from napari_shadowinv.io.files import sha256, split_address, text_of
 from napari_shadowinv.io.formats import format_of
 from napari_shadowinv.io.shot_columns import JOINED, ShotTable, describe_columns
 from napari_shadowinv.io.store import FORMAT
-from napari_shadowinv.io.store_checksums import RECORD
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
+from napari_shadowinv.io.store_damage import RECORD
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs

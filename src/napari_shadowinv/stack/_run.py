@@ -333,7 +333,7 @@ class _Run:
         self.report(engine.name)
         stack = self._stack
         # A name that no earlier run has used: dask would reuse the earlier value.
-        name = f"settings-{self._store.attributes['store_id']}-{time.time_ns()}"
+        name = f"settings-{self._writer.store_id}-{time.time_ns()}"
         beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
         context = engine.share(TaskContext(self._writer, stack.shot_task, engine.workers), name)
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()

@@ -1,27 +1,21 @@
-"""A store is only read as far as it is there, and nothing in it blocks or fills the memory."""
+"""A store is only read as far as it is there, and damage to it ends in one sentence."""
 
 from __future__ import annotations
 
-import asyncio
 import importlib.util
 import json
-import os
-import pickle
 import sys
-import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
 from typer.testing import CliRunner
-from zarr.core.buffer import default_buffer_prototype
 
 from napari_shadowinv import InversionOptions, Recipe, run_stack
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.store import DAMAGED, DONE, StackStore, read_stack
-from napari_shadowinv.io.store_checksums import FIXED, SEAL, CheckedStore
+from napari_shadowinv.io.store import StackStore, read_stack
 
 OPTIONS = InversionOptions(n_sites=100)
 
@@ -39,82 +33,6 @@ def status(path: Path):
     return CliRunner().invoke(app, ["status", str(path)])
 
 
-@pytest.fixture
-def unsealed(store) -> Path:
-    """A store without checksums, as a copy by another program."""
-    file = store / "zarr.json"
-    document = json.loads(file.read_text())
-    for name in (SEAL, FIXED):
-        del document["attributes"][name]
-    file.write_text(json.dumps(document))
-    return store
-
-
-def test_the_count_of_a_report_is_looked_at_first(unsealed):
-    store = unsealed
-    chunk = store / "report" / "c" / "0"
-    chunk.write_bytes(np.uint32(2**31 - 1).tobytes() + chunk.read_bytes()[4:])
-    tracemalloc.start()
-    with pytest.raises(FileFormatError, match="implies 2147483647"):
-        StackStore(store).reports()
-    assert tracemalloc.get_traced_memory()[1] < 20_000_000
-    tracemalloc.stop()
-    assert status(store).exit_code == 2
-
-
-def test_the_bytes_of_a_packed_chunk_are_looked_at_first(unsealed):
-    store = unsealed
-    chunk = store / "potential" / "c" / "0" / "0" / "0"
-    head = chunk.read_bytes()
-    chunk.write_bytes(head[:4] + np.uint32(2**31 - 1).tobytes() + head[8:])
-    with pytest.raises(FileFormatError, match="implies 2147483647"):
-        read_stack(store)["potential"][0].load()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs pipes and devices")
-@pytest.mark.parametrize("where", ["zarr.json", "name/c/0"])
-def test_a_pipe_or_a_device_in_a_store_is_refused(store, where):
-    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
-        (store / where).unlink()
-        make(store / where)
-        with pytest.raises(FileFormatError):
-            StackStore(store).reports()
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs pipes and devices")
-@pytest.mark.parametrize("where", ["status/c/1", "report/c/1", "potential/c/1/0/0"])
-def test_a_pipe_or_a_device_in_a_shot_damages_the_shot(store, where):
-    for make in (os.mkfifo, lambda path: path.symlink_to("/dev/zero")):
-        (store / where).unlink()
-        make(store / where)
-        opened = StackStore(store)
-        assert opened.statuses().tolist() == [DONE, DAMAGED]
-        assert "is a" in opened.reports()[1]["reason"]
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs pipes")
-def test_a_pipe_in_a_store_without_checksums_is_refused(unsealed):
-    (unsealed / "name" / "c" / "0").unlink()
-    os.mkfifo(unsealed / "name" / "c" / "0")
-    with pytest.raises(FileFormatError, match="is a pipe"):
-        StackStore(unsealed)
-
-
-def test_a_chunk_beyond_the_limit_of_memory_is_not_unpacked(unsealed, monkeypatch):
-    monkeypatch.setenv("SHADOWINV_MAX_GB", "5e-6")
-    with pytest.raises(FileFormatError, match="expands to"):
-        StackStore(unsealed)
-
-
-def test_parts_of_files_are_checked_too(store):
-    (store / "zarr.json").write_text((store / "zarr.json").read_text().replace("100", "101"))
-    parts = CheckedStore(store).get_partial_values(
-        default_buffer_prototype(), [("zarr.json", None)]
-    )
-    with pytest.raises(FileFormatError, match="does not match its checksum"):
-        asyncio.run(parts)
-
-
 def test_the_copy_of_an_arrays_metadata_is_enough(store):
     before = read_stack(store)["potential"].values
     (store / "potential" / "zarr.json").write_bytes(b"\xff junk")
@@ -122,8 +40,7 @@ def test_the_copy_of_an_arrays_metadata_is_enough(store):
 
 
 @pytest.mark.parametrize("shots", [3000, 10**12])
-def test_a_store_has_the_shots_that_are_there(unsealed, shots):
-    store = unsealed
+def test_a_store_has_the_shots_that_are_there(store, shots):
     file = store / "zarr.json"
     content = json.loads(file.read_text())
     for array in content["consolidated_metadata"]["metadata"].values():
@@ -140,7 +57,6 @@ def test_a_store_has_the_shots_that_are_there(unsealed, shots):
 def test_a_store_opened_twice_is_not_taken_for_the_same_by_dask(store):
     first, second = (read_stack(store)["potential"].data.name for _ in range(2))
     assert first != second
-    assert pickle.loads(pickle.dumps(CheckedStore(store))).root == store
 
 
 def test_warnings_of_a_file_are_in_its_shots_report(night, tmp_path):
@@ -184,7 +100,7 @@ def test_damage_at_random_ends_in_one_of_two_errors(store, tmp_path):
     spec.loader.exec_module(fuzz)
     reader = fuzz.Reader()
     (tmp_path / "bad").mkdir()
-    tally = fuzz.fuzz("run.shadowinv.zarr", 30, 1, tmp_path / "bad", reader, store)
+    tally = fuzz.fuzz("run.shadowinv.zarr", 60, 1, tmp_path / "bad", reader, store)
     reader.close()
     assert tally.failures == []
     assert tally.refused >= 3
