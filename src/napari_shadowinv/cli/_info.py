@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io.formats import Format
+    from napari_shadowinv.io.matlab import Variable
     from napari_shadowinv.provenance import Provenance
 
 PACKAGES = (
@@ -44,22 +45,29 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.io import is_stack, read
     from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.field_grids import describe_field_grid, is_field_grid
-    from napari_shadowinv.io.formats import format_of
+    from napari_shadowinv.io.formats import MATLAB, format_of
     from napari_shadowinv.io.frames import find_frames
     from napari_shadowinv.io.hdf5_arrays import read_hdf5
+    from napari_shadowinv.io.matlab import mat_variables, read_mat
     from napari_shadowinv.io.store import StackStore
 
     if is_stack(path):
         return store_rows(StackStore(path))
     if variable is None and is_field_grid(path):
         return describe_field_grid(path)
+    if variable is None and path.is_file() and format_of(path) is MATLAB:
+        variables = mat_variables(path)
+        if sum(each.is_image for each in variables) != 1:
+            return _matlab_rows(variables)
     frames = find_frames(path, variable)
     if len(frames) > 1:
         return _frame_rows(read(path, variable=variable), frames[0].variable)
     path, variable = frames[0].path, frames[0].variable
     form = format_of(path)
-    if form.name == "mat":
-        return _matlab_rows(path, variable)
+    if form is MATLAB:
+        array, metadata = read_mat(path, variable)
+        chosen = ("image", metadata["variable"])
+        return [*_matlab_rows(mat_variables(path))[:2], chosen, *_array_rows(array)]
     if variable is not None and form.name in ("pradformat", "shadowinv"):
         array = read_hdf5(path, variable)
         return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
@@ -83,18 +91,15 @@ def _frame_rows(frames: Radiograph | xarray.Dataset, array: str | None) -> _summ
     ]
 
 
-def _matlab_rows(path: Path, variable: str | None) -> _summary.Rows:
-    """Describe the image of a MATLAB file, or list the images to choose from."""
-    from napari_shadowinv.io.matlab import mat_variables, read_mat
-
-    contents = mat_variables(path)
-    rows = [("kind", "MATLAB file"), ("variables", ", ".join(map(str, contents)) or "none")]
-    images = [array for array in contents if array.is_image]
-    if variable is None and len(images) != 1:
-        advice = "choose one with --variable" if images else "no variable is an image"
-        return [*rows, ("images", f"{len(images)}: {advice}")]
-    array, metadata = read_mat(path, variable)
-    return [*rows, ("image", metadata["variable"]), *_array_rows(array)]
+def _matlab_rows(variables: Sequence[Variable]) -> _summary.Rows:
+    """List the variables of a MATLAB file, and say how to choose of its images."""
+    images = sum(each.is_image for each in variables)
+    advice = "choose one with --variable" if images else "no variable is an image"
+    return [
+        ("kind", "MATLAB file"),
+        ("variables", ", ".join(map(str, variables)) or "none"),
+        ("images", f"{images}: {advice}"),
+    ]
 
 
 def _picture_rows(path: Path, form: Format) -> _summary.Rows:
