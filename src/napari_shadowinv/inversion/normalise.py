@@ -127,11 +127,17 @@ def mask_unlit(
     check_memory(shot.shape, _BYTES_PER_PIXEL, "an inversion")
     usable = check_mask(mask, shot.shape)
     lit: BoolArray | None = None if mask is None else usable
-    planes = {"image": shot} if source is None else {"image": shot, "source": np.asarray(source)}
+    planes = (
+        {"image": shot}
+        if source is None
+        else {"image": shot, "source": check_plane(source, "source")}
+    )
     if any(plane.shape != shot.shape for plane in planes.values()):
         return lit, []  # refused later, as are values that are not finite
-    values = {name: np.where(usable, plane, 0.0) for name, plane in planes.items()}
-    if not all(float(np.abs(plane).max()) < _BRIGHTEST for plane in values.values()):
+    values = {
+        name: np.where(usable, plane, 0.0).astype(np.float64) for name, plane in planes.items()
+    }
+    if not all(np.abs(plane).max() < _BRIGHTEST for plane in values.values()):
         return lit, []
     cautions = []
     for name, plane in values.items():

@@ -48,7 +48,8 @@ _DARK, _DIM = 0.03, 0.1  # of the light elsewhere: without doubt, and if noise e
 _MIN_NOISE = 0.8  # of the light, per pixel
 _LIT = 0.3  # of the light elsewhere, just outside the sharp edge of a window
 _MAX_PILE = 1.5  # there, unless the light was deflected out of a hollow
-_EDGE_PX = 6, 9  # outside a dark region
+_EDGE_PX, _SHARP_EDGE_PX = (6, 9), (2, 4)  # outside a dark region, and without a source
+_LIT_SHARPLY = 0.5  # there without a source: a beam may fall smoothly
 
 # Saturation
 _MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
@@ -292,7 +293,7 @@ def _is_dark_region(
     """Return whether a region was dark before any deflection, by its noise and its edge."""
     if len(lights) > 1 and noisy[region].mean() > 0.5:
         return True
-    least, most = _EDGE_PX
+    least, most = _EDGE_PX if len(lights) > 1 else _SHARP_EDGE_PX
     around = tuple(slice(max(side.start - most, 0), side.stop + most) for side in box)
     distance = ndimage.distance_transform_edt(~region[around])
     ring = usable[around] & (distance > least) & (distance <= most)
@@ -303,7 +304,7 @@ def _is_dark_region(
         return at_edge > _LIT
     # Shorter than the image's sides, it could be the object's.
     is_rim = region[1:-1, 1:-1].sum() < region.sum() >= min(region.shape)
-    return _LIT < at_edge < _MAX_PILE and bool(is_rim)
+    return _LIT_SHARPLY < at_edge < _MAX_PILE and bool(is_rim)
 
 
 def image_warnings(
