@@ -103,6 +103,13 @@ def test_without_a_source_a_dark_rim_is_masked_and_a_hollow_stays(name) -> None:
     assert caution.code == "unlit"
 
 
+def test_a_small_smooth_spot_without_a_source_is_not_masked() -> None:
+    y, x = np.mgrid[:24, :28]
+    spot = 1e4 * np.exp(-((y - 12) ** 2 + (x - 14) ** 2) / 2 / 5**2) + 100
+    image = np.random.default_rng(0).poisson(spot).astype(float)
+    assert mask_dark(image, None, None) == (None, [])
+
+
 def test_a_hollow_that_the_source_lights_is_not_masked() -> None:
     source = np.random.default_rng(0).poisson(100.0, SHAPE).astype(float)
     image = source.copy()

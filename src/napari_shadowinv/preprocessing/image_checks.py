@@ -49,7 +49,7 @@ _MIN_NOISE = 0.8  # of the light, per pixel
 _LIT = 0.3  # of the light elsewhere, just outside the sharp edge of a window
 _MAX_PILE = 1.5  # there, unless the light was deflected out of a hollow
 _EDGE_PX, _SHARP_EDGE_PX = (6, 9), (2, 4)  # outside a dark region, and without a source
-_LIT_SHARPLY = 0.5  # there without a source: a beam may fall smoothly
+_LIT_SHARPLY = 0.4  # there without a source: a beam may fall smoothly
 
 # Saturation
 _MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
