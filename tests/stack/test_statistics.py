@@ -67,7 +67,7 @@ def test_peak_leaves_out_masked_pixels(night, out):
     mask = np.ones(night.source.shape, bool)
     mask[4:16, 6:20] = False  # the blob
     written = night.run(out, mask=mask, shots=night.images[:2])
-    np.testing.assert_array_equal(written.mask, mask)
+    np.testing.assert_array_equal(written.mask, [mask, mask])
     peaks = stack_statistics(written).displacement_peak.values
     lengths = np.hypot(*written.displacement.values.transpose(1, 0, 2, 3).astype(float))
     np.testing.assert_allclose(peaks, lengths[:, mask].max(axis=1), rtol=1e-12)

@@ -101,7 +101,7 @@ def _peak(field: xarray.DataArray, mask: xarray.DataArray | None) -> xarray.Data
     if "component" in field.dims:
         squared = squared.sum("component", skipna=False)
     if mask is not None:
-        squared = squared.where(mask, 0.0)
+        squared = squared.where(mask | squared.isnull(), 0.0)  # NaN until a shot is done
     largest: xarray.DataArray = squared.max(("y", "x"), skipna=False)
     return largest**0.5
 
