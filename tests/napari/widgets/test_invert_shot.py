@@ -363,7 +363,7 @@ USER_ERRORS = {
     "at least 4 × 4": np.ones((1, 1)),
     "no positive pixel": np.zeros((20, 20)),
     "NaN": np.full((20, 20), np.nan),
-    "negative": np.linspace(-1, 1, 400).reshape(20, 20),
+    "negative": np.where(np.eye(20) * np.arange(20) == 10, -0.5, 1.0),
 }
 
 
