@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import platform
 import ssl
 import threading
@@ -96,15 +97,25 @@ def test_scheduler_and_workers_serve_no_pages():
                 urllib.request.urlopen(page, timeout=5)
 
 
+def spawned() -> set[psutil.Process]:
+    """Return the living processes that were started as workers."""
+    found = set()
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(psutil.Error):  # it may have ended meanwhile
+            if "spawn_main" in " ".join(process.cmdline()):
+                found.add(process)
+    return found
+
+
 def test_worker_killed_while_it_starts_gives_one_sentence():
+    before = spawned()  # those of earlier tests may still be ending
+
     def kill() -> None:
         end = time.monotonic() + 60
-        while time.monotonic() < end:
-            for process in psutil.Process().children(recursive=True):
-                if "spawn_main" in " ".join(process.cmdline()):
-                    process.kill()
-                    return
+        while not (new := spawned() - before) and time.monotonic() < end:
             time.sleep(0.01)
+        for process in new:
+            process.kill()
 
     killer = threading.Thread(target=kill)
     killer.start()
@@ -112,8 +123,4 @@ def test_worker_killed_while_it_starts_gives_one_sentence():
     with pytest.raises(EngineError, match=message), engine_for("processes", 1):
         pass
     killer.join()
-    assert not [
-        process
-        for process in psutil.Process().children(recursive=True)
-        if "spawn_main" in " ".join(process.cmdline())
-    ]
+    assert not spawned() - before
