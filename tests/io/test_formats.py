@@ -90,6 +90,7 @@ FOREIGN = {
     "shot.lif": (b"\x70\0\0\0\x10\0\0\0\x2a\0", "a Leica LIF file"),
     "shot.fits": (b"SIMPLE  =                    T", "a FITS file"),
     "shot.nrrd": (b"NRRD0004\ntype: uint16\n", "an NRRD file"),
+    "shot.exr": (b"\x76\x2f\x31\x01\2\0\0\0", "an OpenEXR picture"),
     "photo.heic": (b"\0\0\0\x18ftypheic\0\0\0\0", "a HEIC or AVIF picture"),
     "photo.webp": (b"RIFF\x10\0\0\0WEBPVP8 ", "a WebP picture"),
     "photo.jp2": (b"\0\0\0\x0cjP  \r\n\x87\n", "a JPEG 2000 picture"),

@@ -30,6 +30,12 @@ def test_savetxt_comes_back(tmp_path: Path, suffix: str, newline: str, delimiter
     assert radiograph.setup is None
 
 
+def test_semicolons_separate_numbers_with_a_decimal_comma(tmp_path: Path) -> None:
+    path = tmp_path / "shot.csv"
+    path.write_text("1,5;2;3e-1;\n4.25;5,125;-6;\n")
+    np.testing.assert_array_equal(read(path).image, [[1.5, 2, 0.3], [4.25, 5.125, -6]])
+
+
 def test_byte_order_mark_blank_lines_and_last_commas(tmp_path: Path) -> None:
     path = tmp_path / "shot.csv"
     path.write_bytes(b"\xef\xbb\xbf1,2,\r\n\r\n3,4e1,\r\n\r\n")

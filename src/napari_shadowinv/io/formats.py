@@ -213,6 +213,7 @@ _FOREIGN_FORMATS = {
     rb"\xda\xce\xbe\x0a": "a Nikon ND2 file",
     rb"\x70\0\0\0.{4}\x2a": "a Leica LIF file",
     rb"NRRD": "an NRRD file",
+    rb"\x76\x2f\x31\x01": "an OpenEXR picture",
     rb".{4}ftypcrx|II\x2a\0.{4}CR|II(RO|RS|U\0)|MMOR|FUJIFILMCCD-RAW|FOVb": _CAMERA_RAW,
     rb".{4}ftyp(hei|hev|mif|msf|avi)": "a HEIC or AVIF picture",
     rb".{4}ftyp|RIFF.{4}AVI |\x1aE\xdf\xa3|LUCAM-RECORDER|\xed\xfe\0\0": "a movie",

@@ -1,8 +1,8 @@
 """Images as text, one row of pixels per line: `read_text`.
 
-Numbers are separated by spaces, tabs or commas, with a decimal point. Lines that begin with
-``#`` or ``%`` are comments; they may contain the geometry as ``key = value``, ``key: value`` or
-``key value``:
+Numbers are separated by spaces, tabs or commas, with a decimal point, or by semicolons, with a
+decimal comma or point. Lines that begin with ``#`` or ``%`` are comments; they may contain the
+geometry as ``key = value``, ``key: value`` or ``key value``:
 
 ===========================  ==========================================================
 key                          meaning
@@ -218,7 +218,10 @@ def _read_lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _parse_row(path: Path, number: int, line: str, width: int | None) -> FloatArray:
-    words = line.rstrip(",").split("," if "," in line else None)
+    if ";" in line:
+        words = line.rstrip(";").replace(",", ".").split(";")
+    else:
+        words = line.rstrip(",").split("," if "," in line else None)
     if width is not None and len(words) != width:
         raise FileFormatError(
             f"{path}, line {number} has {len(words)} numbers, but the first row has {width}: "
@@ -231,7 +234,7 @@ def _parse_row(path: Path, number: int, line: str, width: int | None) -> FloatAr
         excerpt = word if len(word) <= 30 else f"{word[:30]}…"
         raise FileFormatError(
             f"{path}, line {number} has {excerpt!r}: expected numbers with a decimal point, "
-            "separated by spaces or commas; start lines of text with #"
+            "separated by spaces, commas or semicolons; start lines of text with #"
         ) from None
 
 
