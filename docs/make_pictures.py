@@ -17,17 +17,12 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from napari_shadowinv import InversionOptions, fit, invert, poisson_invert, read, synthetic_image
-from napari_shadowinv.fitting import FitShot
-from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
-from napari_shadowinv.pipeline import run_windows
 from napari_shadowinv.plotting import (
     comparison_figure,
     fit_figure,
     report_figure,
-    windows_figure,
 )
-from napari_shadowinv.preprocessing import Recipe
 
 HERE = Path(__file__).parent
 SHOT = "Image_20241017221829851.bmp"
@@ -83,28 +78,12 @@ def fit_picture() -> None:
     save_small(fit_figure(found, title="Two energies, beam unknown"), HERE / "fit.png", 1300)
 
 
-def windows_picture() -> None:
-    """Windows of two of five images of an object that is stronger in the last two."""
-    energies, factors = (8.0, 10.0, 12.2, 14.5, 16.7), (1, 1, 1, 1.25, 1.25)
-    setups = [paper_setup().model_copy(update={"energy": energy}) for energy in energies]
-    truth = toroid((96, 96), setups[0], 40.0, 20e-6).displacement
-    rng = np.random.default_rng(0)
-    shots = []
-    for setup, factor in zip(setups, factors, strict=True):
-        strength = factor * setups[0].momentum / setup.momentum
-        image = synthetic_image(strength * truth) + 0.03 * rng.normal(size=(96, 96))
-        shots.append(FitShot(image, setup))
-    found = run_windows(Recipe(fit=FitChoices(noise=0.03)), shots, 2)
-    save_small(windows_figure(found), HERE / "fit-windows.png", 1300)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     default = HERE.parents[1] / "shared" / "data"
     parser.add_argument("--data", type=Path, default=default)
     toroid_picture()
     fit_picture()
-    windows_picture()
     folder = parser.parse_args().data / "burner" / "data"
     if folder.is_dir():
         burner_picture(folder)

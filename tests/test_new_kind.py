@@ -32,7 +32,6 @@ from napari_shadowinv.pipeline import read_recipe, run_fit, write_recipe
 from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.pipeline.fit_run import compared_fields, refinement_choices, run_refinement
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
-from napari_shadowinv.pipeline.static_checks import run_windows
 from napari_shadowinv.preprocessing import Recipe
 
 SHAPE = (40, 44)
@@ -119,16 +118,6 @@ def test_fit_scales_images_by_a_new_kind(setups, images, tmp_path):
     assert "areal_electron_density" in read(path)
 
 
-def test_windows_have_the_quantity_of_a_new_kind(setups, images):
-    shots = [FitShot(image, setup=s) for image, s in zip(images, setups, strict=True)]
-    recipe = Recipe(fit=FitChoices(fields="electrons", options=HASTY))
-    windows = run_windows(recipe, shots, 1)
-    coordinate = windows.to_dataset()["photon_energy"]
-    assert coordinate.values.tolist() == [8.0, 12.0]
-    assert coordinate.attrs == {"units": "keV", "long_name": "Mean energy"}
-    assert windows.times_of_flight is None
-
-
 def test_table_gives_each_shot_the_quantity_of_a_new_kind(table, setups):
     recipe = Recipe(setup=setups[0], options=FAST)
     store = run_stack(table, "out.shadowinv.zarr", recipe=recipe, scheduler="synchronous")
@@ -148,11 +137,9 @@ def test_table_gives_each_shot_the_quantity_of_a_new_kind(table, setups):
 def test_command_fits_a_table_of_a_new_kind(table):
     result = shadowinv(
         *("fit", table, "--setup", "xray.toml", "--out", "fit.shadowinv", "--samples", 0),
-        *("--max-iterations", 3, "--spacing", 0.25, "--energy-window", 1),
+        *("--max-iterations", 3, "--spacing", 0.25),
     )
     assert "8 keV" in flat(result.output), result.output
-    dataset: Any = read(Path("fit.shadowinv"))
-    assert dataset["window_photon_energy"].values.tolist() == [8.0, 12.0]
 
 
 def test_text_image_states_a_new_kind(table, setups, images):

@@ -80,10 +80,9 @@ def test_bad_values_are_named_by_their_flags(
 @pytest.mark.parametrize("command", COMMANDS)
 def test_each_flag_with_a_number_is_of_a_model_or_of_the_command(command: str) -> None:
     named = {flag for model in COMMANDS[command][1] for flag in flag_names(model).values()}
-    own = {"--energy-window"}
     numbers = {flag for flag, kind in kinds_of_flags(command).items() if kind in ("int", "float")}
     assert numbers & named
-    assert numbers <= named | own
+    assert numbers <= named
 
 
 @pytest.mark.parametrize(

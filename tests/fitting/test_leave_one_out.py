@@ -15,7 +15,7 @@ from helpers.fit_images import bump, counted, noisy, together
 from napari_shadowinv import FitOptions, InputError, ProtonSetup
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import LeaveOneOut, leave_one_out
-from napari_shadowinv.fitting.windows import explanation_of
+from napari_shadowinv.fitting.left_out import explanation_of
 
 SHAPE = (56, 56)
 NOISE = 0.04

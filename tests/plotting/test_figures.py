@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitWindows, LeaveOneOut
+from napari_shadowinv.fitting import Fit, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.physics.significance import PixelErrors
@@ -26,7 +26,6 @@ from napari_shadowinv.plotting import (
     left_out_figure,
     report_figure,
     save_figure,
-    windows_figure,
 )
 from napari_shadowinv.plotting._panels import ALARM_COLOUR
 
@@ -374,25 +373,6 @@ def test_each_image_left_out_has_its_prediction_and_its_residual(
         np.testing.assert_allclose(residual, np.where(fit.mask[k], fit.residual[k] / 0.05, np.nan))
     assert sum(title.endswith("not explained") for title in panel_titles) == 1
     assert "a sentence" in [text.get_text() for text in figure.texts]
-    assert_nothing_overlaps(figure)
-
-
-def test_fields_of_windows_are_side_by_side_on_one_scale(
-    make_fit: MakeFit, proton_setup: ProtonSetup
-) -> None:
-    setups = setups_of(proton_setup, 4)
-    fits = tuple(make_fit(setups=setups[w : w + 2]) for w in range(3))
-    windows = FitWindows(((0, 1), (1, 2), (2, 3)), fits, np.array([[1.0], [0.8], [0.5]]))
-    figure = windows_figure(windows)
-    panel_titles = titles(figure)
-    assert [title.split(",")[0] for title in panel_titles[:3]] == ["3.5 MeV", "4.5 MeV", "5.5 MeV"]
-    assert panel_titles[3].startswith("Cut at")
-    limits = {panel.images[0].get_clim() for panel in panels(figure)[:3]}
-    assert len(limits) == 1
-    # The weakest images have the strongest field.
-    assert limits.pop()[1] == pytest.approx(
-        np.asarray(panels(figure)[2].images[0].get_array()).max()
-    )
     assert_nothing_overlaps(figure)
 
 

@@ -32,8 +32,6 @@ HELP = {
     "setups. Writes the likeliest fit, or the one that --fields names.",
     "leave_one_out": "Also predict each image from a fit of the others, and list the images that "
     "one static field does not explain.",
-    "energy_window": "Also fit each group of N neighbouring images, in order of energy, for a "
-    "movie of the field.",
     "brightness": "known: images are as bright as the source; free: fit the brightness of each "
     "image; or the brightness of each relative to the source, separated by commas.",
     "mask": "Image of the same size, 0 at pixels to ignore in all images.",
@@ -49,7 +47,7 @@ shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --fields B,E --b
 shadowinv fit a.tif b.tif --strengths 1,0.68 --source unknown --noise poisson
 shadowinv fit shots.csv --source-size 10e-6 --resolution 30e-6 --bin 2
 shadowinv fit shots.csv --setup setup.toml --compare
-shadowinv fit shots.csv --setup setup.toml --leave-one-out --energy-window 3
+shadowinv fit shots.csv --setup setup.toml --leave-one-out
 shadowinv fit next.csv --recipe recipe.toml
 
 [bold]shots.csv[/bold] (paths are relative to this file; flags apply where a cell is empty)
@@ -87,7 +85,6 @@ def fit(
     fiducials: Annotated[Path | None, Option(help=HELP["fiducials"])] = None,
     compare: Annotated[bool, Option("--compare", help=HELP["compare"])] = False,
     leave_one_out: Annotated[bool, Option("--leave-one-out", help=HELP["leave_one_out"])] = False,
-    energy_window: Annotated[int | None, Option(help=HELP["energy_window"])] = None,
     recipe: _flags.RecipeFile = None,
     save_recipe: _flags.SaveRecipe = None,
     options: Annotated[Path | None, Option(help="TOML file with options of the fit.")] = None,
@@ -106,10 +103,9 @@ def fit(
     bars, re-projections, residuals and a verdict to one file, and a figure next to it.
     """
     from napari_shadowinv.cli import _fit_result
-    from napari_shadowinv.pipeline import run_fit, write_recipe
+    from napari_shadowinv.pipeline import run_fit, run_leave_one_out, write_recipe
     from napari_shadowinv.pipeline.fit_run import read_row_images
     from napari_shadowinv.pipeline.shot_table import shot_rows
-    from napari_shadowinv.pipeline.static_checks import run_checks
 
     lists = {"energy": energies, "strength": strengths}
     if brightness not in (None, "known", "free"):
@@ -119,9 +115,10 @@ def fit(
     first = rows[0].file
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
     result, figure = _inputs.result_and_figure(first, target, figure)
-    checks: dict[str, Any] = {"left_out": leave_one_out, "window": energy_window}
-    _fit_result.check_requests(len(rows), **checks, fiducials=fiducials, result=result)
-    figures = [figure, *_fit_result.static_figures(figure, **checks)]
+    figures = [figure]
+    if leave_one_out:
+        _fit_result.check_leave_one_out(len(rows), fiducials, result)
+        figures.append(_inputs.left_out_path(figure))
     files = _inputs.result_outputs(ResultKind.FIT, result, *figures)
     outputs = _inputs.check_outputs([*files, (save_recipe, (".toml",))], overwrite)
     row_files = [file for row in rows for file in row.files.values()]
@@ -142,18 +139,20 @@ def fit(
     else:
         with work_callbacks(quiet) as callbacks:
             result_fit = run_fit(chosen, shots, **callbacks)
-    with work_callbacks(quiet) as callbacks:
+    left_out = None
+    if leave_one_out:
         named = [replace(shot, name=name) for shot, name in zip(shots, short, strict=True)]
-        static = run_checks(chosen, named, result_fit, **checks, **callbacks)
-    failed = _inputs.write_result(result_fit, names, result, figure, overwrite, static)
+        fields = [field.name for field in result_fit.fields]
+        with work_callbacks(quiet) as callbacks:
+            left_out = run_leave_one_out(chosen, named, fields, **callbacks)
+    failed = _inputs.write_result(result_fit, names, result, figure, overwrite, left_out)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
     if not quiet:
-        for title, check in (("Left out", static.left_out), ("Windows", static.windows)):
-            if check is not None:
-                say(two_columns(title, fact_rows(check.facts)))
+        if left_out is not None:
+            say(two_columns("Left out", fact_rows(left_out.facts)))
         fit_rows = _fit_result.fit_rows(result_fit, names, printed)
         say(two_columns("Fit", [*fit_rows, *written_rows(outputs, failed)]))
-    exit_unless_sound(result_fit, result, static)
+    exit_unless_sound(result_fit, result, left_out)

@@ -65,7 +65,6 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
 def fit_file_rows(dataset: xarray.Dataset) -> Rows:
     """Describe the file of a fit."""
     from napari_shadowinv.fitting import Fit, LeaveOneOut
-    from napari_shadowinv.fitting.windows import window_facts
 
     fit = Fit.from_dataset(dataset)
     left_out = LeaveOneOut.from_dataset(dataset).facts if "left_out_chi2" in dataset else ()
@@ -75,7 +74,6 @@ def fit_file_rows(dataset: xarray.Dataset) -> Rows:
         ("created", str(dataset.attrs["created"])),
         *fit_rows(fit),
         *fact_rows(left_out),
-        *fact_rows(window_facts(dataset)),
         *([] if provenance is None else _provenance_rows(provenance)),
         ("options", options_text(fit.options.model_dump())),
     ]
@@ -108,38 +106,21 @@ def fit_rows(fit: Fit, names: Sequence[str] = (), printed: tuple[str, ...] = ())
     ]
 
 
-def check_requests(
-    count: int, *, left_out: bool, window: int | None, fiducials: Path | None, result: Path
-) -> None:
-    """Refuse, before any work, checks that the images or the result file do not allow."""
-    from napari_shadowinv.fitting.windows import check_count
-    from napari_shadowinv.pipeline.static_checks import check_window
+def check_leave_one_out(count: int, fiducials: Path | None, result: Path) -> None:
+    """Refuse, before any work, to leave images out where inputs or outputs do not allow it."""
+    from napari_shadowinv.fitting.left_out import check_count
 
-    if left_out:
-        check_count(count)
-    if window is not None:
-        check_window(window, count)
-    flag = "--leave-one-out" if left_out else "--energy-window" if window is not None else None
-    if flag is None:
-        return
+    check_count(count)
     if fiducials is not None:
         raise InputError(
-            f"received {flag} and --fiducials, which apply to the first image only: use one of them"
+            "received --leave-one-out and --fiducials, which apply to the first image only: use "
+            "one of them"
         )
     if result.suffix.lower() not in RESULT.suffixes:
         raise InputError(
-            f"received {flag} and {result}, a format without it: write a {RESULT.suffix} file"
+            f"received --leave-one-out and {result}, a format without it: write a {RESULT.suffix} "
+            "file"
         )
-
-
-def static_figures(report: Path, *, left_out: bool, window: int | None) -> list[Path]:
-    """Return the files of the checks' figures."""
-    requests = {"left_out": left_out, "windows": window is not None}
-    return [
-        report.with_name(f"{report.stem}_{name}{report.suffix}")
-        for name, is_requested in requests.items()
-        if is_requested
-    ]
 
 
 def short_names(names: Sequence[str], beams: Sequence[str]) -> list[str]:

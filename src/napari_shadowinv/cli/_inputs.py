@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from napari_shadowinv.facts import ResultKind
+    from napari_shadowinv.fitting import LeaveOneOut
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.results import AnyResult
 
 Output = tuple[Path | None, tuple[str, ...]]  # a file and the endings that it may have
@@ -106,31 +106,31 @@ def write_result(
     out: Path,
     figure: Path,
     overwrite: bool,
-    checks: StaticChecks | None = None,
+    left_out: LeaveOneOut | None = None,
 ) -> list[Path]:
     """Write a result, then its figures, whose title is the names of its files.
 
     Returns the figures that could not be drawn; see `write_figures`.
     """
-    from napari_shadowinv.cli._fit_result import static_figures
     from napari_shadowinv.io import write
     from napari_shadowinv.io.files import name_of
-    from napari_shadowinv.plotting import left_out_figure, result_figure, windows_figure
+    from napari_shadowinv.plotting import left_out_figure, result_figure
 
     title = ", ".join(name_of(name) for name in names)
     dataset = result.to_dataset()
     figures: dict[Path, Callable[[], Figure]] = {
         figure: partial(result_figure, result, title=title)
     }
-    if checks is not None:
-        dataset = checks.add_to(dataset)
-        left_out, windows = static_figures(figure, left_out=True, window=1)
-        if checks.left_out is not None:
-            figures[left_out] = partial(left_out_figure, checks.left_out, title=title)
-        if checks.windows is not None:
-            figures[windows] = partial(windows_figure, checks.windows, title=title)
+    if left_out is not None:
+        dataset = left_out.added_to(dataset)
+        figures[left_out_path(figure)] = partial(left_out_figure, left_out, title=title)
     write(out, dataset, overwrite=overwrite)
     return write_figures(figures, overwrite)
+
+
+def left_out_path(figure: Path) -> Path:
+    """Return the file of the figure of images that were left out."""
+    return figure.with_name(f"{figure.stem}_left_out{figure.suffix}")
 
 
 def write_figures(figures: Mapping[Path, Callable[[], Figure]], overwrite: bool) -> list[Path]:

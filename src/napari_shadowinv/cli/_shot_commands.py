@@ -198,7 +198,6 @@ def rerun(
 
     With the same files and version, the result is identical bit for bit.
     """
-    from napari_shadowinv.cli import _fit_result
     from napari_shadowinv.pipeline.rerun import collect_rerun
 
     target = out or Path(f"{result.stem}_again{result.suffix}")
@@ -206,7 +205,7 @@ def rerun(
     files = _inputs.result_outputs(ResultKind.INVERSION, again_out, figure)
     _inputs.check_outputs(files, overwrite)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
-    figures = _fit_result.static_figures(figure, **inputs.checks)
+    figures = [_inputs.left_out_path(figure)] if inputs.leaves_out else []
     files = _inputs.result_outputs(inputs.kind, again_out, *figures)
     _inputs.check_outputs(files, overwrite)
     _inputs.protect([again_out, figure, *figures], [result, *inputs.files])
@@ -215,7 +214,9 @@ def rerun(
     with work_callbacks(quiet) as callbacks:
         again = inputs.run(**callbacks)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
-    failed = _inputs.write_result(again.content, names, again_out, figure, overwrite, again.checks)
+    failed = _inputs.write_result(
+        again.content, names, again_out, figure, overwrite, again.left_out
+    )
     content: Any = again.content
     if not quiet:
         rows = [
@@ -227,7 +228,7 @@ def rerun(
             *written_rows([again_out, figure], failed),
         ]
         say(two_columns("Rerun", rows))
-    exit_unless_sound(content, again_out, again.checks)
+    exit_unless_sound(content, again_out, again.left_out)
 
 
 FORWARD_EPILOG = """

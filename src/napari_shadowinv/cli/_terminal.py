@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from napari_shadowinv._system.progress import OnProgress, Progress
+    from napari_shadowinv.fitting import LeaveOneOut
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.pipeline.static_checks import StaticChecks
     from napari_shadowinv.preprocessing import Radiograph, Recipe
 
 EXIT_MISTAKE = 2
@@ -185,12 +185,11 @@ def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
     return run
 
 
-def exit_unless_sound(result: Any, out: Path, checks: StaticChecks | None = None) -> None:
+def exit_unless_sound(result: Any, out: Path, left_out: LeaveOneOut | None = None) -> None:
     """Exit with an error code if an inversion did not converge or a fit is not determined.
 
-    Also if, by the checks of a fit, a static field does not explain an image.
+    Also if a static field does not explain an image that was left out.
     """
-    left_out = None if checks is None else checks.left_out
     is_inversion = result.kind is ResultKind.INVERSION
     # Of a fit; a film pack has none.
     verdict: Any = None if is_inversion else getattr(result, "verdict", None)

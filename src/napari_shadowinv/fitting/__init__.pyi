@@ -1,15 +1,14 @@
 from ._fit import compare, fit
 from ._leave_one_out import leave_one_out
+from .left_out import LeaveOneOut
 from .result import Basin, Fit, FitReport, FittedField
 from .shots import FitShot, point_spread
-from .windows import FitWindows, LeaveOneOut
 
 __all__ = [
     "Basin",
     "Fit",
     "FitReport",
     "FitShot",
-    "FitWindows",
     "FittedField",
     "LeaveOneOut",
     "compare",

@@ -23,6 +23,7 @@ from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import finer, settle
 from napari_shadowinv.fitting.forward import Linear, Scene
+from napari_shadowinv.fitting.left_out import LeaveOneOut, check_count, explanation_of
 from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.fitting.rays import at_rest
@@ -38,7 +39,6 @@ from napari_shadowinv.fitting.search import (
 )
 from napari_shadowinv.fitting.shots import Images
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.windows import LeaveOneOut, check_count, explanation_of
 from napari_shadowinv.options import FitOptions
 
 _LEAST_AGREEING = 2

@@ -5,7 +5,7 @@ from .files import read_recipe, write_recipe
 from .film_files import read_pack, write_layers
 from .fit_run import run_comparison, run_fit, run_refinement
 from .inversion_run import Cache, Inputs, collect_inputs, run, run_prepared
-from .static_checks import run_leave_one_out, run_windows
+from .left_out import run_leave_one_out
 
 __all__ = [
     "Cache",
@@ -22,7 +22,6 @@ __all__ = [
     "run_leave_one_out",
     "run_prepared",
     "run_refinement",
-    "run_windows",
     "sweep_experiment",
     "write_layers",
     "write_recipe",

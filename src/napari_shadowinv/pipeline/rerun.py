@@ -21,8 +21,7 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind, to_figures
-from napari_shadowinv.fitting import Fit, FitShot
-from napari_shadowinv.fitting.windows import PREFIX
+from napari_shadowinv.fitting import Fit, FitShot, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset
@@ -31,7 +30,7 @@ from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import Shot, picture_mask, radiograph_of, run
-from napari_shadowinv.pipeline.static_checks import StaticChecks, run_checks
+from napari_shadowinv.pipeline.left_out import run_leave_one_out
 from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
 from napari_shadowinv.provenance import MaskOrigin, Origin, Provenance
 from napari_shadowinv.results import result_from_dataset
@@ -54,9 +53,9 @@ class Rerun:
     content : Inversion, Fit or FilmDoses
         The result.
     dataset : Dataset
-        All of it, with the images left out of a fit and its windows.
-    checks : StaticChecks
-        The images left out of a fit and its windows, if the first result has them.
+        All of it, with the images left out of a fit.
+    left_out : LeaveOneOut or None
+        The images left out of a fit, if the first result has them.
     changes : tuple of str
         Changes of the version and the files.
     difference : str
@@ -65,7 +64,7 @@ class Rerun:
 
     content: AnyResult
     dataset: xarray.Dataset
-    checks: StaticChecks
+    left_out: LeaveOneOut | None
     changes: tuple[str, ...]
     difference: str
 
@@ -111,30 +110,30 @@ class RerunInputs:
         return ResultKind.from_noun(self.provenance.kind)
 
     @property
-    def checks(self) -> dict[str, Any]:
-        """Keywords of `run_checks` for the checks of a fit that the first result has."""
-        numbers = self.dataset.get(f"{PREFIX}image_number")
-        window = None if numbers is None else int(numbers.sizes["member"])
-        return {"left_out": "left_out_chi2" in self.dataset, "window": window}
+    def leaves_out(self) -> bool:
+        """Whether the first result is a fit with each image left out in turn."""
+        return "left_out_chi2" in self.dataset
 
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Rerun:
         """Repeat the result, and compare it with the first."""
         callbacks: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
-        before, checks = self.provenance, StaticChecks()
+        before, left_out = self.provenance, None
         content: AnyResult
         if before.pack is not None:
             content = run_film(before.pack, **callbacks)
         elif self.kind is ResultKind.FIT:
-            content, checks = self._fit(**callbacks)
+            content, left_out = self._fit(**callbacks)
         else:
             content = self._invert(self.recipe, **callbacks)
-        dataset = checks.add_to(content.to_dataset())
+        dataset = content.to_dataset()
+        if left_out is not None:
+            dataset = left_out.added_to(dataset)
         after = Provenance.of(dataset.attrs)
         changes = [*self.changes, *([] if after is None else _image_changes(before, after))]
         difference = _difference(self.dataset, dataset)
-        return Rerun(content, dataset, checks, tuple(dict.fromkeys(changes)), difference)
+        return Rerun(content, dataset, left_out, tuple(dict.fromkeys(changes)), difference)
 
     def _invert(self, recipe: Recipe, **callbacks: Any) -> Inversion:
         (shot,) = self.shots
@@ -156,20 +155,23 @@ class RerunInputs:
         provenance = provenance.model_copy(update={"masks": self.masks})
         return replace(inversion, provenance=provenance)
 
-    def _fit(self, **callbacks: Any) -> tuple[Fit, StaticChecks]:
+    def _fit(self, **callbacks: Any) -> tuple[Fit, LeaveOneOut | None]:
         start, choices = self.provenance.start, self.recipe.fit
         if start is not None and choices is not None:
             inversion = self._invert(_with_dark(start.recipe, self.recipe.dark_file), **callbacks)
             setup = self.provenance.image.setup
-            return run_refinement(inversion, setup, choices, **callbacks), StaticChecks()
+            return run_refinement(inversion, setup, choices, **callbacks), None
         fit = run_fit(self.recipe, self.shots, **callbacks)
-        checks = run_checks(self.recipe, self.shots, fit, **self.checks, **callbacks)
+        left_out = None
+        if self.leaves_out:
+            fields = [field.name for field in fit.fields]
+            left_out = run_leave_one_out(self.recipe, self.shots, fields, **callbacks)
         assert fit.provenance is not None
         # Masks and rows were passed as arrays.
         origins: dict[str, Any] = {"masks": self.masks}
         if self.provenance.fiducial_rows is not None:
             origins["fiducials"] = self.provenance.fiducials
-        return replace(fit, provenance=fit.provenance.model_copy(update=origins)), checks
+        return replace(fit, provenance=fit.provenance.model_copy(update=origins)), left_out
 
 
 def rerun(
@@ -188,7 +190,7 @@ def rerun(
     Parameters
     ----------
     result : path, Dataset, Inversion, Fit or FilmDoses
-        An inversion, a fit with its images left out and windows, a film pack, or the dataset of
+        An inversion, a fit with its images left out, a film pack, or the dataset of
         one shot of a stack, which is inverted without another shot to start from.
     images : sequence of path, array_like or Radiograph, optional
         The images in their order. Default: the files that the provenance names, in the result's
@@ -482,9 +484,7 @@ def _difference(before: xarray.Dataset, after: xarray.Dataset) -> str:
         str(name)
         for name in before.data_vars
         # Fields in SI units follow from those in pixels, and the setup may be of a later choice.
-        if name in after.data_vars
-        and name not in _PAINTED
-        and not str(name).removeprefix(PREFIX).startswith(in_si)
+        if name in after.data_vars and name not in _PAINTED and not str(name).startswith(in_si)
     ]
     pairs: dict[str, tuple[Any, Any]] = {}
     for name in names:

@@ -3,7 +3,7 @@
 - the figure of any result: `result_figure`; of each kind: `report_figure`, `fit_figure`,
   `pack_figure`
 - products with their bands: `products_figure`; axes of their spectra: `make_logarithmic`
-- tests of one static field: `left_out_figure`, `windows_figure`
+- the test of one static field: `left_out_figure`
 - planned experiments: `plan_figure`, `sweep_figure`
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
 - a style of their own, whatever a user's matplotlibrc says: `own_style`
@@ -14,7 +14,7 @@ disturb the figures of a notebook.
 """
 
 from napari_shadowinv.plotting._film_figure import pack_figure
-from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure, windows_figure
+from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure
 from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
 from napari_shadowinv.plotting._panels import own_style
 from napari_shadowinv.plotting._plan_figure import plan_figure, sweep_figure
@@ -41,6 +41,5 @@ __all__ = [
     "save_figure",
     "stack_frames",
     "sweep_figure",
-    "windows_figure",
     "write_film",
 ]

@@ -1,12 +1,11 @@
 """Figures of fits, each on a page.
 
 - images and how they are explained, fields and verdict: `fit_figure`
-- tests of one static field: images left out, `left_out_figure`; windows, `windows_figure`
+- the test of one static field, images left out: `left_out_figure`
 """
 
 from __future__ import annotations
 
-import math
 import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -15,14 +14,13 @@ import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Fact, Level
-from napari_shadowinv.fitting import Fit, FittedField, FitWindows, LeaveOneOut
-from napari_shadowinv.fitting.windows import image_numbers
+from napari_shadowinv.fitting import Fit, FittedField, LeaveOneOut
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.significance import deviation_along
 from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR, Grid, Panel
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -185,48 +183,6 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     return figure
 
 
-def windows_figure(windows: FitWindows, *, title: str | None = None) -> Figure:
-    """Show the field of each group of neighbouring images, on one scale, and cuts through it.
-
-    Parameters
-    ----------
-    windows : FitWindows
-        Its setups give axes in metres, fields in SI units, energies and times of flight.
-    title : str, optional
-        A heading, such as the images' names.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
-    """
-    displacement = windows.displacement
-    count, fields, _, *shape = displacement.shape
-    columns = max(2, min(count + 1, math.ceil(math.sqrt(_PAGE_ASPECT * fields * (count + 1)))))
-    rows = -(-(count + 1) // columns)
-    verdicts = [
-        (f"{fact.title}: {fact.short}", ALARM_COLOUR)
-        for fact in windows.facts
-        if fact.level is not Level.SOUND
-    ]
-    sentences = verdicts or [(f"All {count} windows are determined.", GOOD_COLOUR)]
-    grid, header, heading = _page(shape, rows * fields, columns, sentences, title)
-    scale = _panels.image_scale(shape, windows.setup)
-    text = "All fields on one colour scale"
-    text += ", at the strength of the image displaced most." if windows.setup is None else "."
-    with _panels.new_page(grid, scale, heading, header, [(text, QUIET_COLOUR)]) as (figure, panels):
-        for m, field in enumerate(windows.fits[0].fields):
-            block = panels[m * rows * columns : (m + 1) * rows * columns]
-            deflector = deflector_titles()[field.name]
-            in_units = shown_fields(list(displacement[:, m]), windows.setup, deflector)
-            names = [f"{field.name}: " * (fields > 1) + _name(windows, w) for w in range(count)]
-            by_name = dict(zip(names, in_units, strict=True))
-            _panels.draw_side_by_side(block[: count + 1], by_name, common=True)
-            for panel in block[count + 1 :]:
-                panel.axes.remove()
-    return figure
-
-
 def _page(
     shape: Sequence[int],
     rows: int,
@@ -255,12 +211,3 @@ def _draw_left_out(
     panels[2].draw_differences(residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
     if fact.level is not Level.SOUND:
         panels[2].axes.set_title(title, color=ALARM_COLOUR)
-
-
-def _name(windows: FitWindows, window: int) -> str:
-    """Energy or wavelength and time of flight of a group, or its images."""
-    quantity, means, times = windows.beam_quantity, windows.beam_means, windows.times_of_flight
-    if quantity is None or means is None:
-        return image_numbers(windows.numbers[window]).capitalize()
-    time = "" if times is None else f", {times[window] * 1e12:.3g} ps"
-    return f"{quantity.text(means[window])}{time}"

@@ -1,0 +1,91 @@
+"""Test of one static field against several images: `run_leave_one_out`.
+
+Images are processed in order of energy, so results do not depend on their order in the call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting import FitShot, LeaveOneOut, leave_one_out
+from napari_shadowinv.fitting.left_out import check_count
+from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.fitting.shots import common_values
+from napari_shadowinv.options import FitChoices
+from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
+from napari_shadowinv.pipeline.inversion_run import Shot
+from napari_shadowinv.preprocessing import Recipe
+
+
+def run_leave_one_out(
+    recipe: Recipe,
+    shots: Sequence[FitShot | Shot],
+    fields: Sequence[str] | None = None,
+    *,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
+) -> LeaveOneOut:
+    """Predict each of several images of one object from a fit of the others, as `run_fit`.
+
+    Parameters
+    ----------
+    recipe : Recipe
+        Steps and options; without a section `fit` the defaults apply.
+    shots : sequence of FitShot, Radiograph, array_like or path
+        Three images or more, of one size after the steps.
+    fields : sequence of {"B", "E", "n"}, optional
+        The fields of the object. Default: those of the recipe.
+    on_progress, should_stop
+        As for `run_fit`.
+
+    Returns
+    -------
+    LeaveOneOut
+        Its images are in the order of `shots`.
+
+    Raises
+    ------
+    InputError
+        As `run_fit`, and if there are fewer than three images.
+    FileFormatError
+        If a file cannot be read.
+    InversionCancelled
+        If `should_stop` returned true.
+    """
+    check_count(len(shots))
+    if fields is not None:
+        choices = recipe.fit or FitChoices()
+        recipe = recipe.model_copy(
+            update={"fit": choices.model_copy(update={"fields": tuple(fields)})}
+        )
+    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
+    order = _order_by_energy(inputs)
+    left_out = leave_one_out(
+        **inputs.only(order).keywords,
+        fields=inputs.fields,
+        on_progress=on_progress,
+        should_stop=should_stop,
+    )
+    left_out = left_out.only([int(place) for place in np.argsort(order)])
+    return replace(left_out, setups=inputs.setups or (), names=inputs.names)
+
+
+def _order_by_energy(inputs: FitInputs) -> list[int]:
+    """Sort the images by energy, the most displaced first."""
+    sizes = np.abs(_strengths(inputs)[:, 0])
+    images = [shot.image.tobytes() for shot in inputs.shots]
+    return sorted(range(len(images)), key=lambda k: (-sizes[k], images[k]))
+
+
+def _strengths(inputs: FitInputs) -> FloatArray:
+    """Displacement of each image by each field, relative to the first image."""
+    strengths = common_values(inputs.names, [shot.strength for shot in inputs.recorded], "strength")
+    if strengths is None:
+        return strengths_of(inputs.setups, inputs.fields, len(inputs.shots), inputs.names)
+    matrix = np.array(strengths, dtype=np.float64)
+    return np.asarray(matrix / matrix[0])
