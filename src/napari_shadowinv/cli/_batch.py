@@ -35,7 +35,6 @@ from napari_shadowinv.cli._terminal import (
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.facts import Level, to_figures
-from napari_shadowinv.io.shot_columns import joined_columns
 from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
@@ -332,10 +331,7 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     is_damaged = bool(store.damage.shots or store.damage.files)
     if not every:
         return tables, is_damaged
-    joined = joined_columns(store.attributes)
-    own_columns = [column for column in store.columns if column.format and column not in joined]
-    listed = [_column_table(store, own_columns)]
-    listed += [_column_table(store, joined)] if joined else []  # of a shot table
+    listed = _column_table(store, [column for column in store.columns if column.format])
     # A column of the table above would leave them a few letters a line.
     notes: Rows = []
     for index, report in enumerate(store.reports()):
@@ -343,7 +339,7 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
         reason = report.get("reason")
         texts = [reason] if reason else [caution.text for caution in cautions]
         notes += [(f"shot {index}", text) for text in texts]
-    tables += [*listed, *([two_columns("Reasons and warnings", notes)] if notes else [])]
+    tables += [listed, *([two_columns("Reasons and warnings", notes)] if notes else [])]
     return tables, is_damaged
 
 
@@ -368,7 +364,6 @@ def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
     """Describe a store."""
     attributes = store.attributes
     seconds = [report["seconds"] for report in store.reports() if "stages" in report]
-    titles = [column.title for column in joined_columns(attributes)]
     fit = {}
     if store.field is not None:
         fit = {**json.loads(attributes["fit"]), "fields": json.loads(attributes["fields"])}
@@ -380,7 +375,6 @@ def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
         *_recipe_rows(store),
         *_beam_rows(store),
         ("stored", str(attributes["stored"])),
-        *([("shot table", ", ".join(titles))] if titles else []),
         *([("fit", options_text(fit))] if fit else []),
         ("options", options_text(json.loads(attributes["options"]))),
         *_site_rows(store),

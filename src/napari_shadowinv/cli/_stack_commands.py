@@ -37,7 +37,7 @@ shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr
 shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr --resume
 shadowinv batch 'shots/*.tif' --source-from polynomial --low-pass 1 --out night.shadowinv.zarr
 shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
-shadowinv batch run.h5::/entry/data/data --shot-table shots.csv --out run.shadowinv.zarr
+shadowinv batch run.h5::/entry/data/data --out run.shadowinv.zarr
 shadowinv batch pack.csv --setup setup.toml --out pack.shadowinv.zarr
 shadowinv batch shots.csv --fit --recipe recipe.toml --out fits.shadowinv.zarr
 

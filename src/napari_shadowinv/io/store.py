@@ -31,7 +31,6 @@ from napari_shadowinv.inversion.variables import (
 )
 from napari_shadowinv.io.files import check_folder_of
 from napari_shadowinv.io.formats import STORE
-from napari_shadowinv.io.shot_columns import joined_columns
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
 from napari_shadowinv.io.store_damage import (
     Damage,
@@ -83,14 +82,13 @@ def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
 
 
 def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[Column, ...]:
-    """Return the columns of a store, by its attributes; columns of a shot table last."""
-    joined = joined_columns(attributes)
+    """Return the columns of a store, by its attributes."""
     if fitted_field(attributes) is not None:
-        return *columns_of(FITS), *joined
+        return columns_of(FITS)
     if OWN_SETUPS not in attributes:
-        return *columns_of(INVERSIONS), *joined
+        return columns_of(INVERSIONS)
     kind = json.loads(attributes.get("setup", "{}")).get("kind", "proton")
-    return *columns_of(ROWS, kind), *joined
+    return columns_of(ROWS, kind)
 
 
 def read_attributes(path: Path) -> dict[str, Any]:

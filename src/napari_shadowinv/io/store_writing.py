@@ -4,7 +4,6 @@
 - make room for more shots: `grow_store`
 - write a shot, or why it failed, also in a worker: `ShotWriter`; gather numbers: `summarise`
 - a store that grows by one shot at a time while its run goes on: `GrowingStore`
-- columns of a shot table for a store that exists: `join_columns`
 
 The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
 by that copy. So a store changes its length in one moment: when that one file is replaced.
@@ -31,12 +30,10 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from napari_shadowinv._system.hidden_files import hidden_name
 from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import AnyArray
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import replacing
-from napari_shadowinv.io.shot_columns import JOINED, describe_columns, joined_columns
 from napari_shadowinv.io.store import (
     DONE,
-    FAILED,
     FORMAT,
     PENDING,
     SKIPPED,
@@ -157,61 +154,6 @@ def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
             "the file system is in sync on all machines, then run again to resume"
         )
     return arrays
-
-
-def join_columns(
-    store: StackStore, columns: Sequence[Column], rows: Sequence[Mapping[str, Any]]
-) -> StackStore:
-    """Join columns of a shot table to a store, and return it as it is now.
-
-    The values, `rows` for all shots, go into the reports of shots that have ended; a process killed
-    meanwhile leaves a store that can be joined again.
-    """
-    before = {column.key: column for column in joined_columns(store.attributes)}
-    for column in columns:
-        existing = before.get(column.key, column)
-        if (existing.unit, existing.kind) != (column.unit, column.kind):
-            raise InputError(
-                f"the shot table has '{column.key}' as {_kind_text(column)}, and {store.path} as "
-                f"{_kind_text(existing)}: correct the table, or rename the column"
-            )
-    joined = {**before, **{column.key: column for column in columns}}
-    with _as_store_errors(store.path), defer_interrupts():
-        new = [column for column in columns if column.key not in before]
-        if new:
-            _create_columns(store, new, describe_columns(joined.values()))
-        entries = {column.entry for column in columns}
-        reports = ShotWriter.of(store).arrays()["report"]
-        for index in np.flatnonzero(np.isin(store.statuses(), (DONE, FAILED))).tolist():
-            report = store.report(index)
-            kept = {key: value for key, value in report.items() if key not in entries}
-            changed = {**kept, **rows[index]}
-            if changed != report:
-                reports[index : index + 1] = np.array([json.dumps(changed)], dtype=object)
-    joined_store = StackStore(store.path)
-    summarise(joined_store)
-    return joined_store
-
-
-def _kind_text(column: Column) -> str:
-    if column.kind is str:
-        return "text"
-    return "numbers" if column.unit == "1" else f"numbers in {column.unit}"
-
-
-def _create_columns(store: StackStore, columns: Sequence[Column], description: str) -> None:
-    """Create the arrays of more columns; the folder lists them once all are there."""
-    shots = len(store.names)
-    group = zarr.open_group(store.path, mode="r+")
-    for column in columns:
-        shutil.rmtree(store.path / column.key, ignore_errors=True)  # left by a killed process
-        _create_array(group, column.key, _variable_of(column, shots), {"shot": shots})
-    with _changing_description(store.path) as document:
-        document["attributes"][JOINED] = description
-        for column in columns:
-            text = (store.path / column.key / "zarr.json").read_text(encoding="utf-8")
-            document["consolidated_metadata"]["metadata"][column.key] = json.loads(text)
-    _open_arrays.cache_clear()  # it has been opened without them
 
 
 def summarise(store: StackStore) -> None:

@@ -63,12 +63,6 @@ class RunOptions(_StoreOptions):
         "similar shots with a common source.",
         json_schema_extra={"metavar": "N"},
     )
-    shot_table: Path | None = Field(
-        default=None,
-        description="Table with a row for each shot (CSV, or HDF5 as file.h5::/entry/shots) that "
-        "is stored with the shots by the numbers in their names: energies, delays, remarks.",
-        json_schema_extra={"metavar": "FILE"},
-    )
     workers: int | None = Field(
         default=None,
         ge=1,

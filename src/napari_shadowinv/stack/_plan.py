@@ -32,10 +32,7 @@ from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source, 
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, split_address, text_of
 from napari_shadowinv.io.formats import format_of
-from napari_shadowinv.io.shot_columns import JOINED, ShotTable, describe_columns
 from napari_shadowinv.io.store import FORMAT
-from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
-from napari_shadowinv.io.store_damage import RECORD
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
@@ -101,29 +98,12 @@ class Stack:
     as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
     chained: bool = False  # whether each shot starts from an earlier one, without groups
     dtype: str = "float64"  # of fields in a store
-    columns: tuple[Column, ...] = ()  # of a shot table, whose rows the shots have
 
     @property
     def chooses_sites(self) -> bool:
         """Whether the number of sites still has to be derived from the accuracy."""
         is_adaptive = self.beam is not None and self.task.recipe.options.is_adaptive
         return is_adaptive and isinstance(self.task, InvertTask)
-
-    def with_table(self, table: ShotTable) -> Stack:
-        """Return the stack with the columns of a shot table; each shot has its row."""
-        kind = FITS if isinstance(self.task, FitTask) else ROWS if self.task.by_row else INVERSIONS
-        setup_kind = "proton" if self.task.setup is None else self.task.setup.kind
-        own_columns = (column.key for column in columns_of(kind, setup_kind))
-        of_store = {*self.task.labels, *coordinates_of(self), *own_columns, *RECORD, "setup"}
-        for column in table.columns:
-            if column.key in of_store:
-                raise InputError(
-                    f"the shot table has the column '{column.key}', a name that the store uses "
-                    "itself: rename the column"
-                )
-        rows = zip(self.shots.items, table.rows_of(self.shots.names), strict=True)
-        items = [replace(shot, entries=entries) for shot, entries in rows]
-        return replace(self, shots=replace(self.shots, items=items), columns=table.columns)
 
     def with_sites(self, n_sites: int) -> Stack:
         assert isinstance(self.task, InvertTask)
@@ -494,8 +474,7 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
 
 def attributes_of(stack: Stack) -> dict[str, str]:
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.task.setup).attrs
-    joined = {JOINED: describe_columns(stack.columns)} if stack.columns else {}
-    return {"format": FORMAT, **attributes, **stack.task.attributes, **joined}
+    return {"format": FORMAT, **attributes, **stack.task.attributes}
 
 
 def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:

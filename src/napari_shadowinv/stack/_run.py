@@ -32,7 +32,6 @@ from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
-from napari_shadowinv.io.shot_columns import read_shot_table
 from napari_shadowinv.io.store import (
     DONE,
     FAILED,
@@ -50,7 +49,6 @@ from napari_shadowinv.io.store_writing import (
     Variable,
     create_store,
     grow_store,
-    join_columns,
     remove_unfinished,
     summarise,
 )
@@ -221,8 +219,6 @@ def run_stack(
         shots, recipe, source, mask, source_mask, reader, variables, run.warm_start
     )
     stack = replace(stack, dtype=run.dtype)
-    if run.shot_table is not None:
-        stack = stack.with_table(read_shot_table(run.shot_table))
     again = (PENDING, SKIPPED, *([FAILED] if run.redo_failed else []))
 
     on_progress = on_progress or (lambda _: None)
@@ -240,9 +236,6 @@ def run_stack(
             stack = resume(store, stack)
             remove_unfinished(path)
             store = reopen_damaged(store)
-            if stack.columns:
-                rows = [shot.entries for shot in stack.shots.items]
-                store = join_columns(store, stack.columns, rows)
             arrived = len(stack.shots) > len(store.names)
             if not arrived and not np.isin(store.statuses(), again).any():
                 summarise(store)  # the last run may have been killed before it did
@@ -390,8 +383,7 @@ class _Run:
             lost = [index for index in batch if index in self._todo]
             outcomes = [ShotOutcome(index, FAILED, 0.0, str(error)) for index in lost]
             for index in lost:
-                entries = self._stack.shots.items[index].entries
-                self._writer.write(index, {}, {"reason": str(error), **entries}, FAILED)
+                self._writer.write(index, {}, {"reason": str(error)}, FAILED)
         if outcomes is None:
             return False
         for outcome in outcomes:

@@ -318,7 +318,6 @@ class Shot:
     name: str  # for messages and tables
     images: ImageReference
     source: Shot | None = None  # as measured, unless it is shared or estimated
-    entries: Mapping[str, Any] = field(default_factory=dict)  # of a shot table, for its report
 
     @property
     def rows(self) -> tuple[ShotRow, ...]:

@@ -580,7 +580,6 @@ def try_shot(
     except Exception as error:
         # No error of a reader or a solver may stop the other shots.
         failure = failure_text(error)
-    origin = {**origin, **shot.entries}
     return Attempt(began, time.perf_counter() - began, origin, result, failure)
 
 
