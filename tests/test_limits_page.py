@@ -39,6 +39,12 @@ def test_the_blocks_print_what_the_page_shows(names):
     assert_same_but_for_rounding(without_solver(names["printed"]), without_solver(shown))
 
 
+def test_the_first_line_of_the_page_is_that_of_its_shot(names):
+    (line,) = re.findall(r"^> (.*)$", PAGE, re.MULTILINE)
+    headline = names["result"].headline
+    assert line == f"{headline.level.value.capitalize()}: {headline.text}"
+
+
 def test_the_commands_of_the_page_run(names):
     commands = re.findall(r"^    shadowinv (.*)$", PAGE, re.MULTILINE)
     assert len(commands) == 2

@@ -69,6 +69,12 @@ def decimals_of(error: float) -> int:
     return max(0, 1 - math.floor(math.log10(error)))
 
 
+def round_down(number: float) -> float:
+    """Round a positive number down to one digit."""
+    step = 10.0 ** math.floor(math.log10(number))
+    return float(f"{math.floor(number / step + 1e-9) * step:.1g}")
+
+
 def with_error(value: float, error: float, sign: str = "") -> str:
     """Write a number with its error, to two figures of the error; "+" writes every sign.
 
@@ -169,19 +175,39 @@ class Level(StrEnum):
     """How far a result can be trusted."""
 
     SOUND = "sound"
+    CONDITIONAL = "depends on the beam"
     DOUBTFUL = "doubtful"
     FAILED = "failed"
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the work was done: commands exit with 0, and no face warns.
+
+        What nobody measured is a condition of the result, not a fault.
+        """
+        return self in (Level.SOUND, Level.CONDITIONAL)
 
 
 class Verdict(StrEnum):
     """Whether the field of an inversion or a fit is known, and why not."""
 
     DETERMINED = "determined"
+    CONDITIONAL = "depends on the beam"
     SEVERAL = "one of several"
     AMBIGUOUS = "one image cannot tell"
     UNCERTAIN = "too uncertain"
     EDGE = "reaches the edge"
     MISFIT = "does not fit"
+
+    @property
+    def level(self) -> Level:
+        """How far a result with this verdict can be trusted, if it has no warnings."""
+        levels = {Verdict.DETERMINED: Level.SOUND, Verdict.CONDITIONAL: Level.CONDITIONAL}
+        return levels.get(self, Level.DOUBTFUL)
+
+    def explain(self, reason: str) -> str:
+        """Return a reason after the verdict; a condition begins with its number instead."""
+        return reason if self is Verdict.CONDITIONAL else f"{self.upper()}: {reason}"
 
 
 @dataclass(frozen=True)
@@ -191,8 +217,7 @@ class Headline:
     Attributes
     ----------
     level : Level
-        Sound if the field is determined and there are no warnings, failed if the solver did not
-        converge, else doubtful.
+        Failed if the solver did not converge, doubtful with a warning, else that of the verdict.
     text : str
         The verdict and its reason, the warnings in a few words, the peak of the main field with
         its error.
@@ -238,8 +263,7 @@ def in_headline(cautions: Iterable[Caution]) -> list[str]:
 
 def verdict_fact(verdict: Verdict) -> Fact:
     """Return a verdict, whose reason is in the headline."""
-    level = Level.SOUND if verdict is Verdict.DETERMINED else Level.DOUBTFUL
-    return Fact("verdict", "Verdict", str(verdict), level, short=str(verdict))
+    return Fact("verdict", "Verdict", str(verdict), verdict.level, short=str(verdict))
 
 
 def caution_facts(cautions: Iterable[Caution]) -> list[Fact]:

@@ -13,7 +13,7 @@ from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.verdict import assess_verdict
-from napari_shadowinv.options import FitOptions
+from napari_shadowinv.options import FitOptions, Instrument
 
 
 def blob(middle: tuple[int, int]) -> FloatArray:
@@ -38,6 +38,7 @@ GOOD: dict[str, Any] = {
     "hidden": 0.0,
     "parts": {},
     "options": FitOptions(max_error=0.05),
+    "instrument": Instrument(beam_rms=0.01),
 }
 
 
@@ -52,6 +53,7 @@ def assess(
     displacement: FloatArray,
     used: BoolArray,
     options: FitOptions,
+    instrument: Instrument,
     **facts: Any,
 ) -> tuple[Verdict, str]:
     """Return the verdict on a fit with these errors and other facts.
@@ -61,11 +63,12 @@ def assess(
     solutions = [(0.0, 0.0), *rivals]
     mask = np.tile(used, (len(chi2), 1, 1))
     planes, of_each = np.zeros(mask.shape), np.ones(len(chi2))
+    errors = np.full(displacement.shape, 0.02)
     fit = Fit(
         images=planes,
         mask=mask,
         strengths=of_each[:, None],
-        fields=(FittedField("B", planes[0], displacement, None, (1.0, 1.0)),),
+        fields=(FittedField("B", planes[0], displacement, errors, (1.0, 1.0)),),
         source=planes,
         brightness=of_each,
         frames=np.zeros((len(chi2), 6)),
@@ -79,6 +82,7 @@ def assess(
         explanation="",
         report=FitReport(0.0, 1, ended, {}, uncertainty, beam=beam, parts=parts),
         options=options,
+        instrument=instrument,
     )
     return assess_verdict(fit, **facts)
 
@@ -193,14 +197,45 @@ def test_verdict_names_a_mask_over_the_strongest_structure(hidden: float, expect
     assert ("mask hides" in why) == (hidden > 0.5)
 
 
-@pytest.mark.parametrize(("share", "expected"), [(0.03, "determined"), (0.2, "too uncertain")])
-def test_verdict_asks_for_the_beam_where_it_was_assumed(share: float, expected: str) -> None:
+@pytest.mark.parametrize(
+    ("share", "expected"), [(0.03, Verdict.DETERMINED), (0.2, Verdict.CONDITIONAL)]
+)
+def test_a_beam_that_was_assumed_is_a_condition(share: float, expected: Verdict) -> None:
     beam = BeamError(sensitivity=0.1, variation=0.05, share=share, scale=0.25, assumed=True)
     verdict, why = assess(**GOOD | {"beam": beam})
-    assert verdict == expected
+    assert verdict is expected
     if share > 0.05:
-        # √(0.05² - 0.02²) / 0.1
-        assert "measure the beam to 0.5 %" in why
+        # 1 % × √(0.05² - 0.02²) / 0.1, and √(0.02² + 0.2²)
+        assert why.startswith("peak |d| 1.000")
+        assert "if the beam is even to 0.4 %; ± 0.02 (field 20 %) if it is 5 % uneven" in why
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"hidden": 0.8},
+        {"uncertainty": 0.06},
+        {"ended": False},
+        {"pattern": Pattern(np.array([9.0, 1.0]))},
+        {"displacement": blob((46, 24))},
+    ],
+)
+def test_an_assumed_beam_excuses_no_other_fault(fault: dict[str, Any]) -> None:
+    beam = BeamError(sensitivity=0.1, variation=0.05, share=0.2, scale=0.25, assumed=True)
+    verdict, _ = assess(**GOOD | {"beam": beam} | fault)
+    assert not verdict.level.is_success
+
+
+def test_a_beam_that_was_assumed_is_a_condition_of_a_fit_with_other_numbers() -> None:
+    of_beam: dict[str, Any] = {"uncertainty": 0.1, "parts": {"beam": 0.09, "gamma": 0.04}}
+    film = Instrument(gamma=0.03)
+    big: dict[str, Any] = {"displacement": np.pad(blob((24, 24)), ((0, 0), (20, 20), (20, 20)))}
+    big |= {"used": np.ones((88, 88), bool)}
+    assert assess(**GOOD | big | of_beam)[0] is Verdict.UNCERTAIN  # stated
+    assert assess(**GOOD | big | of_beam | {"instrument": film})[0] is Verdict.UNCERTAIN  # doubled
+    of_beam["parts"] = {"beam": 0.09, "background": 0.04}
+    film = Instrument(background=0.03)
+    assert assess(**GOOD | big | of_beam | {"instrument": film})[0] is Verdict.CONDITIONAL
 
 
 @pytest.mark.parametrize(

@@ -61,6 +61,30 @@ def test_the_total_against_the_largest_error_decides_the_verdict(image):
         assert (again.headline.level is Level.SOUND) == (verdict is Verdict.DETERMINED)
 
 
+def test_a_beam_that_nobody_measured_is_a_condition_unless_more_is_wrong(image):
+    inversion = invert(image, options=FEW)
+    errors = inversion.errors
+    assert inversion.verdict is Verdict.CONDITIONAL
+    headline = inversion.headline
+    assert headline.level is Level.CONDITIONAL
+    assert headline.level.is_success
+    # What it says of an even beam is what an inversion with that beam says.
+    stated = re.fullmatch(
+        r"peak \|d\| ([\d.]+) ± ([\d.]+) px if the beam is even to ([\d.]+) %; ± ([\d.]+) "
+        r"\(field ([\d.]+) %\) if it is 5 % uneven \(assumed\). Record a reference.",
+        headline.text,
+    )
+    peak, if_even, even, if_uneven, share = map(float, stated.groups())
+    known = invert(image, options=FEW, instrument={"beam_rms": even / 100})
+    assert known.verdict is Verdict.DETERMINED
+    assert if_even == pytest.approx(known.errors.total.at_peak, rel=0.05)
+    assert if_uneven == pytest.approx(errors.total.at_peak, rel=0.05)
+    assert (peak, share / 100) == pytest.approx((errors.peak, errors.share), rel=0.05)
+    for fault in ({"beam_rms": 0.05}, {"background": 0.5}):
+        assert invert(image, options=FEW, instrument=fault).verdict is Verdict.UNCERTAIN
+    assert inversion.with_warnings([Caution("flux", "")]).headline.level is Level.DOUBTFUL
+
+
 def test_the_error_of_the_energy_counts_for_the_field_alone(image):
     instrument = {"beam_rms": 0.0, "energy": 0.4}
     inversion = invert(image, options=FEW, instrument=instrument)

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import h5py
@@ -23,9 +24,10 @@ from rich.console import Console
 from typer.testing import Result
 
 from helpers.command_line import flat, interrupted, shadowinv
-from napari_shadowinv import InversionOptions, invert, read
+from napari_shadowinv import InversionOptions, invert, read, synthetic_image
 from napari_shadowinv.cli._batch import progress_columns
 from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.facts import Level, Verdict
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.provenance import Provenance
 
@@ -585,16 +587,29 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
 
 def test_status_counts_verdicts_and_lists_warnings_once(store):
     reports = StackStore(store).reports()
-    assert {report["level"] for report in reports} <= {"sound", "doubtful", "failed"}
+    assert {report["level"] for report in reports} <= set(Level)
     assert all("peak" in report["headline"] for report in reports)
     doubtful = [report for report in reports if report["level"] == "doubtful"]
     assert all(report["warnings"] for report in doubtful)
     text = flat(shadowinv("status", store).output)
-    determined = sum(report["verdict"] == "determined" for report in reports)
-    assert f"{determined} determined" in text
+    shots = Counter(report["verdict"] for report in reports)
+    assert f"{shots['determined']} determined" in text
     codes = {caution["code"] for report in doubtful for caution in report["warnings"]}
-    verdicts = {report["verdict"] for report in reports} - {"determined"}
+    verdicts = {verdict for verdict in shots if not Verdict(verdict).level.is_success}
     assert text.count("warning ") == len(codes) + len(verdicts)
+
+
+def test_shots_whose_beam_nobody_recorded_are_a_success(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    y, x = (np.indices((48, 48)) - 24) / 5
+    lens = 0.8 * np.exp(-(y**2 + x**2) / 2) * np.stack([y, x])
+    for number in (1, 2):
+        np.save(f"{number}.npy", synthetic_image(number * lens))
+    threads = "--scheduler", "threads"
+    run = shadowinv("batch", "1.npy", "2.npy", "--out", "b.shadowinv.zarr", *threads)
+    assert run.exit_code == 0
+    rows = flat(shadowinv("status", "b.shadowinv.zarr").output)
+    assert "0 determined, 2 depends on the beam" in rows
 
 
 def test_arrays_of_a_file_are_shots_source_mask_and_rows(night, folder):

@@ -196,7 +196,12 @@ def main_layers(layer_data: Sequence[_LayerTuple], also: Collection[str] = ()) -
     ]
 
 
-_MARKS = {Level.SOUND: "✓ ", Level.DOUBTFUL: "? ", Level.FAILED: "✗ "}
+_MARKS = {
+    Level.SOUND: "✓ ",
+    Level.CONDITIONAL: "± ",
+    Level.DOUBTFUL: "? ",
+    Level.FAILED: "✗ ",
+}
 
 
 def layer_name(title: str, name: str, level: Level | None = None) -> str:

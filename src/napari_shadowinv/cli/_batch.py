@@ -34,7 +34,7 @@ from napari_shadowinv.cli._terminal import (
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import Level, to_figures
+from napari_shadowinv.facts import Verdict, to_figures
 from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
@@ -59,7 +59,6 @@ _BAR_COLUMNS = 16
 _MAX_LISTED = 10  # shots that a row lists
 _LINE_COLUMNS = 100
 _MIN_NAME_COLUMNS = 12
-_DETERMINED = "determined"  # the only verdict of a reliable fit
 
 
 def _rate_text(status: RunStatus) -> str:
@@ -137,11 +136,15 @@ def exit_unless_reliable(store: StackStore) -> None:
         raise typer.Exit(EXIT_FAILED_SHOTS)
     for status, report in zip(statuses, store.reports(), strict=True):
         codes = {caution["code"] for caution in report.get("warnings", ())}
-        is_sound = report.get("verdict") == _DETERMINED and "samples" not in codes
+        is_sound = _is_success(report.get("verdict", "")) and "samples" not in codes
         if "level" in report:  # an inversion
             is_sound = report.get("converged")
         if status == DONE and not is_sound:
             raise typer.Exit(EXIT_NOT_CONVERGED)
+
+
+def _is_success(verdict: str) -> bool:
+    return verdict in list(Verdict) and Verdict(verdict).level.is_success
 
 
 def progress_columns() -> tuple[progress.ProgressColumn, ...]:
@@ -302,16 +305,19 @@ def _list_text(names: Sequence[str]) -> str:
 
 
 def _verdict_rows(store: StackStore) -> Rows:
-    """Count the shots that are determined, and list the others by their verdict."""
+    """Count the shots whose verdict is a success, and list the others by their verdict."""
     shots: dict[str, list[str]] = {}
     for name, report in zip(store.names, store.reports(), strict=True):
         if "verdict" in report:
             shots.setdefault(str(report["verdict"]), []).append(name)
-    determined = shots.pop(_DETERMINED, [])
-    rows = [("verdicts", f"{len(determined)} {_DETERMINED}")] if determined or shots else []
-    return rows + [
+    if not shots:
+        return []
+    shots = {Verdict.DETERMINED.value: [], **shots}
+    listed = [f"{len(shots[each])} {each}" for each in shots if _is_success(each)]
+    return [("verdicts", ", ".join(listed))] + [
         ("warning", f"{len(names)} {verdict}: {_list_text(names)}")
         for verdict, names in shots.items()
+        if not _is_success(verdict)
     ]
 
 
@@ -430,14 +436,14 @@ class _WatchPrinter:
         assert result is not None
         summary = "  ".join(fact.short for fact in result.facts if fact.short)
         summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}"
-        # Any other verdict implies its warnings.
-        if result.verdict == _DETERMINED and (count := len(result.cautions)):
+        # A verdict that is no success implies its warnings.
+        if result.verdict.level.is_success and (count := len(result.cautions)):
             summary += f", {count} warning{'s' if count > 1 else ''}"
         columns = max(_LINE_COLUMNS - len(summary), _MIN_NAME_COLUMNS)
         if len(name) > columns:  # its end identifies the file
             name = f"…{name[1 - columns :]}"
-        is_sound = result.headline.level is Level.SOUND
-        self._print(self.out, f"{name}{summary}", "" if is_sound else "yellow")
+        is_success = result.headline.level.is_success
+        self._print(self.out, f"{name}{summary}", "" if is_success else "yellow")
         for warning in result.cautions:
             if warning.code not in self.warned:
                 self.warned.add(warning.code)

@@ -19,7 +19,13 @@ if TYPE_CHECKING:
 
 Rows = list[tuple[str, str]]
 
-_STYLES = {"warning": "yellow", "sound": "green", "doubtful": "bold yellow", "failed": "bold red"}
+_STYLES = {
+    "warning": "yellow",
+    "sound": "green",
+    "depends on the beam": "cyan",
+    "doubtful": "bold yellow",
+    "failed": "bold red",
+}
 
 
 def two_columns(title: str, rows: Rows) -> Table:

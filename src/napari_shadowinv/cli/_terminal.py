@@ -21,7 +21,7 @@ from pydantic import ValidationError
 
 from napari_shadowinv._system.machine import ENDING_SIGNALS, handling
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import ResultKind, Verdict, to_figures
+from napari_shadowinv.facts import ResultKind, to_figures
 from napari_shadowinv.physics.beam import setup_warnings
 
 if TYPE_CHECKING:
@@ -186,7 +186,7 @@ def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
 
 
 def exit_unless_sound(result: Any, out: Path, left_out: LeaveOneOut | None = None) -> None:
-    """Exit with an error code if an inversion did not converge or a fit is not determined.
+    """Exit with an error code if an inversion did not converge or a fit is doubtful.
 
     Also if a static field does not explain an image that was left out.
     """
@@ -202,7 +202,7 @@ def exit_unless_sound(result: Any, out: Path, left_out: LeaveOneOut | None = Non
             f"{to_figures(report.residual)} (tolerance {to_figures(report.tolerance)}): do not "
             "trust the field"
         )
-    elif verdict not in (None, Verdict.DETERMINED):
+    elif verdict is not None and not verdict.level.is_success:
         text = f"{verdict.upper()}: {out} was written, but {result.explanation}"
     elif doubts := [each.text for each in result.cautions if each.code == "samples"]:
         text = f"UNRELIABLE ERROR BARS: {out} was written, but {doubts[0]}"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
@@ -35,7 +36,7 @@ from napari_shadowinv.fitting.instrument import TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.variables import FIT_VARIABLES, belongs, dataset_from_field
-from napari_shadowinv.options import FitOptions, Instrument
+from napari_shadowinv.options import ASSUMED_BEAM, FitOptions, Instrument
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.physics.significance import (
     PixelErrors,
@@ -47,6 +48,7 @@ from napari_shadowinv.physics.significance import (
 from napari_shadowinv.physics.units import (
     FLUX_DENSITY,
     PIXEL,
+    BeamCondition,
     PeakError,
     ShownField,
     label,
@@ -419,8 +421,8 @@ class Fit(Summarised):
 
     @property
     def cautions(self) -> tuple[Caution, ...]:
-        """Reasons to doubt the result: its verdict, unless determined, and of its images."""
-        if self.verdict is Verdict.DETERMINED:
+        """Reasons to doubt the result: its verdict, unless it is a success, and of its images."""
+        if self.verdict.level.is_success:
             return self.warnings
         text = f"the fit's verdict is '{self.verdict}': {self.explanation}"
         return (Caution("verdict", text), *self.warnings)
@@ -428,8 +430,8 @@ class Fit(Summarised):
     @property
     def headline(self) -> Headline:
         """Verdict and its reason, warnings and convergence in one line."""
-        texts = [f"{self.verdict.upper()}: {self.explanation}", *in_headline(self.warnings)]
-        level = Level.DOUBTFUL if self.cautions else Level.SOUND
+        texts = [self.verdict.explain(self.explanation), *in_headline(self.warnings)]
+        level = Level.DOUBTFUL if self.cautions else self.verdict.level
         if not self.report.converged:
             level = Level.FAILED
             texts.append(f"not converged in {self.report.iterations} steps")
@@ -448,11 +450,10 @@ class Fit(Summarised):
         names : sequence of str
             A name for each image, or none.
         """
-        is_determined = self.verdict is Verdict.DETERMINED
-        level = Level.SOUND if is_determined else Level.DOUBTFUL
+        level = self.verdict.level
         return (
             verdict_fact(self.verdict),
-            Fact("verdict", "Reason" if is_determined else "Warning", self.explanation, level),
+            Fact("verdict", "Reason" if level.is_success else "Warning", self.explanation, level),
             *caution_facts(self.warnings),
             *self._image_facts(names),
             *(self._field_fact(field) for field in self.fields),
@@ -496,6 +497,32 @@ class Fit(Summarised):
         cause = f"energy, {percent(self.instrument.energy)}"
         cause = cause if by_energy > share else self.report.error_name
         return PeakError(float(np.hypot(share, by_energy)), cause)
+
+    def beam_condition(self, share: float) -> BeamCondition | None:
+        """Return the condition on a beam that was assumed; None if that is not all that it takes.
+
+        Parameters
+        ----------
+        share : float
+            Largest total of the displacement (r.m.s.).
+        """
+        report, beam, field = self.report, self.report.beam, self.fields[0]
+        if beam is not None and beam.assumed:
+            variation, left_open = beam.variation, beam.share
+            by_beam = 100 * beam.sensitivity * variation  # the images exclude part of it
+        elif "beam" in report.parts and self.instrument.beam_rms is None:
+            variation, by_beam = ASSUMED_BEAM.rms, report.parts["beam"]
+            left_open = by_beam
+        else:
+            return None
+        rest = math.sqrt(max(report.total**2 - left_open**2, 0.0))
+        (shown,) = shown_fields([field.displacement], None, mask=self.used)
+        at_peak = field.error_at(*shown.peak)
+        scale = at_peak / report.total
+        peak = scale * rest, scale * by_beam
+        condition = BeamCondition.within(share, variation, (rest, by_beam), peak)
+        totals = {"peak_if_uneven": at_peak, "field_if_uneven": report.total}
+        return condition and condition._replace(**totals)
 
     @property
     def _origins(self) -> tuple[ImageOrigin, ...]:

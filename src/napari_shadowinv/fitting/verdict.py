@@ -23,6 +23,8 @@ from napari_shadowinv.inversion.solution_checks import (
     inner_sides,
     turning_displacement,
 )
+from napari_shadowinv.physics.setup import deflector_titles
+from napari_shadowinv.physics.units import shown_fields
 
 _MIN_HOLE_RADIUS_PX = 6.0
 _RIM_PX = 4
@@ -129,7 +131,7 @@ def assess_verdict(
         Whether the fit has started from several fields.
     """
     report, chi2, used = fit.report, fit.chi2, fit.used
-    uncertainty, parts, beam = report.uncertainty, report.parts, report.beam
+    uncertainty, parts = report.uncertainty, report.parts
     max_error = fit.options.max_error
     displacement = np.sum([field.displacement for field in fit.fields], axis=0)
     names = [f"image {k + 1}" for k in range(len(chi2))]
@@ -200,8 +202,9 @@ def assess_verdict(
             "known"
         )
     is_small = min(used.shape) < SMALL_PX
-    safety = _SAFETY if is_small or _UNDERESTIMATED & parts.keys() else 1.0
-    if parts and safety * uncertainty > max_error:
+    safety = _SAFETY if parts and (is_small or _UNDERESTIMATED & parts.keys()) else 1.0
+    condition = fit.beam_condition(max_error / safety)
+    if not condition and parts and safety * uncertainty > max_error:
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
         text = f"errors of {uncertainty:.1%} of the displacement (r.m.s.): {ranking}; "
         if uncertainty <= max_error:
@@ -211,19 +214,10 @@ def assess_verdict(
         return Verdict.UNCERTAIN, (
             f"{text}{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
         )
-    if uncertainty > max_error:
+    if not condition and uncertainty > max_error:
         return Verdict.UNCERTAIN, (
             f"the noise leaves {uncertainty:.0%} of the displacement open (r.m.s.): average "
             "shots, or take images at energies that differ more"
-        )
-    if beam is not None and np.hypot(uncertainty, beam.share) > max_error:
-        allowed = np.sqrt(max_error**2 - uncertainty**2) / beam.sensitivity
-        origin = "was assumed, not measured" if beam.assumed else "is known to that only"
-        return Verdict.UNCERTAIN, (
-            f"the beam {origin}: if it differs by {beam.variation:.1%} (r.m.s.) over "
-            f"{to_figures(beam.scale)} of the image, the displacement is off by {beam.share:.0%} "
-            f"(r.m.s.); measure the beam to {allowed:.1g} % and give it as the source, state its "
-            "variation, or fit it with several energies, as a source that is unknown"
         )
     if not report.converged:
         return Verdict.UNCERTAIN, (
@@ -238,6 +232,11 @@ def assess_verdict(
         )
     if at_edge:
         return Verdict.EDGE, at_edge
+    if condition and safety * report.total > max_error:
+        setup, field = fit.setup, fit.fields[0]
+        deflector = deflector_titles()[field.name]
+        (shown,) = shown_fields([field.displacement], setup, deflector, mask=used)
+        return Verdict.CONDITIONAL, shown.conditional_text(condition)
     unchecked = "" if np.isfinite(uncertainty) else "; error bars were not worked out"
     if np.isfinite(uncertainty) and _share_squeezed(jacobian, displacement, 0.0) > _DEEP_FOLDS:
         times = _BARS_DEEP_FOLDS_AND_BEAM if beam_unknown else _BARS_DEEP_FOLDS

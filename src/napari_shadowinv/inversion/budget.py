@@ -25,7 +25,7 @@ from scipy.spatial import KDTree
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.facts import percent, to_figures
+from napari_shadowinv.facts import percent, round_down, to_figures
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
     SolvedShot,
@@ -36,7 +36,7 @@ from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument, InversionOptions
-from napari_shadowinv.physics.units import PeakError
+from napari_shadowinv.physics.units import BeamCondition, PeakError
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, Level, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
@@ -214,6 +214,21 @@ class Errors:
         lengths = {0.25: "a quarter", 0.5: "half"}
         return lengths.get(self.beam_scale, to_figures(self.beam_scale))
 
+    def beam_condition(self, share: float) -> BeamCondition | None:
+        """Return the condition on a beam that was assumed; None if that is not all that it takes.
+
+        Parameters
+        ----------
+        share : float
+            Largest total of the displacement (r.m.s.).
+        """
+        if self.beam is None or self.beam_basis != "assumed" or not self.rms > 0:
+            return None
+        rest = replace(self, beam=None).total
+        field = rest.rms / self.rms, self.beam.rms / self.rms
+        peak = rest.at_peak / self.peak, self.beam.at_peak / self.peak
+        return BeamCondition.within(share, self.beam_variation, field, peak)
+
     def measure_next(self, share: float) -> str:
         """Return what has to be known better for a total of at most `share`, and that total.
 
@@ -266,7 +281,7 @@ class Errors:
         unit, scale, power = "%", 100.0, 1.0
         if known is not None:
             unit, scale, power = known.unit, known.factor, 2.0 if known.is_even else 1.0
-        rounded = _round_down(scale * size * factor ** (1 / power))
+        rounded = round_down(scale * size * factor ** (1 / power))
         text = f"the {title} known to {to_figures(rounded)} {unit}".rstrip()
         return text, (rounded / scale / size) ** power
 
@@ -712,12 +727,6 @@ def _near(peak: FloatArray, places: FloatArray, spacing: float) -> FloatArray:
 
 def _roots(square: float, square_at_peak: float) -> ErrorEstimate:
     return ErrorEstimate(math.sqrt(square), math.sqrt(square_at_peak))
-
-
-def _round_down(number: float) -> float:
-    """Return a positive number with one digit."""
-    step = 10.0 ** math.floor(math.log10(number))
-    return float(f"{math.floor(number / step + 1e-9) * step:.1g}")
 
 
 def _share_text(error: float, total: float) -> str:

@@ -302,6 +302,9 @@ class Inversion(Summarised):
         text = f"errors of {errors.share_text} of the {self._subject(errors)} (r.m.s.)"
         if errors.share <= max_error:
             return Assessment(Verdict.DETERMINED, f"{text}, the largest by {errors.limited_by}")
+        if condition := errors.beam_condition(max_error):
+            (field,) = shown_fields([self.displacement], setup, mask=self.mask)
+            return Assessment(Verdict.CONDITIONAL, field.conditional_text(condition))
         parts = [f"{text}: {errors.largest_part}", errors.measure_next(max_error)]
         if errors.share > _MAX_LINEAR:
             parts.append(
@@ -326,13 +329,14 @@ class Inversion(Summarised):
         error = None if errors is None else errors.of_peak
         (field,) = shown_fields([self.displacement], setup, mask=self.mask)
         assessment, cautions = self.assess_in(setup), self.report.warnings
-        texts = [f"{assessment.verdict.upper()}: {assessment.reason}"]
+        texts = [assessment.verdict.explain(assessment.reason)]
         texts += in_headline(each for each in cautions if each is not assessment.caution)
-        is_sound = assessment.verdict is Verdict.DETERMINED and not cautions
-        level = Level.SOUND if is_sound else Level.DOUBTFUL
+        level = Level.DOUBTFUL if cautions else assessment.verdict.level
         if not self.report.converged:
             level = Level.FAILED
-        return Headline(level, "; ".join([*texts, field.peak_text(error)]))
+        if assessment.verdict is not Verdict.CONDITIONAL:
+            texts.append(field.peak_text(error))
+        return Headline(level, "; ".join(texts))
 
     @property
     def facts(self) -> tuple[Fact, ...]:

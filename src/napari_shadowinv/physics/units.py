@@ -15,6 +15,7 @@ coordinates on to it. For pint ``px`` is a length, 1/96 inch, and ``flux`` a fem
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -23,7 +24,7 @@ import numpy as np
 
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.facts import Fact, with_error
+from napari_shadowinv.facts import Fact, percent, round_down, to_figures, with_error
 
 if TYPE_CHECKING:
     import xarray
@@ -53,6 +54,33 @@ def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> t
         return 1.0, ""
     power = max((p for p in allowed if largest >= 10.0**p), default=min(allowed))
     return 10.0**-power, _PREFIXES[power]
+
+
+class BeamCondition(NamedTuple):
+    """Errors of a field whose beam nobody measured, as shares of it, at two unevennesses."""
+
+    even: float  # relative r.m.s. of a beam that leaves the field determined
+    uneven: float  # of the beam that is assumed
+    peak_if_even: float
+    peak_if_uneven: float
+    field_if_uneven: float  # r.m.s.
+
+    @classmethod
+    def within(
+        cls, largest: float, uneven: float, field: tuple[float, float], peak: tuple[float, float]
+    ) -> BeamCondition | None:
+        """Return the condition for a total error of the field (r.m.s.) of at most `largest`.
+
+        `field` and `peak` are errors by all but the beam, and by the beam that is assumed. None if
+        no beam makes the total as small.
+        """
+        rest, by_beam = field
+        allowed = largest**2 - rest**2
+        if not (allowed > 0 and by_beam > 0):
+            return None
+        even = round_down(uneven * min(math.sqrt(allowed) / by_beam, 1.0))
+        at_peak = math.hypot(peak[0], peak[1] * even / uneven)
+        return cls(even, uneven, at_peak, math.hypot(*peak), math.hypot(*field))
 
 
 class PeakError(NamedTuple):
@@ -93,6 +121,16 @@ class ShownField:
         """Write the largest magnitude with its error."""
         share = error.share if error else 0.0
         return f"peak {self.symbol} {with_error(self.largest, share * self.largest)} {self.unit}"
+
+    def conditional_text(self, condition: BeamCondition) -> str:
+        """Write the largest magnitude with its errors by an even and by the assumed beam."""
+        peak = self.short_peak_text(PeakError(condition.peak_if_even, ""))
+        if_uneven = to_figures(condition.peak_if_uneven * self.largest)
+        return (
+            f"{peak} if the beam is even to {percent(condition.even)}; ± {if_uneven} (field "
+            f"{percent(condition.field_if_uneven)}) if it is {percent(condition.uneven)} uneven "
+            "(assumed). Record a reference."
+        )
 
     def peak_text(self, error: PeakError | None = None) -> str:
         """Write the largest magnitude, path-integrated fields also in MG·µm."""

@@ -29,6 +29,12 @@ LINE_IN = 0.18  # of a header or footer
 
 
 ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR = "#b00020", "#1b6e3c", "0.3"
+LEVEL_COLOURS = {
+    Level.SOUND: GOOD_COLOUR,
+    Level.CONDITIONAL: "#1f4e79",
+    Level.DOUBTFUL: ALARM_COLOUR,
+    Level.FAILED: ALARM_COLOUR,
+}
 _STYLE: Any = {
     "font.family": ["DejaVu Sans"],
     "font.size": 9.0,
@@ -190,7 +196,7 @@ def wrapped(sentences: Iterable[tuple[str, str]], letters: int) -> list[tuple[st
 
 def headline_sentence(headline: Headline | Fact) -> tuple[str, str]:
     """Return a headline, or a fact in its place, with the colour of its level."""
-    return headline.text, GOOD_COLOUR if headline.level is Level.SOUND else ALARM_COLOUR
+    return headline.text, LEVEL_COLOURS[headline.level]
 
 
 _LEGENDS = {"masked": " (hatched)", "caustics": " (outlined)", "crossed_rays": " (outlined)"}

@@ -18,7 +18,7 @@ from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._panels import ReportTable, Rows, RunPanel, fact_rows
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
-from napari_shadowinv.facts import Fact, Verdict
+from napari_shadowinv.facts import Fact
 from napari_shadowinv.fitting import Fit
 
 _REDRAW_MS = 500
@@ -83,11 +83,11 @@ class FitView(QWidget):
         self.report.empty()
 
     def show_result(self, job: FitJob, finished: Finished, last: LastResults) -> None:
-        """Show the layers, verdict and report of a fit; notify unless the field is determined."""
+        """Show the layers, verdict and report of a fit; notify if the field is doubtful."""
         fit = finished.content
         moved = place_inputs(self._viewer, job)
         self._show_report(fit, fit.facts_with_names(job.names), job.inputs)
-        if fit.verdict is not Verdict.DETERMINED:
+        if not fit.verdict.level.is_success:
             text = fit.cautions[0].text
             show_warning(text[:1].upper() + text[1:])
         self._alternative.show([])
@@ -109,7 +109,7 @@ class FitView(QWidget):
         return True
 
     def _show_report(self, fit: Fit, facts: Iterable[Fact], inputs: Rows = ()) -> None:
-        style = "" if fit.verdict is Verdict.DETERMINED else forms.PROBLEM_STYLE
+        style = "" if fit.verdict.level.is_success else forms.PROBLEM_STYLE
         self.verdict.show_titled(f"Verdict: {fit.verdict.value}", f"{fit.explanation}.", style)
         warnings = [("Warning", caution.text) for caution in fit.warnings]
         rows = [row for row in warnings if row not in inputs]

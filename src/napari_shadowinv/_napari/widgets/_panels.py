@@ -205,6 +205,7 @@ _POLL_MS = 500
 _MIN_SHOWN_TIME_S = 2.0
 _LEVEL_STYLES = {
     Level.SOUND: "color: #4caf72;",
+    Level.CONDITIONAL: "color: #5b9bd5;",
     Level.DOUBTFUL: forms.PROBLEM_STYLE,
     Level.FAILED: "color: #e05252;",
 }

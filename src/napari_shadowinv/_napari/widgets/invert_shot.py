@@ -25,7 +25,6 @@ from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Level
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.setup import Setup
@@ -245,7 +244,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
             self.panel.say(f"{residual.title} {residual.text}")
         else:
             self._report(inversion, inversion.setup, job.inputs)
-            if headline.level is not Level.SOUND:
+            if not headline.level.is_success:
                 show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
             self.reveal(self.verdict)
             self._learn_pace(inversion)
