@@ -138,7 +138,7 @@ def exit_unless_reliable(store: StackStore) -> None:
         codes = {caution["code"] for caution in report.get("warnings", ())}
         is_sound = _is_success(report.get("verdict", "")) and "samples" not in codes
         if "level" in report:  # an inversion
-            is_sound = report.get("converged")
+            is_sound = bool(report.get("converged"))
         if status == DONE and not is_sound:
             raise typer.Exit(EXIT_NOT_CONVERGED)
 
