@@ -857,28 +857,33 @@ def samples(seed: int, count: int) -> Iterator[Answer]:
         "coaxial_line": phantoms.coaxial_line((200, 200), setup)[0].displacement,
     }
     for name, truth in phantoms_of.items():
-        layers = getattr(sample_data, name)()
-        images = {layer[1]["name"]: np.asarray(layer[0]) for layer in layers if layer[2] == "image"}
-        source = next((each for key, each in images.items() if key.endswith("source")), None)
-        shot = next(each for key, each in images.items() if not key.endswith("source"))
+        shot, source = shot_of(getattr(sample_data, name)())
         yield answer("samples", f"sample {name}", invert(shot, source=source), truth)
     yield from sampled_run(sample_data, phantoms)
     yield from tutorials()
 
 
+def shot_of(layers: Sequence[Any]) -> tuple[Any, FloatArray | None]:
+    """Return the image of a sample's layers, perhaps a lazy stack, and its source if it has one."""
+    images = {keywords["name"]: data for data, keywords, kind in layers if kind == "image"}
+    sources = [np.asarray(data) for name, data in images.items() if name.endswith("source")]
+    (shot,) = (data for name, data in images.items() if not name.endswith("source"))
+    return shot, sources[0] if sources else None
+
+
 def sampled_run(sample_data: Any, phantoms: Any) -> Iterator[Answer]:
-    """The sample of twenty shots: its sixth, tenth and fourteenth, each without a source."""
-    (layer,) = sample_data.wakefield_run()
+    """Three shots of the sample of twenty."""
+    stack, source = shot_of(sample_data.wakefield_run())
     for shot in (5, 10, 14):
         phase = shot / 19
-        height, width = layer[0].shape[1:]
+        height, width = stack.shape[1:]
         wave = phantoms.wakefield(
             (height, width),
             phantoms.wakefield_setup(),
             0.8 * np.sin(np.pi * (0.15 + 0.75 * phase)) ** 2,
             center=((height - 1) / 2, width * (0.2 + 0.6 * phase)),
         )
-        result = invert(np.asarray(layer[0][shot]))
+        result = invert(np.asarray(stack[shot]), source=source)
         yield answer("samples", f"sample wakefield_run, shot {shot}", result, wave.displacement)
 
 
