@@ -135,16 +135,17 @@ def press_run(widget: Any) -> None:
 def show_only(viewer: napari.Viewer, *titles: str) -> None:
     """Switch on the layers whose names begin with these titles, and off all others."""
     for layer in viewer.layers:
-        layer.visible = layer.name.lstrip("✓?✗ ").startswith(titles)
+        layer.visible = layer.name.lstrip("✓±?✗ ").startswith(titles)
 
 
 def toroid_window() -> None:
     """The paper's toroid with caustics: the widget, the field and its arrows."""
     viewer = new_window("toroid with caustics")
-    (shot,) = viewer.open_sample(PLUGIN, "toroid_with_caustics")
+    *_, shot = viewer.open_sample(PLUGIN, "toroid_with_caustics")
     shot.name = "toroid"
     open_widget(viewer, "Invert shot")
-    inversion = invert(shot.data, options=InversionOptions(n_sites=10_000))
+    options = InversionOptions(n_sites=10_000)
+    inversion = invert(shot.data, source=np.ones(shot.data.shape), options=options)
     add_inversion(viewer, inversion, setup_of(shot), name="toroid")
     photograph(viewer, "napari-toroid.png")
 

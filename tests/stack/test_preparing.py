@@ -139,7 +139,7 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
-        ({"filters": (HighPassFilter(),)}, "removes the beam from the image"),
+        ({"filters": (HighPassFilter(),)}, "would flatten the image but not the source"),
         ({"source_mask": np.eye(24, 28) < 1}, "got a source mask"),
         ({"source": InterpolatedEstimate()}, "without a source mask"),
         (

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv import io
-from napari_shadowinv._napari.layer_metadata import CAME_WITH
+from napari_shadowinv._napari.layer_metadata import CAME_WITH, SOURCE
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.shots import lazy_stack, radiograph_layers, shot_layer
 from napari_shadowinv._napari.viewer_sync import notify_errors
@@ -82,7 +82,11 @@ def wakefield_run() -> LayerData:
     limits = intensity_limits(_wakefield_shot(_RUN_LENGTH // 2))
     origin = f"{CAME_WITH} the sample 'wakefield run'"
     setup = phantoms.wakefield_setup()
-    return [shot_layer(stack, "wakefield run", setup, limits, setup_origin=origin)]
+    beam = _wakefield_beam()
+    name, facts = "wakefield run", {"setup_origin": origin}
+    source, keywords, kind = shot_layer(beam, f"{name} source", setup, limits, SOURCE, **facts)
+    shots = shot_layer(stack, name, setup, limits, source=beam, **facts)
+    return [(source, {**keywords, "visible": False}, kind), shots]
 
 
 # For an image without channels napari adds no layer; it refuses an empty list.
@@ -98,9 +102,8 @@ def _toroid_of(peak: float) -> phantoms.Phantom:
 
 
 def _proton_shot(name: str, phantom: phantoms.Phantom, beam: FloatArray | None = None) -> LayerData:
-    source = None if beam is None else _COUNTS * beam
-    undisturbed = np.full(_SHAPE, _COUNTS) if source is None else source
-    image = _counts_image(phantom.displacement, undisturbed, seed=1)
+    source = _COUNTS * (np.ones(_SHAPE) if beam is None else beam)
+    image = _counts_image(phantom.displacement, source, seed=1)
     return radiograph_layers(Radiograph(image, setup=phantoms.paper_setup(), source=source), name)
 
 
@@ -126,4 +129,8 @@ def _wakefield_shot(shot: int) -> FloatArray:
         0.8 * np.sin(np.pi * (0.15 + 0.75 * phase)) ** 2,
         center=((height - 1) / 2, width * (0.2 + 0.6 * phase)),
     )
-    return _counts_image(wave.displacement, np.full(_RUN_SHAPE, 2500.0), seed=shot)
+    return _counts_image(wave.displacement, _wakefield_beam(), seed=shot)
+
+
+def _wakefield_beam() -> FloatArray:
+    return np.full(_RUN_SHAPE, 2500.0)

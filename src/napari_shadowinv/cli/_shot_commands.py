@@ -384,7 +384,9 @@ def demo(
     image = synthetic_image(truth)
     grain = np.random.default_rng(0).normal(size=image.shape)
     image = image + noise * image.mean() * grain
-    inversion = invert_shot(chosen.model_copy(update={"setup": setup}), Radiograph(image))
+    # The simulated beam is known: it is flat.
+    shot = Radiograph(image, source=np.ones(image.shape))
+    inversion = invert_shot(chosen.model_copy(update={"setup": setup}), shot)
     poisson = displacement_from_potential(poisson_invert(image))
     fields = {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
     errors = {name: _error_text(fields[name], truth) for name in ("Retrieved", "Poisson")}

@@ -402,11 +402,6 @@ def collect_inputs(
         beam = read_radiograph(file, variable=kind.variable)
     elif radiograph.source is not None and recipe.estimate is None:
         beam = replace(radiograph, image=radiograph.source, source=None, mask=None)
-        if any(step.flattens for step in recipe.steps):
-            raise InputError(
-                f"{radiograph.path or 'the shot'} contains its own source, but a filter would "
-                "flatten the image: leave the filter out, or choose the source 'uniform'"
-            )
     if setup is not None:
         check_spacing(shot, "the image", setup.pixel_sizes)
         check_spacing(source, "the source", setup.pixel_sizes)

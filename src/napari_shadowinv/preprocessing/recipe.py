@@ -154,9 +154,9 @@ class Recipe(CheckedModel):
     def check(self, shot: Radiograph) -> None:
         """Reject choices that contradict each other, or the shot, before any work is done.
 
-        An `InputError` if arrays differ in shape, there is a source though the image is flattened
-        or the source estimated, no source mask for an estimate that needs one, or the mask hides
-        the object, too.
+        An `InputError` if arrays differ in shape, there is an uneven source though the image is
+        flattened, or any source though it is estimated, no source mask for an estimate that needs
+        one, or the mask hides the object, too.
         """
         for name in ("source", "mask", "source_mask"):
             array = getattr(shot, name)
@@ -168,11 +168,13 @@ class Recipe(CheckedModel):
                     f"got a measured source and the estimate '{self.estimate.title}': choose one "
                     "of them"
                 )
+            is_flat = np.ptp(shot.source) == 0
             for step in self.steps:
-                if step.flattens:
+                if step.flattens and not is_flat:
                     raise InputError(
-                        f"got a source and the filter {step.summary}, which removes the beam "
-                        "from the image but not from the source: use only one of them"
+                        f"got a source and the filter {step.summary}, which would flatten the "
+                        "image but not the source: leave the filter out, or choose the source "
+                        "'uniform'"
                     )
         elif isinstance(self.source, MeasuredSource):
             raise InputError("the recipe asks for a measured source, but none is given: give one")

@@ -369,7 +369,7 @@ def _describe_inputs(
     inputs = collect_inputs(
         recipe.model_copy(update={"source": recipe.estimate}),
         Radiograph(blank),
-        source=None if sources is None else blank,
+        source=None if sources is None else _checked_beam(sources, blank),
         mask=usable,
         source_mask=bare,
     )
@@ -387,6 +387,11 @@ def _describe_inputs(
         )
         inputs = replace(inputs, provenance=inputs.provenance.with_image(source=origin))
     return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
+
+
+def _checked_beam(sources: Any, blank: AnyArray) -> AnyArray:
+    """Return a common source; for one of each shot a beam that is not flat, as they may be."""
+    return sources if getattr(sources, "ndim", None) == 2 else blank.cumsum(axis=0)
 
 
 def _reader_of_source(source: Any, measured: MeasuredSource, reader: Reader) -> Reader:
