@@ -43,6 +43,15 @@ def test_a_plan_writes_a_row_for_each_draw_and_a_figure(folder):
     assert (folder / "plan.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_a_plan_says_which_beam_it_assumes(folder):
+    planned = ("plan", "toroid:peak=20,radius=9e-6", "--setup", "setup.toml", *QUICK)
+    text = flat(shadowinv(*planned, "--counts", 3000).output)
+    assert "its unevenness of 5 % is assumed: record a reference" in text
+    stated = flat(shadowinv(*planned, "--beam-rms", 0.05, "--overwrite").output)
+    assert "limited by beam" in stated
+    assert "assumed: record" not in stated
+
+
 def test_a_sweep_has_a_row_for_each_value(folder):
     answer = shadowinv(
         *("plan", "blob:amplitude=15,sigma=6", *QUICK, "--beam-rms", 0),

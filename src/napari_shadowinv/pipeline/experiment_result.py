@@ -295,6 +295,9 @@ class ExperimentPlan(Summarised):
         if self.parts:
             cause, share = next(iter(self.parts.items()))
             texts.append(f"limited by {self._title(cause)} {percent(share)}")
+            if cause == "beam" and self.instrument.beam_rms is None:
+                rms = self.instrument.beam_of(measured=self.options.is_recorded).rms
+                texts.append(f"its unevenness of {percent(rms)} is assumed: record a reference")
         if self.silent:
             texts.append(f"{self.silent} of them wrong without a warning")
         return Headline(Level.SOUND if self.is_determined else Level.DOUBTFUL, "; ".join(texts))

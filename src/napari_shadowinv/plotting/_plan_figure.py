@@ -10,7 +10,7 @@ from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR
+from napari_shadowinv.plotting._panels import GOOD_COLOUR, LEVEL_COLOURS, QUIET_COLOUR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -97,11 +97,11 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
 def _draw_errors(axes: Axes, plan: ExperimentPlan) -> None:
     """Errors made and reported in each draw; draws that are not determined in another colour."""
     numbers = [shot.number for shot in plan.shots]
-    colours = [GOOD_COLOUR if shot.is_determined else ALARM_COLOUR for shot in plan.shots]
+    colours = [LEVEL_COLOURS[shot.verdict.level] for shot in plan.shots]
     axes.bar(numbers, [100 * shot.error for shot in plan.shots], color=colours)
     totals = [100 * shot.total for shot in plan.shots]
     axes.plot(numbers, totals, "_", color="black", markersize=7, label="reported")
-    axes.set_xlabel("draw (red: not determined)")
+    axes.set_xlabel("draw (blue: depends on the beam, red: doubtful)")
     axes.set_ylabel("error of the field (%)")
     axes.set_title(f"Error made: {percent(plan.error.median)}")
     axes.legend(fontsize=7)
