@@ -586,6 +586,7 @@ def flaws(seed: int, count: int) -> Iterator[Answer]:
         folds = "folded " * is_folded
         noise_given = given.get("noise", "noise estimated")
         case = f"{flaw.title}, {folds}{name}, {len(images)} energies, {noise_given}"
+        case += f", named {' or '.join(named) or 'none'}"
         yield answer("flaws", case, result, truth, **numbers)
 
 
