@@ -383,7 +383,7 @@ def right(seed: int, count: int) -> Iterator[Answer]:
 
 def right_lines(answers: Sequence[Answer]) -> Iterator[Line]:
     doubted = [each for each in answers if each.is_refused or each.cries]
-    yield of("right inputs refused or doubted", doubted, len(answers))
+    yield of("refused or doubted", doubted, len(answers))
     yield silent_line(answers)
 
 
@@ -591,7 +591,7 @@ def flaws(seed: int, count: int) -> Iterator[Answer]:
 
 
 def flaw_lines(answers: Sequence[Answer]) -> Iterator[Line]:
-    yield silent_line(answers, "fits with nothing stated: silent")
+    yield silent_line(answers, "silent")
     named = [each for each in answers if each.numbers["named"]]
     found = [each for each in named if each.numbers["cause found"]]
     yield of("causes named: right", found, len(named))
@@ -619,7 +619,7 @@ def right_fit_lines(answers: Sequence[Answer]) -> Iterator[Line]:
     for kind in ("others", "folded single"):
         chosen = [each for each in answers if each.case.startswith(kind)]
         doubted = [each for each in chosen if each.is_refused or each.cries]
-        yield of(f"right fits, {kind}: refused or doubted", doubted, len(chosen))
+        yield of(f"{kind}: refused or doubted", doubted, len(chosen))
     yield silent_line(answers)
 
 
@@ -639,7 +639,7 @@ def unknown_beams(seed: int, count: int) -> Iterator[Answer]:
 
 def refused_lines(answers: Sequence[Answer]) -> Iterator[Line]:
     doubted = [each for each in answers if each.is_refused or each.cries]
-    yield of(f"{answers[0].row}: refused or doubted", doubted, len(answers))
+    yield of("refused or doubted", doubted, len(answers))
     yield silent_line(answers)
 
 
@@ -662,18 +662,18 @@ def between(seed: int, count: int) -> Iterator[Answer]:
 
 
 def between_lines(answers: Sequence[Answer]) -> Iterator[Line]:
-    ratios = [each.ratio for each in answers if not each.is_refused]
-    yield "beams between energies: true over told, r.m.s.", f"{rms(ratios):.2f} of {len(ratios)}"
+    kept = [each for each in answers if not each.is_refused]
+    yield "error over told, r.m.s.", ratio_text(kept)
     for title in dict.fromkeys(each.case.split(",")[0] for each in answers):
-        own = [each.ratio for each in answers if each.case.startswith(f"{title},")]
-        yield f"- {title}", f"{rms(own):.2f} of {len(own)}"
+        yield f"- {title}", ratio_text([a for a in kept if a.case.startswith(f"{title},")])
     determined = [each for each in answers if each.is_determined]
     wrong = [each for each in determined if each.share > MAX_ERROR]
     yield of("determined and over 5 %", wrong, len(determined))
 
 
-def rms(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values)))) if values else np.nan
+def ratio_text(answers: Sequence[Answer]) -> str:
+    ratios = [each.ratio for each in answers if np.isfinite(each.ratio)]
+    return f"{np.sqrt(np.mean(np.square(ratios))):.2f} of {len(ratios)}" if ratios else "none"
 
 
 @dataclass
@@ -826,7 +826,7 @@ def coverage_lines(answers: Sequence[Answer]) -> Iterator[Line]:
         shares = [
             np.mean([each.numbers[f"{name} {band}"] for each in answers]) for band in (68, 95)
         ]
-        yield f"coverage 68/95: {name}", f"{shares[0]:.0%} / {shares[1]:.0%} of {len(answers)}"
+        yield f"{name}, 68 / 95 %", f"{shares[0]:.0%} / {shares[1]:.0%} of {len(answers)}"
     kinds: dict[str, list[Answer]] = {}
     for each in answers:
         kinds.setdefault(", ".join(each.case.split(", ")[:-1]), []).append(each)
@@ -916,10 +916,10 @@ def names_after(page: str) -> dict[str, Any]:
 
 def sample_lines(answers: Sequence[Answer]) -> Iterator[Line]:
     near = [each for each in answers if 1 / MAX_TOTALS < each.ratio < MAX_TOTALS]
-    yield of("samples: told within a factor 3 of the true error", near, len(answers))
+    yield of("told within a factor 3 of the true error", near, len(answers))
     good = [each for each in answers if each.share < MAX_ERROR]
     lit = [each for each in good if each.stands]
-    yield of("samples: first line not red where the error is below 5 %", lit, len(good))
+    yield of("first line not red where the error is below 5 %", lit, len(good))
 
 
 def times(seed: int, count: int) -> Iterator[Answer]:
@@ -963,18 +963,18 @@ def processor_seconds(work: Callable[[], Any]) -> float:
 def time_lines(answers: Sequence[Answer]) -> Iterator[Line]:
     by_title = {each.case: each.numbers["ratio"] for each in answers}
     for title, ratio in by_title.items():
-        yield f"time, {title}: processor time over numpy's", f"{ratio:.2f}"
-    yield "time, free over closed", f"{by_title['invert, free'] / by_title['invert']:.2f}"
+        yield f"{title}: processor time over numpy's", f"{ratio:.2f}"
+    yield "free over closed", f"{by_title['invert, free'] / by_title['invert']:.2f}"
 
 
 def silent_lines(answers: Sequence[Answer]) -> Iterator[Line]:
-    yield silent_line(answers, f"{answers[0].row}: silent")
+    yield silent_line(answers)
     widths = sorted({each.numbers["width"] for each in answers if "width" in each.numbers})
     for width in widths:
         own = [each for each in answers if each.numbers["width"] == width]
         yield silent_line(own, f"- over {width:g} px")
-    determined = [each for each in answers if each.is_determined]
-    yield of(f"{answers[0].row}: determined", determined, len(answers))
+    yield of("determined", [a for a in answers if a.is_determined], len(answers))
+    yield "error over told, r.m.s.", ratio_text(answers)
 
 
 @dataclass(frozen=True)
