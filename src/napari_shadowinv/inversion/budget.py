@@ -121,6 +121,8 @@ class Errors:
     noise_correlation : float
         Standard deviation of the Gaussian blur with the measured correlation of the noise, px; 0
         for white noise.
+    noise_is_bound : bool
+        Whether structure hides the noise: its error is then the largest that the image allows.
     """
 
     peak: float
@@ -136,6 +138,7 @@ class Errors:
     beam_scale: float
     beam_basis: str
     noise_correlation: float
+    noise_is_bound: bool = False
 
     @property
     def total(self) -> ErrorEstimate:
@@ -160,7 +163,8 @@ class Errors:
         """Known errors by their causes, the largest first."""
         noise = "noise"
         if self.noise_correlation:
-            noise = f"noise, correlated over {to_figures(self.noise_correlation)} px"
+            limit = "at most, hidden by structure, " if self.noise_is_bound else ""
+            noise = f"noise, {limit}correlated over {to_figures(self.noise_correlation)} px"
         parts = {noise: self.noise, "discretisation": self.discretisation, **self.effects}
         if self.beam is not None:
             parts[self._beam_name] = self.beam
@@ -520,6 +524,7 @@ class Budget:
             beam_scale=self._beam.length,
             beam_basis=basis,
             noise_correlation=self._noise().correlation_length,
+            noise_is_bound=self._noise().is_bound,
         )
 
     @cached_property

@@ -1,14 +1,14 @@
 """Noise of an image, and the difference of its beam from the source.
 
 - the noise, from differences between neighbouring pixels: `ImageNoise`
+- its correlation: `measure_correlation`
 - the beam of a shot against its source, where there is no object: `beam_difference`
 
 Structures from the beam's path are smooth over a few pixels, noise is not: in
 (a - b - c + d) / 2 over four neighbours a smooth image cancels, and white noise keeps its
-variance. A filter, a scintillator or an image plate correlates the noise of neighbouring pixels;
-then such a difference over k pixels grows with k until the pixels are independent, in all parts
-of the image alike. The variances V(k) = V(∞) (1 - ρ(k))² give the correlation ρ along one axis,
-and from it how much more noise there is in the mean of many pixels than in white noise.
+variance. A filter, a scintillator, an image plate or resampling correlates the noise of
+neighbouring pixels; then differences over more pixels are larger. `measure_correlation` tells how
+much more noise there is in the mean of many pixels than in white noise.
 
 A reference of another exposure, or a beam that is less flat than assumed, differs from the beam of
 the shot on large scales. An object has finer structure. The frame along the image's edge is divided
@@ -18,16 +18,16 @@ source is a plane plus noise, and its differences between such tiles are differe
 
 from __future__ import annotations
 
+import itertools
 import math
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, order_by_value
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, order_by_value
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing.pixels import nonnegative_fit
@@ -158,25 +158,23 @@ _CLIPPED_AT = 4.0  # in standard deviations of normal noise
 _DEVIATIONS = 5.0
 _BINS, _SAMPLES = 24, 20_000  # of brightness, and the pixels that are looked at
 
-_LAGS_PX = (1, 2, 3, 4, 6, 8, 12)
-_TILE_PX, _SMALL_TILE_PX = 16, 10
-_MIN_SIDE_PX = 92  # of an image with large tiles
-_MAX_TILES = 20  # along each axis
-_MIN_TILES = 5
-_QUIET_SHARE = 0.3  # of the tiles, those with the least structure around them
-_RISE_LAG_PX = 3
-_MIN_RISE, _RISE_DEVIATIONS = 1.2, 0.8  # of V(3) over V(1): least, and in 1/√(tiles)
-_LOW_QUANTILE = 0.25  # of the quiet tiles: noise is correlated in nearly all of them
-_MAX_UNEVENNESS = 0.25  # of its logarithm between tiles: noise has 0.15, structure 0.4 and more
+_LAGS_PX = (1, 2, 3, 4, 6, 8)
+_FAR_LAG_PX = 12
+_BLOCK_PX, _MAX_BLOCKS = 4, 2000
+_CALM_SHARE, _LESS_CALM_SHARE = 0.15, 0.5  # of the blocks
+_DARK = 0.2  # of the mean brightness
+_MIN_PIXELS = 40
+_MIN_RISE, _RISE_DEVIATIONS = 1.2, 20.0  # of V(2) over V(1): least, and in 1/√(pixels)
+_WIDTHS_PX = np.geomspace(0.3, 4.0, 24)
+_FIT_PX = 6  # lags up to which differences are compared with those of a blur
+_SCATTER = 0.25  # of V
+_MAX_MISFIT = 8.0  # χ², of noise that stands out of structure
+_MAX_STATED = 2.5  # variance, over the measured one
+_MAX_WHITE = 1.0  # variance before the blur: of one quantum a pixel
+_CLIP_DEVIATIONS, _CLIPPED_VARIANCE = 2.5, 0.973
 _MIN_DEVIATION = 1e-4  # of the brightness; below are the smooth flanks of noiseless images
-_MAX_PLATEAU_RISE = 1.35  # of V at the largest lag over the one before
-_MIN_CORRELATION = 0.05
-_CLIP_DEVIATIONS = 5.0
+_MIN_FAR_RISE, _MAX_FAR_UNEVENNESS = 1.4, 1.5
 
-_MIN_FAR_TILES = 12
-_MIN_FAR_RISE = 1.4  # of V at the largest lag over V(1), in most of the quiet tiles
-_MAX_FAR_UNEVENNESS = 0.62  # of its logarithm between tiles: noise has up to 0.6, structure 0.64
-_MAX_FAR_SPREAD = 0.85  # of the logarithm of V: noise has up to 0.75, structure 1 and more
 # White noise on pixels has waves up to 3.51 rad/px, averaged over directions of its logarithm;
 # a Gaussian blur of standard deviation b ends them at exp(-γ/2) / b.
 _GRAIN_PER_BLUR = 3.51 / math.exp(-0.5772 / 2)
@@ -198,6 +196,8 @@ class ImageNoise:
         noise.
     variance_terms : ndarray, shape (3,)
         Terms of a pixel's variance: constant, in proportion to its brightness, and to its square.
+    is_bound : bool
+        Whether structure hides the noise: it is then at most as large.
     is_correlated_far : bool
         Whether calm parts vary over more pixels than a correlation can be measured: all of the
         above is then too small.
@@ -215,16 +215,13 @@ class ImageNoise:
         excess = (image - prepared.source) / mean
         used = mask[1:, 1:] & mask[1:, :-1] & mask[:-1, 1:] & mask[:-1, :-1]
         differences = finest_differences(excess, used)
-        self.is_correlated_far = False
-        if correlation is not None:
-            inflation, self.clumping = _stated_correlation(excess, mask, correlation)
-        elif (tiles := _Tiles.of(excess, mask)) is None:
-            inflation = self.clumping = 1.0
-        else:
-            inflation, self.clumping = _correlation(tiles)
-            self.is_correlated_far = self.clumping == 1 and _is_correlated_far(tiles)
-        self.largest = _rms(differences) * math.sqrt(inflation)
-        self.typical = _clipped_rms(differences) * math.sqrt(inflation)
+        measured = measure_correlation(excess, image / mean, mask, correlation)
+        self.clumping, self.is_bound = measured.clumping, measured.is_bound
+        self.is_correlated_far = measured.is_far
+        self.typical, self.largest = _clipped_rms(differences), _rms(differences)
+        if measured.blurred:
+            self.typical = math.sqrt(measured.variance)
+            self.largest = max(self.largest, self.typical)
         # The source's mean, in units of the recorded image.
         quantum = prepared.flux_scale * prepared.unit * mean
         self.variance_terms = np.zeros(3)
@@ -233,10 +230,15 @@ class ImageNoise:
         )
         if level is not None:
             self.variance_terms[0] = (level / quantum) ** 2
+            # A smooth image may have been smoothed, or has less noise than that.
+            if measured.is_bound or self.variance_terms[0] > _MAX_STATED * measured.variance:
+                self.clumping, self.is_bound = 1.0, False
         elif counts is not None:
             self.variance_terms[1] = counts / quantum
             self.clumping = 1.0  # a blur leaves the counting noise of many pixels as it was
-            self.is_correlated_far = False
+            self.is_bound = self.is_correlated_far = False
+        elif measured.blurred:
+            self.variance_terms[1] = measured.variance
         elif used.any():
             step = -(-len(differences) // _SAMPLES)
             places = np.arange(0, used.size, step)
@@ -246,7 +248,7 @@ class ImageNoise:
             low, right = rows + 1, columns + 1
             bright = image[low, right] + image[low, columns] + image[rows, right]
             bright = (bright + image[rows, columns]) / (4 * mean)
-            self.variance_terms = inflation * _terms(bright, differences[::step])
+            self.variance_terms = _terms(bright, differences[::step])
         if (level, counts) != (None, None):  # stated for the image, not for its source
             of_source = finest_differences(prepared.source / mean, used)
             self.variance_terms[0] += _clipped_rms(of_source) ** 2
@@ -295,122 +297,153 @@ def _clipped_rms(differences: FloatArray) -> float:
     return _rms(np.minimum(differences, limit)) if limit > 0 else _rms(differences)
 
 
-@dataclass(frozen=True, eq=False)
-class _Tiles:
-    """Tiles of an image on a grid, each with the pixels at a lag; not all are used."""
+@dataclass(frozen=True)
+class CorrelatedNoise:
+    """Noise that is partly white, partly blurred by a Gaussian of a width, px.
 
-    values: FloatArray
-    used: BoolArray
-    side: int
-    lag: int
+    The variances are those of a pixel as bright as the source's mean.
+    """
+
+    white: float
+    blurred: float = 0.0
+    width: float = 0.0
+    is_bound: bool = False
+    is_far: bool = False
+
+    @property
+    def variance(self) -> float:
+        """Variance of a pixel."""
+        return self.white + self.blurred
+
+    @property
+    def white_variance(self) -> float:
+        """Variance in a pixel of white noise with as much power on long waves."""
+        return self.white + max(4 * math.pi * self.width**2, 1.0) * self.blurred
+
+    @property
+    def clumping(self) -> float:
+        """Variance of the sum of many pixels over the sum of their variances."""
+        return self.white_variance / self.variance if self.blurred else 1.0
+
+
+def measure_correlation(
+    excess: FloatArray, brightness: FloatArray, mask: BoolArray, width: float | None = None
+) -> CorrelatedNoise:
+    """Return the noise of the calm parts of an image, or the most that structure there allows.
+
+    Second differences over d pixels along both axes have a variance V(d) that is constant for white
+    noise. That of noise blurred by a Gaussian is smaller up to about twice its width, that of
+    structure up to the structure's size: V(1) to V(6) are compared with those of blurs, and no V
+    may be exceeded. Of the widths that fit alike, the one with most noise on long waves is used.
+
+    Parameters
+    ----------
+    excess, brightness : ndarray, shape (H, W)
+        Image less source, and image, over the source's mean.
+    mask : ndarray of bool, shape (H, W)
+        The pixels to use.
+    width : float, optional
+        Standard deviation of the blur, px, if it is known.
+    """
+    differences = _CalmDifferences.of(excess, brightness, mask)
+    lags, variances = differences.curve(_CALM_SHARE)
+    if len(lags) < 3 or variances[-1] < _MIN_DEVIATION**2:
+        return CorrelatedNoise(0.0)
+    variances = np.maximum(variances, 1e-9 * variances.max())
+    white = float(variances[0])
+    widths = _WIDTHS_PX if width is None else np.array([width])
+    if width is None:
+        least = max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(differences.count(_CALM_SHARE)))
+        if variances[1] < least * white:
+            return CorrelatedNoise(white, is_far=differences.rise_evenly())
+    elif 4 * math.pi * width**2 <= 1:
+        return CorrelatedNoise(white)
+    near = lags <= _FIT_PX
+    answers = []
+    for blur in widths:
+        shares = _blurred_shares(lags, blur)
+        columns = np.stack([np.full(len(lags), width is None), shares], axis=1)
+        fitted, _ = nonnegative_fit((columns / variances[:, None])[near], np.ones(near.sum()))
+        white = min(float(fitted[0]), float(variances.min()))
+        blurred = min(float(fitted[1]), float(((variances - white) / shares).min()))
+        most = max(_MAX_WHITE - white, 0.0) / max(4 * math.pi * blur**2, 1.0)
+        noise = CorrelatedNoise(white, min(blurred, most), float(blur), blurred >= most)
+        rest = 1 - columns @ [white, noise.blurred] / variances
+        answers.append((float((rest[near] ** 2).sum()) / _SCATTER**2, noise))
+    least = min(misfit for misfit, _ in answers)
+    alike = [noise for misfit, noise in answers if misfit <= least + 1]
+    noise = max(alike, key=lambda noise: noise.white_variance)
+    return replace(noise, is_bound=noise.is_bound or least > _MAX_MISFIT)
+
+
+def _blurred_shares(lags: FloatArray, width: float) -> FloatArray:
+    """Return V(d) of noise that a Gaussian has blurred, over its variance."""
+    near, far = (np.exp(-((distance / width) ** 2) / 4) for distance in (lags, 2 * lags))
+    return np.asarray(((6 - 8 * near + 2 * far) / 6) ** 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _CalmDifferences:
+    """Blocks of an image in the order of their slopes, and differences of their pixels."""
+
+    excess: FloatArray
+    brightness: FloatArray
+    mask: BoolArray
+    blocks: IntArray  # rows and columns, the calmest first
 
     @classmethod
-    def of(cls, excess: FloatArray, mask: BoolArray, lag: int | None = None) -> _Tiles | None:
-        """Cut an image into tiles; None if it has too few."""
-        side = _TILE_PX if min(excess.shape) >= _MIN_SIDE_PX else _SMALL_TILE_PX
-        if lag is None:
-            lag = max(known for known in _LAGS_PX if known < side)
-        size = side + lag
-        if _MIN_TILES * side + lag > min(excess.shape):
-            return None
-        steps = [max(side, -(-(n - size) // _MAX_TILES)) for n in excess.shape]
-        places = np.s_[:: steps[0], :: steps[1]]
-        values = sliding_window_view(excess, (size, size))[places]
-        used = sliding_window_view(mask, (size, size))[places].all(axis=(2, 3))
-        return cls(values, np.asarray(used), side, lag)
+    def of(cls, excess: FloatArray, brightness: FloatArray, mask: BoolArray) -> _CalmDifferences:
+        used = complete_block_means(mask, _BLOCK_PX) == 1
+        level = complete_block_means(brightness, _BLOCK_PX)
+        if not used.any():
+            return cls(excess, brightness, mask, np.zeros((0, 2), np.int64))
+        mean = level[used].mean()
+        means = np.where(used, complete_block_means(excess, _BLOCK_PX), 0.0)
+        smooth, level = (
+            ndimage.gaussian_filter(values, 1.0, mode="nearest") for values in (means, level)
+        )
+        slopes = np.gradient(smooth) if min(smooth.shape) > 1 else [smooth]
+        slope = np.hypot(*slopes) if len(slopes) > 1 else slopes[0]
+        slope = ndimage.gaussian_filter(slope / np.sqrt(np.maximum(level, 0.05 * mean)), 1.0)
+        blocks = np.argwhere(used & (level > _DARK * mean))
+        order = np.argsort(slope[tuple(blocks.T)], kind="stable")
+        return cls(excess, brightness, mask, blocks[order])
 
-    @cached_property
-    def quiet(self) -> FloatArray:
-        """Tiles with the least structure around them, without hot pixels."""
-        tiles = _without_hot_pixels(self.values)
-        finest = _difference_variance(tiles, self.side, 1)
-        used = self.used & (finest > 0)
-        far = _difference_variance(tiles, self.side, self.lag)
-        around = _average_neighbours(np.where(used, far / np.where(used, finest, 1.0), 1.0))
-        return tiles[used & (around <= np.quantile(around, _QUIET_SHARE))]
+    def count(self, share: float) -> int:
+        """Return the number of pixels in the calmest blocks."""
+        return max(math.ceil(share * len(self.blocks)), 1) * _BLOCK_PX**2
 
+    def variance(self, lag: int, share: float) -> float:
+        """Return V at a lag over the brightness, in the calmest blocks; NaN in too few pixels."""
+        blocks = self.blocks[: max(math.ceil(share * len(self.blocks)), 1)]
+        blocks = blocks[:: -(-len(blocks) // _MAX_BLOCKS)]
+        inside = np.indices((_BLOCK_PX, _BLOCK_PX)).reshape(2, -1)
+        places = (_BLOCK_PX * blocks.T[:, :, None] + inside[:, None]).reshape(2, -1)
+        limits = np.array(self.mask.shape)[:, None] - lag
+        rows, columns = places[:, ((places >= lag) & (places < limits)).all(axis=0)]
+        total, is_used = np.zeros(len(rows)), np.ones(len(rows), bool)
+        for down, right in itertools.product((-lag, 0, lag), repeat=2):
+            at = rows + down, columns + right
+            total += (-2.0) ** ((down == 0) + (right == 0)) * self.excess[at]
+            is_used &= self.mask[at]
+        squares = (total[is_used] / 6) ** 2
+        if len(squares) < _MIN_PIXELS:
+            return math.nan
+        limit = (_CLIP_DEVIATIONS * NORMAL_MAD) ** 2 * float(np.median(squares))
+        brightness = float(self.brightness[rows, columns][is_used].mean())
+        return float(np.minimum(squares, limit).mean()) / (_CLIPPED_VARIANCE * brightness)
 
-def _correlation(tiles: _Tiles) -> tuple[float, float]:
-    """Return the variance of a pixel relative to the finest differences, and the clumping."""
-    side, lags = tiles.side, [lag for lag in _LAGS_PX if lag <= tiles.lag]
-    finest = _difference_variance(tiles.values, side, 1)
-    rising = _difference_variance(tiles.values, side, _RISE_LAG_PX) > _MIN_RISE * finest
-    if (tiles.used & (finest > 0) & rising).mean() < _QUIET_SHARE * (1 - _LOW_QUANTILE):
-        return 1.0, 1.0
-    quiet = tiles.quiet
-    count = len(quiet)
-    if count < _MIN_TILES:
-        return 1.0, 1.0
-    finest = _difference_variance(quiet, side, 1)
-    rise = _difference_variance(quiet, side, _RISE_LAG_PX) / np.maximum(finest, 1e-300)
-    least = max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(count))
-    if np.quantile(rise, _LOW_QUANTILE) < least or np.log(rise).std() > _MAX_UNEVENNESS:
-        return 1.0, 1.0
-    variances = [_difference_variance(quiet, side, lag) for lag in lags]
-    ratios = np.array([np.median(variance / finest) for variance in variances])
-    if ratios[-1] > _MAX_PLATEAU_RISE * ratios[-2]:
-        return 1.0, 1.0  # structure, which grows with the distance
-    if np.median(variances[-1]) < _MIN_DEVIATION**2:
-        return 1.0, 1.0
-    inflation = float(ratios[-2:].mean())
-    correlation = 1 - np.sqrt(np.minimum(ratios / inflation, 1.0))
-    ends = np.flatnonzero(correlation < _MIN_CORRELATION)
-    correlation[ends[0] if ends.size else len(lags) :] = 0.0
-    steps = np.arange(lags[-1] + 1)
-    along_axis = np.interp(steps, [0, *lags], [1.0, *correlation])
-    return inflation, float((2 * along_axis.sum() - 1) ** 2)
+    def curve(self, share: float) -> tuple[FloatArray, FloatArray]:
+        """Return the lags at which V can be measured, and V."""
+        variances = np.array([self.variance(lag, share) for lag in _LAGS_PX])
+        known = np.isfinite(variances)
+        return np.array(_LAGS_PX, dtype=np.float64)[known], variances[known]
 
-
-def _stated_correlation(excess: FloatArray, mask: BoolArray, width: float) -> tuple[float, float]:
-    """Return the same where the noise is correlated as by a Gaussian blur of a width, px."""
-    clumping = 4 * math.pi * width**2
-    if clumping <= 1:
-        return 1.0, 1.0
-    # The nearest pixels hardly differ: the noise is measured where they are nearly independent.
-    lag = min(math.ceil(2 * width), _LAGS_PX[-1])
-    near, far = ((1 - math.exp(-((d / width) ** 2) / 4)) ** 2 for d in (1, lag))
-    tiles = _Tiles.of(excess, mask, lag)
-    if tiles is None or len(tiles.quiet) < _MIN_TILES:
-        return 1 / near, clumping
-    far_variance, finest = (_difference_variance(tiles.quiet, tiles.side, d) for d in (lag, 1))
-    ratio = far_variance / finest
-    return float(np.median(ratio)) / far, clumping
-
-
-def _is_correlated_far(tiles: _Tiles) -> bool:
-    """Whether tiles vary over many pixels, all of them alike, as noise does and structure not."""
-    if tiles.side < _TILE_PX or len(tiles.quiet) < _MIN_FAR_TILES:
-        return False
-    far = _difference_variance(tiles.quiet, tiles.side, tiles.lag)
-    rise = far / _difference_variance(tiles.quiet, tiles.side, 1)
-    return bool(
-        np.quantile(rise, _LOW_QUANTILE) > _MIN_FAR_RISE
-        and np.log(rise).std() < _MAX_FAR_UNEVENNESS
-        and np.log(far).std() < _MAX_FAR_SPREAD
-        and np.median(far) > _MIN_DEVIATION**2
-    )
-
-
-def _without_hot_pixels(tiles: FloatArray) -> FloatArray:
-    """Clip each tile about its median."""
-    middle = np.median(tiles[..., ::2, ::2], axis=(2, 3), keepdims=True)
-    spread = np.median(np.abs(tiles[..., ::2, ::2] - middle), axis=(2, 3), keepdims=True)
-    limit = _CLIP_DEVIATIONS * NORMAL_MAD * spread
-    return np.clip(tiles, middle - limit, middle + limit)
-
-
-def _difference_variance(tiles: FloatArray, side: int, lag: int) -> FloatArray:
-    """Return the mean square of (a - b - c + d) / 2 over pixels at a lag, for each tile."""
-    near, far = slice(0, side), slice(lag, side + lag)
-    down = tiles[..., near, :] - tiles[..., far, :]
-    return np.asarray(((down[..., near] - down[..., far]) ** 2).mean(axis=(-2, -1)) / 4)
-
-
-def _average_neighbours(values: FloatArray) -> FloatArray:
-    """Average tiles with their neighbours, so that noise hardly affects the choice of tiles."""
-    cross = ndimage.generate_binary_structure(2, 1).astype(np.float64)
-    sums, counts = (ndimage.convolve(v, cross, mode="constant") for v in (values, values**0))
-    return np.asarray(sums / counts)
+    def rise_evenly(self) -> bool:
+        """Whether V rises at a large lag, and not more where the image is less calm."""
+        near, far = (self.variance(lag, _CALM_SHARE) for lag in (1, _FAR_LAG_PX))
+        uneven = self.variance(_FAR_LAG_PX, _LESS_CALM_SHARE)
+        return far > _MIN_FAR_RISE * near and uneven < _MAX_FAR_UNEVENNESS * far
 
 
 def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:

@@ -1,0 +1,68 @@
+"""Noise of images in which an object fills the frame, against the noise that was added."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, zoom
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.inversion.noise import CorrelatedNoise, measure_correlation
+
+SIDE = 96
+
+
+def spots(side: int = SIDE) -> FloatArray:
+    """Nine bright and dark spots that fill the frame."""
+    y, x = np.indices((side, side)) / side
+    contrast = np.zeros((side, side))
+    for i, j in np.ndindex(3, 3):
+        square = (y - 0.25 - 0.25 * i) ** 2 + (x - 0.25 - 0.25 * j) ** 2
+        contrast += (-1) ** (i + j) * np.exp(-square / (2 * 0.07**2))
+    return 1 + 0.3 * contrast
+
+
+def blurred(rng: np.random.Generator, width: float, side: int = SIDE) -> FloatArray:
+    """White noise of deviation 1 after a blur."""
+    margin = int(4 * width) + 1
+    noise = gaussian_filter(rng.normal(size=(side + 2 * margin,) * 2), width)
+    return noise[margin:-margin, margin:-margin]
+
+
+def measure(image: FloatArray) -> CorrelatedNoise:
+    return measure_correlation(image - 1, image, np.ones(image.shape, bool))
+
+
+@pytest.mark.parametrize("width", [1.5, 2.0, 3.0])
+def test_correlated_noise_is_seen_between_structures(width: float) -> None:
+    """Its deviation before the blur, which is its power on long waves."""
+    found = []
+    for seed in range(8):
+        image = spots() + 0.2 * blurred(np.random.default_rng(seed), width)
+        found.append(measure(image).white_variance ** 0.5)
+    assert np.median(found) == pytest.approx(0.2, rel=0.35)
+    assert min(found) > 0.07
+
+
+@pytest.mark.parametrize("factor", [1.4, 2.0])
+def test_resampled_counts_are_not_white(factor: float) -> None:
+    side = round(SIDE / factor)
+    counts = np.random.default_rng(4).poisson(400 * spots(side)) / 400
+    found = measure(zoom(counts, factor, order=3, mode="nearest", grid_mode=True))
+    # Of each recorded pixel there are factor² now.
+    assert found.white_variance**0.5 == pytest.approx(factor * 0.05, rel=0.5)
+
+
+@pytest.mark.parametrize("level", [0.02, 0.1])
+def test_white_noise_between_structures_stays_white(level: float) -> None:
+    for seed in range(8):
+        found = measure(spots() + level * np.random.default_rng(seed).normal(size=(SIDE, SIDE)))
+        assert found.clumping == 1
+        assert found.white**0.5 == pytest.approx(level, rel=0.2)
+
+
+def test_structure_without_calm_parts_is_not_called_white_noise() -> None:
+    y, x = np.indices((SIDE, SIDE))
+    found = measure(1 + 0.3 * np.sin(y / 2) * np.sin(x / 2))
+    assert found.is_bound
+    assert found.white_variance**0.5 > 0.3
