@@ -443,3 +443,17 @@ def test_dark_frame_of_another_size_is_refused(tmp_path):
     np.save(tmp_path / "dark.npy", np.ones((5, 6)))
     with pytest.raises(InputError, match=r"\(5, 6\), image \(8, 8\): they must match"):
         run(Recipe(steps=(Dark(level=tmp_path / "dark.npy"),)), np.full((8, 8), 400.0))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_pair_of_negatives_is_seen_by_its_noise_and_by_its_rim(seed):
+    rng = np.random.default_rng(seed)
+    y, x = np.indices((96, 96)) / 96 - 0.5
+    beam = np.exp(-2 * (y**2 + x**2))
+    shot = beam * (1 + 0.3 * np.exp(-50 * (y**2 + x**2)))
+    image, source = (rng.poisson(1000 * plane).astype(float) for plane in (shot, beam))
+    assert "negative" not in named(image, source)
+    assert "negative" in named(1800 - image, 1800 - source)
+    dense = [np.exp(-plane / 1000) for plane in (image, source)]
+    unexposed = [np.pad(plane, 8, constant_values=1.0) for plane in dense]
+    assert "negative" in named(*unexposed)

@@ -162,6 +162,7 @@ _CONTRAST_DEVIATIONS, _BEAM_DEVIATIONS = 7.0, 4.0
 
 DECISIVE = {
     "misfit": Verdict.MISFIT,
+    "negative": Verdict.UNCERTAIN,
     "no-deflection": Verdict.UNCERTAIN,
     "folds": Verdict.AMBIGUOUS,
     "closed-edge": Verdict.EDGE,

@@ -23,12 +23,9 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise, sha256
 from napari_shadowinv.io.formats import format_of
+from napari_shadowinv.preprocessing.image_checks import is_lit_around
 
 CHANNELS = ("red", "green", "blue", "mean")
-
-# Of a picture of film that is exposed in its middle: the rim's width over the shorter side, its
-# least brightness over the brightest, and the middle's greatest over the rim's.
-_RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
 
 INCH_M = 0.0254
 _LEAST_PRINTED_M = 80e-6  # picture programs write resolutions up to 300 per inch without knowing it
@@ -68,7 +65,7 @@ def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, 
     grey = to_grey(array, "mean", "")
     if array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, "")):
         sign = f"channel {channel!r} of a colour image was used as the fluence"
-    elif array.dtype.kind in "iu" and _is_lit_around(grey):
+    elif array.dtype.kind in "iu" and is_lit_around(grey):
         sign = (
             "the rim is as bright as anything in the image and the centre is darker, which "
             "suggests a film scan"
@@ -80,19 +77,6 @@ def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, 
         "converted to dose first (napari_shadowinv.film)"
     )
     return (Caution("film-scan", text),)
-
-
-def _is_lit_around(image: FloatArray) -> bool:
-    """Return whether all four sides are as bright as the brightest part, the middle darker."""
-    # Light or particles that are deflected out of the middle make something else brighter.
-    height, width = image.shape
-    rim = max(1, round(_RIM * min(height, width)))
-    sides = (image[:rim], image[-rim:], image[:, :rim], image[:, -rim:])
-    dimmest = min(float(np.median(side)) for side in sides)
-    middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    return bool(
-        np.median(middle) < _DARKER * dimmest and _AS_BRIGHT * np.percentile(image, 99) < dimmest
-    )
 
 
 class Scan(NamedTuple):

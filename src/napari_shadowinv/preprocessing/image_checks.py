@@ -63,6 +63,12 @@ _MAX_NEIGHBOUR_DIFFERENCE = 0.3  # of the surroundings' brightness, by which a n
 _STRAY_STEP = 0.05  # of the mean, from the pixel on the left
 _NOISE_SAMPLES = 50_000
 
+# Negatives
+# Of film that is exposed in its middle: the rim's width over the shorter side, its least brightness
+# over the brightest, and the middle's greatest over the rim's.
+_RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
+_FALLING_DEVIATIONS = 4.0  # of the slope of the noise's variance with the brightness
+
 # Reference
 _COARSE_SIDE_PX = 128
 _MIN_BLOCKS = 16
@@ -157,6 +163,25 @@ class CheckedImage:
         noise = np.sqrt([float((size**2).mean()) / _CLIPPED_VARIANCE for size in clipped])
         counts = np.array([len(part) for part in parts]) * _INDEPENDENT_SHARE
         return np.array([levels, noise, noise / np.sqrt(counts)])
+
+    @property
+    def has_falling_noise(self) -> bool:
+        """Whether the noise is weaker where the image is brighter, as in no positive.
+
+        Noise of reading, of counting, and of an uneven response do not fall with the light.
+        """
+        if min(self.image.shape) < _WINDOW_PX or self.brightness.size < _MIN_PIXELS:
+            return False
+        levels, noise, uncertainty = self.noise_bins
+        if not ((noise > 0).all() and np.ptp(levels) > 0):
+            return False
+        weights = 1 / (noise * uncertainty)
+        levels = levels - np.average(levels, weights=weights**2)
+        variances = noise**2 - np.average(noise**2, weights=weights**2)
+        information = float(((levels * weights) ** 2).sum())
+        slope = float((levels * variances * weights**2).sum()) / information
+        misfit = float((((variances - slope * levels) * weights) ** 2).sum()) / (len(levels) - 2)
+        return slope * math.sqrt(information / max(misfit, 1.0)) < -_FALLING_DEVIATIONS
 
     @cached_property
     def relative_differences(self) -> FloatArray:
@@ -364,12 +389,12 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
         return
     used = image.usable & ~(image.stray | source.stray)
     pair = ReferencePair(image.image, source.image, used)
-    if pair.is_negative:
+    if sign := _sign_of_negative(image, source, pair):
         yield Caution(
             "negative",
-            "negative: the image is dark where it should be bright, as in a negative or a scan of "
-            "film: the field would have the wrong sign and size; invert its brightness, or "
-            "convert the film to dose",
+            f"negative: {sign}, as in a negative or a scan of film: the field would have the wrong "
+            "sign and size; convert the film to dose, or subtract its pixels from those of "
+            "unexposed film",
         )
     elif pair.is_swapped:
         yield Caution(
@@ -385,6 +410,30 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
             "from the source: the shift would be taken for a field; "
             "align source and image, or crop both to the same part of the beam",
         )
+
+
+def _sign_of_negative(image: CheckedImage, source: CheckedImage, pair: ReferencePair) -> str:
+    """Return what shows that an image, or it and its source, is a negative; empty if nothing."""
+    if pair.is_negative:
+        return "the image is dark where it should be bright"
+    if source.has_falling_noise:
+        return "the source is noisier where it is darker"
+    if is_lit_around(source.image) and is_lit_around(image.image):
+        return "the rims of image and source are brighter than all the beam"
+    return ""
+
+
+def is_lit_around(image: FloatArray) -> bool:
+    """Return whether all four sides are as bright as the brightest part, the middle darker."""
+    # Light or particles that are deflected out of the middle make something else brighter.
+    height, width = image.shape
+    rim = max(1, round(_RIM * min(height, width)))
+    sides = (image[:rim], image[-rim:], image[:, :rim], image[:, -rim:])
+    dimmest = min(float(np.median(side)) for side in sides)
+    middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    return bool(
+        np.median(middle) < _DARKER * dimmest and _AS_BRIGHT * np.percentile(image, 99) < dimmest
+    )
 
 
 def stray_pixels(image: FloatArray, usable: BoolArray) -> BoolArray:
