@@ -737,3 +737,14 @@ def test_no_linear_response_outlives_its_inversion(threads):
         assert not alive
     finally:
         gc.enable()
+
+
+def test_a_reference_of_another_exposure_is_assumed_uneven_and_a_given_uniform_one_is_exact():
+    image = np.random.default_rng(3).poisson(400, (40, 40)).astype(float)
+    reference = np.random.default_rng(4).poisson(4000, (40, 40)).astype(float)
+    recorded = invert(image, source=reference).errors
+    assert (recorded.beam_basis, recorded.beam_variation) == ("reference", 0.005)
+    assert recorded.beam.rms == pytest.approx(0.5 * recorded.beam_sensitivity.rms)
+    assert "assumed" in recorded.rows()[0][1]
+    assert invert(image, source=reference, instrument={"beam_rms": 0}).errors.beam is None
+    assert invert(image, source=np.full((40, 40), 400.0)).errors.beam is None

@@ -6,18 +6,21 @@ import numpy as np
 import pytest
 
 from helpers.shifted_pair import shifted_pair
-from napari_shadowinv import InputError
-from napari_shadowinv.preprocessing import ReferencePair, align_source
+from napari_shadowinv import InputError, Instrument, invert
+from napari_shadowinv.preprocessing import ReferencePair, measure_shift, move, register_source
+
+SIDE = 96
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.4, 0.3), (2.3, -1.6), (11.2, -7.5)])
 def test_the_shift_is_right_within_its_error(shift):
     image, source = shifted_pair(shift)
-    aligned = align_source(image, source)
-    assert aligned.error.max() < 0.1
-    assert (np.abs(aligned.shift - shift) < 3 * aligned.error).all()
-    assert aligned.is_significant == any(shift)
-    assert ReferencePair(image, aligned.source, np.ones(image.shape, bool)).shift is None
+    measured = measure_shift(image, source)
+    assert measured.error.max() < 0.1
+    assert (np.abs(measured.value - shift) < 3 * measured.error).all()
+    assert measured.is_significant.any() == any(shift)
+    moved = move(source, measured.significant)
+    assert ReferencePair(image, moved, np.ones(image.shape, bool)).shift is None
 
 
 def test_masked_pixels_do_not_count():
@@ -25,15 +28,69 @@ def test_masked_pixels_do_not_count():
     image[:20] = 5000
     mask = np.ones(image.shape, bool)
     mask[:22] = False
-    aligned = align_source(image, source, mask)
-    np.testing.assert_allclose(aligned.shift, (2.3, -1.6), atol=0.15)
+    measured = measure_shift(image, source, mask)
+    np.testing.assert_allclose(measured.value, (2.3, -1.6), atol=0.15)
 
 
-def test_what_does_not_determine_a_shift_is_refused():
+def test_noise_shows_no_shift():
     image, source = shifted_pair((2.3, -1.6), contrast=0.0)
-    with pytest.raises(InputError, match="too little structure at their borders"):
-        align_source(image, source)
-    with pytest.raises(InputError, match="too little structure"):
-        align_source(image, np.ones(image.shape))
+    assert measure_shift(image, source).error.min() > 1
+    assert measure_shift(image, np.ones(image.shape)).error.min() > 100
     with pytest.raises(InputError, match=r"source has shape \(120, 149\), the image \(120, 150\)"):
-        align_source(image, source[:, 1:])
+        measure_shift(image, source[:, 1:])
+
+
+def falling_beam(y, x):
+    middle = (SIDE - 1) / 2
+    return np.exp(-((y - middle) ** 2 + (x - middle) ** 2) / (2 * 48.0**2))
+
+
+def ring(y, x):
+    """Displacement of rays that a ring drives outwards."""
+    down, across = y - 46.0, x - 49.0
+    radius = np.hypot(down, across) + 1e-9
+    size = 3.0 * np.exp(-0.5 * ((radius - 20) / 6) ** 2) * np.tanh(radius / 2) / radius
+    return size * down, size * across
+
+
+def pair(shift, seed):
+    """Count rays of a beam that falls off, with a ring, and of a reference that lies elsewhere."""
+    rng = np.random.default_rng(seed)
+    places = (np.arange(-48, (SIDE + 12) * 4) + 0.5) / 4 - 0.5
+    y, x = np.meshgrid(places, places, indexing="ij")
+    down, across = ring(y, x)
+    ends = [(along + 0.5).ravel() for along in (y + down, x + across)]
+    image, *_ = np.histogram2d(
+        *ends, SIDE, [[0, SIDE], [0, SIDE]], weights=falling_beam(y, x).ravel() / 16
+    )
+    pixels = np.indices((SIDE, SIDE), dtype=float)
+    source = falling_beam(pixels[0] - shift[0], pixels[1] - shift[1])
+    return rng.poisson(3000 * image).astype(float), rng.poisson(12000 * source).astype(float)
+
+
+def error_of(inversion):
+    pixels = np.indices((SIDE, SIDE), dtype=float)
+    truth = np.array(ring(*pixels))
+    return float(np.linalg.norm(inversion.displacement - truth) / np.linalg.norm(truth))
+
+
+def test_a_reference_out_of_register_is_moved_and_what_is_left_is_an_error():
+    image, source = pair((2.0, -1.0), seed=1)
+    stated_in_place = invert(image, source=source, instrument=Instrument(registration=0))
+    assert error_of(stated_in_place) > 0.4
+    inversion = invert(image, source=source)
+    assert error_of(inversion) < 2 * inversion.errors.share < 0.4
+    assert "register" in [caution.code for caution in inversion.report.warnings]
+    assert any(name.startswith("registration") for name in inversion.errors.parts)
+
+
+def test_a_reference_in_place_stays_and_a_shift_that_cannot_be_seen_is_an_error():
+    image, source = pair((0.0, 0.0), seed=2)
+    usable = np.ones(image.shape, bool)
+    kept = register_source(image, source, usable, Instrument())
+    assert kept.source is source
+    assert kept.caution is None
+    faint = 12000 + 0.001 * source
+    assert register_source(image, faint, usable, Instrument()).error == pytest.approx(0.2, rel=0.1)
+    stated = register_source(image, faint, usable, Instrument(registration=1.0))
+    assert stated.error == pytest.approx(1.0, rel=0.3)

@@ -171,20 +171,21 @@ def bin_pixels(
 def align_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Shift a source so that its borders fit the borders of the selected image."""
+    """Shift a source so that it fits the selected image."""
     layer, viewer = without_proxy(layer), without_proxy(viewer)
     selection = _select_image(layer, viewer)
     source, name = _source_for(selection, layer, viewer)
 
     def align(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
-        aligned = preprocessing.align_source(selection.image, source, about.usable_of(layer))
-        (y, x), (y_error, x_error) = aligned.shift, aligned.error
+        measured = preprocessing.measure_shift(selection.image, source, about.usable_of(layer))
+        (y, x), (y_error, x_error) = measured
         shift = f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
-        if not aligned.is_significant:
-            raise InputError(f"'{name}' need not be moved: its shift is {shift}")
+        if not measured.is_significant.any():
+            raise InputError(f"'{name}' need not be moved, or cannot: its shift is {shift}")
+        aligned = preprocessing.move(source, measured.significant)
         made_from = {"image": selection.name, "source": f"{name}, moved by {shift}"}
         moved = replace(selection, name=name, role=about.SOURCE)
-        return [_filtered_layer(moved, aligned.source, f"moved by {shift}", made_from=made_from)]
+        return [_filtered_layer(moved, aligned, f"moved by {shift}", made_from=made_from)]
 
     return _start(selection, align, "Aligning the source with", viewer)
 

@@ -603,7 +603,7 @@ def _result(
             variation=data.beam.rms,
             share=largest_share(by_beam.errors, displacements),
             scale=data.beam.length,
-            assumed=data.assumed,
+            assumed=data.assumed or (data.beam.rms > 0 and data.instrument.beam_rms is None),
         )
     shares = {key: largest_share(each, displacements) for key, each in openness.by_part.items()}
     parts = dict(sorted(shares.items(), key=lambda part: -part[1]))

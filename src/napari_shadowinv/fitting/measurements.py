@@ -199,7 +199,7 @@ def collect_data(
     around = (pad, pad + fill[1][1]), (pad, pad + fill[2][1])
     is_common = all(np.allclose(beam, shapes[0], rtol=_SAME, atol=0) for beam in shapes[1:])
     is_assumed = source is None or not all(shot.measured for shot in shots)
-    prior = instrument.beam_of(measured=not is_assumed)
+    prior = instrument.beam_of(measured=not is_assumed, source=shapes[0])
     # Displacement by an electric field that is equal to the field in image 1.
     has_other = setups is not None and tuple(fields) == ("B",)
     other_strengths = strengths_of(setups, ("E",), count) if has_other else matrix

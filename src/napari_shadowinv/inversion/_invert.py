@@ -43,6 +43,7 @@ from napari_shadowinv.inversion.solution_checks import (
 from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.preprocessing.alignment import register_source
 from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_warnings
 from napari_shadowinv.transport.sites import RATIO, Levels, Margin, SitePlan, edge_flux, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
@@ -259,6 +260,14 @@ def invert(
         if unlit and plan is not None:
             plan, start = _plan(plan.source, options, mask, plan.measured), None
         prepared = prepare(image, source, options, mask)
+        moved: Caution | None = None
+        if measured:
+            recorded = prepared.image, prepared.source, prepared.mask
+            source, error, moved = register_source(*recorded, instrument)
+            instrument = instrument.with_registration(error)
+        if moved is not None:
+            plan = start = None
+            prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
     with measure_time("sites", seconds):
         if plan is None:
@@ -339,7 +348,7 @@ def invert(
         why = "with the most sites placed unless more are given"
         by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
     with measure_time("prepare", seconds):
-        warnings = *by_errors, *unlit, *quality.warnings, *by_accuracy, *begin_checks()()
+        warnings = *by_errors, moved, *unlit, *quality.warnings, *by_accuracy, *begin_checks()()
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,

@@ -61,6 +61,7 @@ _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 _BEAM_BASES = {  # name of the part, and its basis in a text
     "assumed": ("beam assumed, {}", "assumed"),
+    "reference": ("beam of another exposure, assumed {}", "another exposure, assumed"),
     "stated": ("beam stated, {}", "stated"),
     "seen": ("image and source differ by {}", "seen outside the object"),
     "references": ("beam by its references, {}", "by its references"),
@@ -101,8 +102,8 @@ class Errors:
         Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`, and of the
         instrument's imperfections.
     beam : ErrorEstimate or None
-        Effect of a beam that differs from the source by `beam_variation`; None if the source was
-        recorded, no variation was stated, and none was seen.
+        Effect of a beam that differs from the source by `beam_variation`; None if the source is
+        exact: stated so, or uniform and given, and no difference was seen.
     beam_sensitivity : ErrorEstimate
         Effect of a beam that differs from the source by 1 %.
     sensitivities : dict of str to ErrorEstimate
@@ -115,7 +116,8 @@ class Errors:
     beam_scale : float
         Length over which they differ, as a share of the image's shorter side.
     beam_basis : str
-        Origin of that number: 'assumed' for an estimated source, 'stated' by the user, 'seen' as a
+        Origin of that number: 'assumed' for an estimated source, 'reference' if it is assumed of a
+        recorded source, which is of another exposure, 'stated' by the user, 'seen' as a
         difference of image and source outside the object, 'references' for a prior from them,
         'outside' for a source estimated from the image outside the object, with its variance.
     noise_correlation : float
@@ -332,7 +334,7 @@ class Errors:
         rows = [("errors", text)]
         if next_step := self.measure_next(self.share / 2):
             rows.append(("measure next", next_step))
-        basis = "recorded" if self.beam is None else self._beam_name.removeprefix("beam ")
+        basis = "exact" if self.beam is None else self._beam_name.removeprefix("beam ")
         by_beam = (
             f"{basis}; a source that differs from it by 1 % (r.m.s.) over {self._beam_length} of "
             "the image's shorter side moves the displacement by "
@@ -549,11 +551,14 @@ class Budget:
             return (self._beam.rms, components.basis) if is_within else (observed, "seen")
         if observed > self._beam.rms:
             return observed, "seen"
-        return self._beam.rms, "assumed" if self.instrument.beam_rms is None else "stated"
+        if self.instrument.beam_rms is not None:
+            return self._beam.rms, "stated"
+        return self._beam.rms, "reference" if self._plan.measured else "assumed"
 
-    @property
+    @cached_property
     def _beam(self) -> BeamPrior:
-        return self.instrument.beam_of(measured=self._plan.measured)
+        measured = self._plan.measured
+        return self.instrument.beam_of(measured=measured, source=self._prepared.source)
 
     def _move(self, solution: LevelSolution) -> FloatArray:
         """Return the displacement at the places, shape (2, n), as in the read-out."""

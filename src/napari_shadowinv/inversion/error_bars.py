@@ -435,6 +435,8 @@ def uncertainty(
         on_progress=on_progress,
         should_stop=should_stop,
     )
+    if not np.array_equal(inversion.source, plan.source):  # it was moved
+        plan = plan_sites(inversion.source, options, mask=plan.mask)
     seeds = np.random.SeedSequence(options.seed).spawn(int(n))
     workers = _workers(options, len(inversion.sites), inversion.image.size)
     # The threads are shared out among the samples; what noise drives below zero is clipped.
@@ -447,7 +449,7 @@ def uncertainty(
     resampling = FullResampling(
         plan, inversion.weights, lambda rng: draw_noise(rng, correlation), clipping
     ).to_tolerance_of_noise(seeds[0])
-    draws = None if instrument is None else _draws(image, inversion, instrument, plan)
+    draws = None if instrument is None else _draws(image, inversion, plan)
     resampling = replace(resampling, instrument=draws)
     report = Reporter(on_progress, should_stop)
     image_fields = np.stack([inversion.potential, *inversion.displacement])
@@ -556,14 +558,13 @@ def _measure(
     return {name: np.asarray(of(potential, moves)) for name, of in quantities.items()}
 
 
-def _draws(
-    image: ArrayLike, inversion: Inversion, instrument: Instrument, plan: SitePlan
-) -> InstrumentDraws | None:
+def _draws(image: ArrayLike, inversion: Inversion, plan: SitePlan) -> InstrumentDraws | None:
     """Return the imperfections to be drawn; None if the instrument is exact."""
-    mask = inversion.mask
+    mask, instrument = inversion.mask, inversion.instrument
     if not plan.measured:
         instrument = instrument.without_reference()
-    beam, errors = instrument.beam_of(measured=plan.measured), inversion.errors
+    beam = instrument.beam_of(measured=plan.measured, source=inversion.source)
+    errors = inversion.errors
     if errors is not None and errors.beam_variation != beam.rms:  # more was seen
         beam = BeamPrior(rms=min(errors.beam_variation, _MAX_BEAM_RMS), length=beam.length)
     shot = RecordedShot(

@@ -197,7 +197,7 @@ class Imperfection:
 
     def stated(self, instrument: Instrument) -> float:
         """Return the standard deviation in an instrument."""
-        return float(getattr(instrument, self.key))
+        return float(getattr(instrument, self.key) or 0.0)
 
 
 def random_waves(

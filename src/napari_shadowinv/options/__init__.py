@@ -7,7 +7,12 @@ window, and is saved with each result: there is no second list of defaults.
 - unknowns of a fit and knowledge about its images: `FitChoices`
 """
 
-from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior
+from napari_shadowinv.options.beam_prior import (
+    ASSUMED_BEAM,
+    REFERENCE_BEAM,
+    BeamComponents,
+    BeamPrior,
+)
 from napari_shadowinv.options.fitting import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
@@ -16,16 +21,23 @@ from napari_shadowinv.options.fitting import (
     KindOfNoise,
     Noise,
 )
-from napari_shadowinv.options.instrument import BEAM_SOURCES, DETECTORS, Instrument
+from napari_shadowinv.options.instrument import (
+    BEAM_SOURCES,
+    DEFAULT_REGISTRATION,
+    DETECTORS,
+    Instrument,
+)
 from napari_shadowinv.options.inversion import MAX_DEFAULT_SITES, InversionOptions, MaxError
 
 __all__ = [
     "ASSUMED_BEAM",
     "BEAM_SOURCES",
+    "DEFAULT_REGISTRATION",
     "DETECTORS",
     "KINDS_OF_NOISE",
     "MAX_DEFAULT_SITES",
     "MAX_STRENGTH",
+    "REFERENCE_BEAM",
     "BeamComponents",
     "BeamPrior",
     "FitChoices",

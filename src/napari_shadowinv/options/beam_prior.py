@@ -1,6 +1,7 @@
 """How far the true beam may be from the source of an image: `BeamPrior`.
 
-- of a beam that nobody measured: `ASSUMED_BEAM`
+- of a beam that nobody measured: `ASSUMED_BEAM`; that was recorded in another exposure:
+  `REFERENCE_BEAM`
 - shapes in which it varies, and what they leave: `BeamComponents`
 """
 
@@ -180,6 +181,9 @@ class BeamPrior(CheckedModel, allow_inf_nan=False):
 
 ASSUMED_BEAM = BeamPrior(rms=0.05, length=0.25)
 """Prior of a beam that nobody measured, unless another one is stated."""
+
+REFERENCE_BEAM = BeamPrior(rms=0.005, length=0.25)
+"""Prior of a beam whose source was recorded in another exposure, unless another one is stated."""
 
 
 def _normalise(images: Iterable[ArrayLike]) -> list[FloatArray]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal, Self, get_args
 
+import numpy as np
 from pydantic import (
     Field,
     ModelWrapValidatorHandler,
@@ -22,7 +23,14 @@ from pydantic import (
 )
 
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
-from napari_shadowinv.options.beam_prior import ASSUMED_BEAM, BeamComponents, BeamPrior, Share
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.options.beam_prior import (
+    ASSUMED_BEAM,
+    REFERENCE_BEAM,
+    BeamComponents,
+    BeamPrior,
+    Share,
+)
 
 Detector = Literal["film", "image plate", "CR-39", "scintillator", "camera"]
 BeamSource = Literal["TNSA", "implosion", "X-ray tube", "laser"]
@@ -45,12 +53,17 @@ BEAM_SOURCES: Mapping[BeamSource, Mapping[str, float]] = {
 """Numbers of an `Instrument` with a source of its beam, unless others are stated."""
 
 
+DEFAULT_REGISTRATION = 0.2
+"""Shift in px of a recorded source that no image shows, unless another one is stated."""
+
+
 class Instrument(CheckedModel, allow_inf_nan=False):
     """How well beam, detector and alignment are known, as standard deviations.
 
     What is not stated has the default of the detector or of the beam source. Without these it
-    counts as exact, except for a beam that nobody measured: `ASSUMED_BEAM`. The beam may be given
-    as `beam`, a `BeamPrior`, in place of its numbers; only so it has components.
+    counts as exact, except for a beam that nobody measured (`ASSUMED_BEAM`) or that was recorded in
+    another exposure (`REFERENCE_BEAM`). The beam may be given as `beam`, a `BeamPrior`, in place of
+    its numbers; only so it has components.
 
     Raises
     ------
@@ -81,9 +94,10 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         ge=0,
         lt=1,
         title="Beam",
-        description="Relative r.m.s. difference between the true beam and the source. Default: 0 "
-        "for a recorded source, else 0.05. If image and source differ by more where there is no "
-        "object, that difference counts.",
+        description="Relative r.m.s. difference between the true beam and the source. Default: "
+        "0.005 for a recorded source (0 if it is uniform), else 0.05. If image and source differ "
+        "by more where there is no object, that difference counts. 0 for a source of the same "
+        "exposure.",
     )
     beam_length: float = Field(
         default=0.25,
@@ -123,13 +137,14 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         default=0.0,
         description="Relative r.m.s. variation of the transmission of the object.",
     )
-    registration: float = Field(
-        default=0.0,
+    registration: float | None = Field(
+        default=None,
         ge=0,
         le=1000,
         title="Registration (px)",
         description="Shift of the image relative to its source in px; rotation and scale move the "
-        "corners by as much.",
+        "corners by as much. Default: as measured in the image, at most 0.2 for a source in place. "
+        "0 for a source that need not be moved.",
     )
     other_field: float = Field(
         default=0.0,
@@ -224,7 +239,11 @@ class Instrument(CheckedModel, allow_inf_nan=False):
 
     def without_reference(self) -> Self:
         """Return the instrument for an estimated source, which is in register with its image."""
-        return self.model_copy(update={"registration": 0.0})
+        return self.with_registration(0.0)
+
+    def with_registration(self, error: float) -> Self:
+        """Return the instrument for a source in register to within an error, px."""
+        return self.model_copy(update={"registration": error})
 
     def with_beam(self, beam: BeamPrior) -> Instrument:
         """Return the instrument with another beam, of the same difference between energies."""
@@ -236,15 +255,19 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         beam = beam.model_copy(update={"between": self.beam_between})
         return Instrument(**{**numbers, "beam": beam})
 
-    def beam_of(self, *, measured: bool) -> BeamPrior:
+    def beam_of(self, *, measured: bool, source: FloatArray | None = None) -> BeamPrior:
         """Return the prior of the beam, assumed unless stated.
 
         Parameters
         ----------
         measured : bool
             Whether the source was recorded.
+        source : ndarray, optional
+            That source, 0 where masked: a uniform one is the beam itself, not a record of it.
         """
-        default = 0.0 if measured else ASSUMED_BEAM.rms
+        default = (REFERENCE_BEAM if measured else ASSUMED_BEAM).rms
+        if measured and source is not None and not np.ptp(source[source != 0]) > 0:
+            default = 0.0
         rms = default if self.beam_rms is None else self.beam_rms
         beam = BeamPrior(rms=rms, length=self.beam_length, between=self.beam_between)
         return beam if self._components is None else beam.with_components(self._components)

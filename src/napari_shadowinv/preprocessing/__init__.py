@@ -2,7 +2,7 @@
 
 - the shot: `Radiograph`; the recipe: `Recipe`
 - whether image and source look right: `image_warnings`, `ReferencePair`; a source in register with
-  its image: `align_source`
+  its image: `register_source`
 - steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
   `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`
 - estimates of the source by name in `ESTIMATES`; as functions `uniform_source`,

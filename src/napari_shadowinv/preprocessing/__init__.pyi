@@ -1,4 +1,4 @@
-from .alignment import AlignedSource, align_source
+from .alignment import Shift, measure_shift, move, register_source
 from .estimates import (
     Estimate,
     GaussianEstimate,
@@ -51,7 +51,6 @@ __all__ = [
     "FILTERS",
     "FIT_STEPS",
     "STEPS",
-    "AlignedSource",
     "BackgroundFilter",
     "Bin",
     "ButterworthFilter",
@@ -74,10 +73,10 @@ __all__ = [
     "Recipe",
     "ReferencePair",
     "Rotate",
+    "Shift",
     "Step",
     "TotalVariationEstimate",
     "UniformEstimate",
-    "align_source",
     "butterworth",
     "check_masks",
     "estimate_source",
@@ -90,7 +89,10 @@ __all__ = [
     "kriged_source",
     "low_pass",
     "low_pass_source",
+    "measure_shift",
+    "move",
     "polynomial_source",
+    "register_source",
     "remove_background",
     "remove_hot_pixels",
     "total_variation_source",

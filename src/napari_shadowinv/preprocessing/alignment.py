@@ -1,59 +1,143 @@
-"""A source in register with its image: `align_source`.
+"""A source in register with its image: `register_source`; its shift alone: `measure_shift`.
 
-The borders of both are compared, where an object displaces least. A shift that is left would be
-taken for a field.
+A shift that is left would be taken for a field. Two comparisons show it, each weighted by its
+error, and neither by much where an object is:
+
+- *at the borders*, where an object displaces least: the ratio of image and source in square cells
+  is the shift's pattern, plus a difference of the beams, smooth over a length, and noise. The size
+  of that difference is the likeliest one, no smaller than expected, so that it, and the flanks of
+  an object, count as errors.
+- *everywhere*, by the finest structure: each part of the image counts by what the shift leaves of
+  it, and the error is the scatter of the parts.
+
+Noise has gradients, too, which share nothing with the shift. Those of the source are therefore
+compared with those of the image, not with themselves (instrumental variables).
+
+References
+----------
+J. D. Angrist and J.-S. Pischke, *Mostly Harmless Econometrics* (Princeton, 2009), sections 4.1 and
+8.2, for instrumental variables and errors by clusters; C. E. Rasmussen and C. K. I. Williams,
+*Gaussian Processes for Machine Learning* (MIT Press, 2006), chapter 5, for the likeliest size.
 """
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+from scipy import linalg, ndimage
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, check_shape
+from napari_shadowinv._system.arrays import NORMAL_MAD, check_shape, complete_block_means
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.errors import InputError
-from napari_shadowinv.preprocessing.image_checks import ReferencePair, border_ring
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.options import DEFAULT_REGISTRATION, REFERENCE_BEAM, BeamPrior, Instrument
+from napari_shadowinv.preprocessing.image_checks import ReferencePair
 
-_BLUR_PX = 1.5  # makes gradients of noisy images
-_MAX_STEPS = 30
-_STEP_TOLERANCE_PX = 1e-3
-_OUTLIER_DEVIATIONS = 3.0  # an object may reach the border
-_MAX_ERROR_PX = 0.5
-_SIGNIFICANT_ERRORS = 2.0
+_SIDE_PX = 512  # of the planes that are compared
+_CELLS = 24  # along the longer side
+_DEPTHS = 1, 2, 4  # cells, of the borders
+_AGREEING_ERRORS = 1.5  # of the shift by a border, for a deeper one to count
+_DIFFERENCES = 1.0, 2.5, 6.0, 16.0  # of the beams, over the expected one
+_LEAST_NOISE = 1e-5  # of a cell
+_LEAST_LIGHT = 0.05  # of the mean
+_FINE_PX, _COARSE_PX = 1.0, 4.0
+_PARTS = 8  # along each side
+_PART_DEVIATIONS = 4.0  # of the finest structure that image and source share
+_UNKNOWN_PX = 1e3
+_MAX_STEPS, _LONGEST_STEP_PX = 12, 3.0
+_MAX_ERROR_PX = 0.5  # of a shift by which a source is moved
+_SIGNIFICANT_ERRORS = 3.0
 _MIN_SHIFT_PX = 0.05  # interpolation would change more than it mends
 
 
-class AlignedSource(NamedTuple):
+class Shift(NamedTuple):
+    """Shift of a source to its place in an image, (y, x) in px, with its standard deviations."""
+
+    value: FloatArray
+    error: FloatArray
+
+    @property
+    def is_significant(self) -> BoolArray:
+        """Whether it is above three times its error and 0.05 px, along each axis."""
+        limits = np.maximum(_SIGNIFICANT_ERRORS * self.error, _MIN_SHIFT_PX)
+        return (self.error <= _MAX_ERROR_PX) & (np.abs(self.value) > limits)
+
+    @property
+    def significant(self) -> FloatArray:
+        """The shift along the axes where it is significant, 0 along others."""
+        return np.where(self.is_significant, self.value, 0.0)
+
+    def left(self, expected: float) -> float:
+        """Return the standard deviation of what is left of it without its significant part, px.
+
+        Parameters
+        ----------
+        expected : float
+            Standard deviation of a shift that was not measured.
+        """
+        unexplained = np.maximum(np.abs(self.value) - 2 * self.error, 0.0)
+        unmoved = np.hypot(np.minimum(self.error, expected), unexplained)
+        return float(np.where(self.is_significant, self.error, unmoved).max())
+
+
+class RegisteredSource(NamedTuple):
     """A source in register with an image.
 
     Attributes
     ----------
     source : ndarray, shape (H, W)
-        Interpolated with cubic splines; at the edges, the nearest pixels.
-    shift : ndarray, shape (2,)
-        By which it was moved, (y, x) in px.
-    error : ndarray, shape (2,)
-        Standard deviation of the shift in px, by the noise.
+        Interpolated with cubic splines.
+    error : float
+        Standard deviation of the shift that is left, px.
+    caution : Caution or None
+        If the source was moved.
     """
 
     source: FloatArray
-    shift: FloatArray
-    error: FloatArray
-
-    @property
-    def is_significant(self) -> bool:
-        """Whether the shift along an axis is above twice its error, and above 0.05 px."""
-        limits = np.maximum(_SIGNIFICANT_ERRORS * self.error, _MIN_SHIFT_PX)
-        return bool((np.abs(self.shift) > limits).any())
+    error: float
+    caution: Caution | None
 
 
-def align_source(
-    image: FloatArray, source: FloatArray, mask: BoolArray | None = None
-) -> AlignedSource:
-    """Shift a source so that it fits an image at the borders, by least squares.
+def register_source(
+    image: FloatArray, source: FloatArray, usable: BoolArray, instrument: Instrument
+) -> RegisteredSource:
+    """Move a recorded source where it fits its image, if it lies elsewhere beyond doubt.
+
+    A source without structure, or one that is stated to be in register, stays.
+    """
+    beam = instrument.beam_of(measured=True, source=source)
+    expected = DEFAULT_REGISTRATION if instrument.registration is None else instrument.registration
+    if not expected or not np.ptp(source[usable]) > 0:
+        return RegisteredSource(source, 0.0, None)
+    shift = measure_shift(image, source, usable, beam)
+    error = shift.left(expected)
+    if not shift.is_significant.any():
+        return RegisteredSource(source, error, None)
+    (y, x), (y_error, x_error) = shift.significant, shift.error
+    text = (
+        f"register: the source was moved by y {y:+.2f} ± {y_error:.2f} and x {x:+.2f} ± "
+        f"{x_error:.2f} px to fit the image; what is left of the shift is in the error. State a "
+        "registration of 0 if both are on the same pixels"
+    )
+    moved = np.where(usable, move(source, shift.significant), 0.0)
+    return RegisteredSource(moved, error, Caution("register", text))
+
+
+def move(source: FloatArray, shift: FloatArray) -> FloatArray:
+    """Return a source that was shifted by px along y and x; its slopes go on beyond its edges."""
+    width = min(int(np.ceil(np.abs(shift).max())) + 2, min(source.shape) - 1)
+    padded = np.pad(source, width, mode="reflect", reflect_type="odd")
+    inside = np.s_[width:-width, width:-width]
+    return np.maximum(ndimage.shift(padded, shift, order=3, mode="nearest")[inside], 0.0)
+
+
+def measure_shift(
+    image: FloatArray,
+    source: FloatArray,
+    mask: BoolArray | None = None,
+    beam: BeamPrior = REFERENCE_BEAM,
+) -> Shift:
+    """Measure the shift of a source to its place in an image.
 
     Parameters
     ----------
@@ -61,59 +145,160 @@ def align_source(
         In any units; their brightness may differ.
     mask : ndarray of bool, shape (H, W), optional
         True at usable pixels.
+    beam : BeamPrior
+        Expected difference of the beams of image and source.
 
     Returns
     -------
-    AlignedSource
+    Shift
+        With errors of 1000 px where nothing shows it.
 
     Raises
     ------
     InputError
-        If the shapes differ, or the borders determine the shift to no better than 0.5 px.
+        If the shapes differ.
     """
     image, source = (np.asarray(plane, dtype=np.float64) for plane in (image, source))
     check_shape("the source", source.shape, image.shape, "the image")
-    usable = np.ones(image.shape, dtype=bool) if mask is None else mask
-    border = usable & border_ring(image.shape)
-    fit = _fit_shift(image, source, border, ReferencePair(image, source, usable).shift or (0, 0))
-    if fit is None:
-        raise InputError(
-            "image and source share too little structure at their borders to be aligned to within "
-            f"{_MAX_ERROR_PX:g} px: align the camera by marks in both, or use an estimated source"
+    usable = np.ones(image.shape, bool) if mask is None else mask
+    start = np.array(ReferencePair(image, source, usable).shift or (0.0, 0.0))
+    block = -(-max(image.shape) // _SIDE_PX)
+    whole = complete_block_means(usable, block) > 1 - 1e-9
+    planes = (complete_block_means(plane, block) for plane in (image, source))
+    if not whole.any():
+        return Shift(np.zeros(2), np.full(2, _UNKNOWN_PX))
+    shot, reference = (np.where(whole, p / max(p[whole].mean(), 1e-300), 1.0) for p in planes)
+    value = start / block
+    for step in range(_MAX_STEPS):
+        moved = (
+            ndimage.shift(reference, value, order=3, mode="nearest") if any(value) else reference
         )
-    shift, error = fit
-    moved = ndimage.shift(source, shift, order=3, mode="nearest")
-    return AlignedSource(np.maximum(moved, 0.0), shift, error)
-
-
-def _fit_shift(
-    image: FloatArray, source: FloatArray, border: BoolArray, start: tuple[float, float]
-) -> tuple[FloatArray, FloatArray] | None:
-    """Return shift and error of a source by Gauss's and Newton's method, None if uncertain."""
-    if border.sum() < 16:
-        return None
-    shot, beam = (
-        ndimage.gaussian_filter(plane / plane[border].mean(), _BLUR_PX) for plane in (image, source)
-    )
-    shift = np.array(start, dtype=np.float64)
-    for _ in range(_MAX_STEPS):
-        moved = ndimage.shift(beam, shift, order=3, mode="nearest")
-        slopes = np.gradient(moved)
-        design = np.stack([-slopes[0][border], -slopes[1][border], moved[border]])
-        misfit = (shot - moved)[border]
-        noise = NORMAL_MAD * float(np.median(np.abs(misfit - np.median(misfit))))
-        weights = (np.abs(misfit) <= _OUTLIER_DEVIATIONS * noise).astype(float)
-        # Sums instead of products of matrices, whose threads would wait for each other.
-        normal = np.array([[(a * b * weights).sum() for b in design] for a in design])
-        if not np.linalg.cond(normal) < 1e12:
-            return None
-        step = np.linalg.solve(normal, [(a * misfit * weights).sum() for a in design])
-        shift += step[:2]
-        if np.abs(step[:2]).max() < _STEP_TOLERANCE_PX:
+        steps = _by_borders(shot, moved, whole, beam), _by_finest(shot, moved, whole)
+        weights = [np.linalg.inv(covariance) for _, covariance in steps]
+        covariance = np.linalg.inv(sum(weights))
+        found = covariance @ sum(w @ move for w, (move, _) in zip(weights, steps, strict=True))
+        error = np.sqrt(np.diag(covariance))
+        is_settled = (np.abs(found) < (0.1 if step else 2.0) * error).all()
+        longest = _LONGEST_STEP_PX / (1 + step)
+        value = value + (found if is_settled else np.clip(found, -longest, longest))
+        if is_settled or error.max() > _LONGEST_STEP_PX:
             break
-    else:
-        return None
-    # The blur correlates the noise of as many pixels.
-    variance = noise**2 * 4 * math.pi * _BLUR_PX**2
-    error = np.sqrt(variance * np.diag(np.linalg.inv(normal))[:2])
-    return (shift, error) if error.max() <= _MAX_ERROR_PX else None
+    return Shift(block * value, block * error)
+
+
+Step = tuple[FloatArray, FloatArray]
+"""A shift, (2,), and its covariance, (2, 2)."""
+
+_NO_STEP: Step = (np.zeros(2), _UNKNOWN_PX**2 * np.eye(2))
+
+
+def _by_borders(shot: FloatArray, source: FloatArray, usable: BoolArray, beam: BeamPrior) -> Step:
+    """Return the shift by the ratio of image and source near the borders."""
+    cell = max(2, -(-max(shot.shape) // _CELLS))
+    if min(shot.shape) < 3 * cell:
+        return _NO_STEP
+    level = complete_block_means(source, cell)
+    lit = (complete_block_means(usable, cell) > 1 - 1e-9) & (level > _LEAST_LIGHT)
+    level = np.where(lit, level, 1.0)
+    ratio = complete_block_means(shot, cell) / level - 1
+    patterns = [
+        [-complete_block_means(each, cell) / level for each in np.gradient(smooth)]
+        for smooth in (ndimage.gaussian_filter(plane, cell / 2) for plane in (source, shot))
+    ]
+    best = _NO_STEP
+    for depth in _DEPTHS:
+        border = lit.copy()
+        border[depth:-depth, depth:-depth] = False
+        if border.sum() > 8:
+            at_border = [[pattern[border] for pattern in both] for both in patterns]
+            places = cell / min(shot.shape) * np.argwhere(border)
+            noise = max(_noise_of(ratio, lit), _LEAST_NOISE**2)
+            found = _likeliest_shift(ratio[border], at_border, places, noise, beam)
+            # Deeper borders show more, until they reach the object.
+            allowed = _AGREEING_ERRORS * np.sqrt(np.diag(best[1]))
+            if best is _NO_STEP or (np.abs(found[0] - best[0]) < allowed).all():
+                best = min(best, found, key=lambda step: float(np.trace(step[1])))
+    return best
+
+
+def _noise_of(ratio: FloatArray, lit: BoolArray) -> float:
+    """Return the variance of noise in the outermost cells."""
+    finest = (ratio[1:, 1:] - ratio[1:, :-1] - ratio[:-1, 1:] + ratio[:-1, :-1]) / 2
+    used = lit[1:, 1:] & lit[1:, :-1] & lit[:-1, 1:] & lit[:-1, :-1]
+    used[1:-1, 1:-1] = False
+    return float((NORMAL_MAD * np.median(np.abs(finest[used]))) ** 2) if used.any() else 0.0
+
+
+def _likeliest_shift(
+    ratio: FloatArray,
+    patterns: list[list[FloatArray]],
+    places: FloatArray,
+    noise: float,
+    beam: BeamPrior,
+) -> Step:
+    """Return the shift, by generalised least squares with the likeliest difference of beams."""
+    of_source, of_shot = (np.stack([np.ones_like(ratio), *both], axis=1) for both in patterns)
+    squares = ((places[:, None] - places) ** 2).sum(axis=2)
+    best, likeliest = _NO_STEP, -np.inf
+    for length in (beam.length, beam.length / 2):
+        correlation = np.exp(-squares / (2 * length**2))
+        for factor in _DIFFERENCES:
+            covariance = (factor * beam.rms) ** 2 * correlation + noise * np.eye(len(ratio))
+            root = linalg.cholesky(covariance, lower=True, check_finite=False)
+            columns = np.column_stack([of_source, of_shot, ratio])
+            white = linalg.solve_triangular(root, columns, lower=True, check_finite=False)
+            source, shot, values = white[:, :3], white[:, 3:6], white[:, 6]
+            normal = source.T @ shot
+            if not np.linalg.cond(normal) < 1e12:
+                continue
+            inverse = np.linalg.inv(normal)
+            answer = inverse @ (source.T @ values)
+            misfit = float(((values - shot @ answer) ** 2).sum())
+            evidence = -misfit / 2 - float(np.log(np.diag(root)).sum())
+            if evidence > likeliest:
+                likeliest = evidence
+                spread = inverse @ (source.T @ source) @ inverse.T
+                best = answer[1:], spread[1:, 1:] * max(1.0, misfit / len(ratio))
+    return best
+
+
+def _by_finest(shot: FloatArray, source: FloatArray, usable: BoolArray) -> Step:
+    """Return the shift by the finest structure, with an error by the scatter of parts."""
+    fine, sharp = (
+        ndimage.gaussian_filter(plane, _FINE_PX) - ndimage.gaussian_filter(plane, _COARSE_PX)
+        for plane in (source, shot)
+    )
+    inner = ndimage.binary_erosion(usable, np.ones((9, 9)))
+    rows, columns = (np.arange(side) * _PARTS // side for side in shot.shape)
+    parts = (rows[:, None] * _PARTS + columns)[inner]
+    difference = (sharp - fine)[inner]
+    slopes, instruments = ([-g[inner] for g in np.gradient(plane)] for plane in (sharp, fine))
+
+    def sums(first: list[FloatArray], second: list[FloatArray]) -> FloatArray:
+        """Return sums of products over each part, (parts, first, second)."""
+        products = [[np.bincount(parts, a * b, _PARTS**2) for b in second] for a in first]
+        return np.moveaxis(np.array(products), 2, 0)
+
+    count = np.bincount(parts, minlength=_PARTS**2)
+    is_filled = count > 0
+    if is_filled.sum() < _PARTS:
+        return _NO_STEP
+    normal = sums(instruments, slopes)[is_filled]
+    normal = (normal + normal.transpose(0, 2, 1)) / 2
+    squares, products = (sums(instruments, each)[is_filled] for each in (instruments, [difference]))
+    squared = sums([difference], [difference])[is_filled, 0, 0]
+    products, count = products[..., 0], count[is_filled]
+    shift = np.zeros(2)
+    for _ in range(3):
+        explained = 2 * products @ shift - np.einsum("tij,i,j->t", squares, shift, shift)
+        weights = count / np.maximum(squared - explained, 1e-12 * count)
+        total = np.einsum("t,tij->ij", weights, normal)
+        spread = weights[:, None, None] * normal - total / len(count)
+        by_chance = np.sqrt((spread**2).sum(axis=0).max())
+        if not np.linalg.eigvalsh(total)[0] > _PART_DEVIATIONS * by_chance:
+            return _NO_STEP
+        shift = np.linalg.solve(total, weights @ products)
+    scores = weights[:, None] * (products - normal @ shift)
+    inverse = np.linalg.inv(total)
+    spread = inverse @ (scores.T @ scores) @ inverse
+    return shift, spread * len(count) / (len(count) - 2)

@@ -30,6 +30,7 @@ from napari_shadowinv.options import (
     ASSUMED_BEAM,
     BEAM_SOURCES,
     DETECTORS,
+    REFERENCE_BEAM,
     Instrument,
     InversionOptions,
 )
@@ -43,7 +44,7 @@ _INSTRUMENT_KINDS = ("detector", "beam_source")
 _KINDS: Mapping[Any, Mapping[str, float]] = {**DETECTORS, **BEAM_SOURCES}
 # Numbers of an instrument without a default.
 _UNSTATED = {
-    "beam_rms": f"{ASSUMED_BEAM.rms:g}, or 0 if recorded",
+    "beam_rms": f"{ASSUMED_BEAM.rms:g}, or {REFERENCE_BEAM.rms:g} if recorded",
     "noise_correlation": "measured in the image",
 }
 _CHANGED = ", changed by hand"
