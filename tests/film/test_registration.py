@@ -43,7 +43,10 @@ def test_films_are_found_to_lie_as_they_do() -> None:
     np.testing.assert_allclose(poses.turns - poses.turns[0], turns, atol=5e-4)
     assert poses.by_images.all()
     assert poses.closure < 0.15
-    assert (poses.errors < 0.3).all()
+    # Content agrees to tenths of a pixel, but only edges are independent of fields.
+    moves = np.sqrt((poses.shifts**2).mean(axis=1))
+    assert (np.hypot(moves, 0.05) < poses.errors).all()
+    assert (poses.errors < np.hypot(moves, 0.3)).all()
     # Only where all lie together is left to the edges.
     np.testing.assert_allclose(poses.shifts.mean(axis=0), 0, atol=1e-9)
 
@@ -85,7 +88,7 @@ def test_edges_are_trusted_as_little_as_those_of_films_that_can_be_compared() ->
     off = np.sqrt(np.mean(poses.shifts[:3] ** 2))
     assert off > 4
     assert poses.errors[3] == pytest.approx(off)
-    assert (poses.errors[:3] < 0.3).all()
+    assert (poses.errors[:3] > np.abs(poses.shifts[:3, 0]) / 2).all()
 
 
 def test_moved_corners_cut_the_film_where_it_shows_the_same() -> None:

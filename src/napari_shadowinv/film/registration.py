@@ -82,7 +82,8 @@ class Poses(NamedTuple):
     turns : ndarray, shape (n,)
         The same as an angle about the middle in rad, from y towards x.
     errors : ndarray, shape (n,)
-        Standard deviation of a shift in px, against the film that it is best compared with.
+        Standard deviation of a shift in px, against the film that it is best compared with, and how
+        far that moved it from its edges (r.m.s. along an axis).
     by_images : ndarray of bool, shape (n,)
         Whether neighbouring films share its structure; else only its edges count.
     closure : float
@@ -184,6 +185,7 @@ def register(
     third film of the same kind agree. Comparisons and edges together give the poses, each
     weighted by its error. Where no comparison is further than 1.5 px from the edges, edges
     count alone: fields displace the structure by different amounts, which looks like a shift.
+    For the same reason the error of a film that was moved is no smaller than its move.
 
     Parameters
     ----------
@@ -227,7 +229,9 @@ def register(
             by_peers = np.sqrt(np.mean(poses.shifts[peers] ** 2))
             poses.errors[k] = max(poses.errors[k], by_peers)
     if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > _EDGE_AGREEMENT_PX:
-        return poses
+        # What films show is at one place to tenths of a pixel also where fields or the beam move it.
+        moves = np.sqrt(np.mean(poses.shifts**2, axis=1))
+        return poses._replace(errors=np.hypot(poses.errors, np.where(poses.by_images, moves, 0.0)))
     return poses._replace(
         shifts=np.zeros_like(poses.shifts),
         turns=np.zeros_like(poses.turns),

@@ -525,7 +525,7 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) 
         for film, film_doses in zip(films, doses, strict=True)
         if film_doses.too_dark > _MAX_DARK_SHARE
     ]
-    at_edges = poses.errors >= EDGE_ERROR_PX
+    at_edges = ~poses.by_images & (poses.errors >= EDGE_ERROR_PX)
     if at_edges.any() and len(films) > 1:
         loose = [film.number for film, by_edges in zip(films, at_edges, strict=True) if by_edges]
         why = "share too little structure with their neighbours"
