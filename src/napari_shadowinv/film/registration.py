@@ -229,7 +229,7 @@ def register(
             by_peers = np.sqrt(np.mean(poses.shifts[peers] ** 2))
             poses.errors[k] = max(poses.errors[k], by_peers)
     if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > _EDGE_AGREEMENT_PX:
-        # What films show is at one place to tenths of a pixel also where fields or the beam move it.
+        # What films show agrees to tenths of a pixel also where fields or the beam move it.
         moves = np.sqrt(np.mean(poses.shifts**2, axis=1))
         return poses._replace(errors=np.hypot(poses.errors, np.where(poses.by_images, moves, 0.0)))
     return poses._replace(
