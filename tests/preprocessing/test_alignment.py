@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from helpers.shifted_pair import shifted_pair
 from napari_shadowinv import InputError, Instrument, invert
-from napari_shadowinv.preprocessing import ReferencePair, measure_shift, move, register_source
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.preprocessing import measure_shift, move, register_source
 
 SIDE = 96
+Y, X = np.indices((200, 200)) / 200
+SMOOTH = 100 * np.exp(-((Y - 0.45) ** 2 + (X - 0.55) ** 2) / 0.5)
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.0), (0.4, 0.3), (2.3, -1.6), (11.2, -7.5)])
@@ -19,8 +24,8 @@ def test_the_shift_is_right_within_its_error(shift):
     assert measured.error.max() < 0.1
     assert (np.abs(measured.value - shift) < 3 * measured.error).all()
     assert measured.is_significant.any() == any(shift)
-    moved = move(source, measured.significant)
-    assert ReferencePair(image, moved, np.ones(image.shape, bool)).shift is None
+    again = measure_shift(image, move(source, measured.significant))
+    assert not again.is_significant.any()
 
 
 def test_masked_pixels_do_not_count():
@@ -38,6 +43,26 @@ def test_noise_shows_no_shift():
     assert measure_shift(image, np.ones(image.shape)).error.min() > 100
     with pytest.raises(InputError, match=r"source has shape \(120, 149\), the image \(120, 150\)"):
         measure_shift(image, source[:, 1:])
+
+
+@pytest.mark.parametrize("peak", [97.0, 194.0])
+def test_a_shift_of_a_faint_smooth_beam_is_seen_above_the_noise(peak):
+    clean = synthetic_image(toroid(SMOOTH.shape, paper_setup(), peak, 30e-6).displacement, SMOOTH)
+    rng = np.random.default_rng(0)
+    image, source = (rng.poisson(plane).astype(float) for plane in (clean, SMOOTH))
+    measured = measure_shift(image[5:], source[:-5])
+    assert (np.abs(measured.value - (-5, 0)) < 3 * measured.error).all()
+    assert measured.is_significant[0]
+    assert not measure_shift(image, source).is_significant.any()
+
+
+def test_a_beam_that_merely_differs_is_not_moved_far():
+    for seed in range(1000, 1006):
+        rng = np.random.default_rng(seed)
+        change = gaussian_filter(rng.normal(size=SMOOTH.shape), 35)
+        changed = SMOOTH * (1 + 0.005 * (change - change.mean()) / change.std())
+        image, source = (rng.poisson(plane).astype(float) for plane in (changed, SMOOTH))
+        assert not measure_shift(image, source).is_significant.any()
 
 
 def falling_beam(y, x):

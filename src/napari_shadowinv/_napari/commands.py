@@ -178,14 +178,12 @@ def align_source(
 
     def align(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
         measured = preprocessing.measure_shift(selection.image, source, about.usable_of(layer))
-        (y, x), (y_error, x_error) = measured
-        shift = f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
         if not measured.is_significant.any():
-            raise InputError(f"'{name}' need not be moved, or cannot: its shift is {shift}")
+            raise InputError(f"'{name}' need not be moved, or cannot: its shift is {measured.text}")
         aligned = preprocessing.move(source, measured.significant)
-        made_from = {"image": selection.name, "source": f"{name}, moved by {shift}"}
+        made_from = {"image": selection.name, "source": f"{name}, moved by {measured.text}"}
         moved = replace(selection, name=name, role=about.SOURCE)
-        return [_filtered_layer(moved, aligned, f"moved by {shift}", made_from=made_from)]
+        return [_filtered_layer(moved, aligned, f"moved by {measured.text}", made_from=made_from)]
 
     return _start(selection, align, "Aligning the source with", viewer)
 

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, FitShot, compare, fit, point_spread
 from napari_shadowinv.fitting.shots import common_values, value_of_first
@@ -38,6 +39,7 @@ from napari_shadowinv.preprocessing import (
     UniformEstimate,
     estimate_source,
 )
+from napari_shadowinv.preprocessing.alignment import measure_shift
 from napari_shadowinv.preprocessing.image_checks import image_warnings
 from napari_shadowinv.provenance import Origin, Provenance, index_masks
 
@@ -382,6 +384,11 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
         mask, doubts = mask_unlit(shot.image, source, shot.mask)
         shot = replace(shot, mask=mask)
         doubts += image_warnings(shot.image, source, shot.mask)
+        if source is not None:
+            shift = measure_shift(shot.image, source, shot.mask)
+            if shift.is_significant.any():
+                text = f"register: the source must be moved by {shift.text}: align it before a fit"
+                doubts.append(Caution("register", text))
         if shot.setup is not None:
             doubts += setup_warnings(shot.setup, shot.shape, shot.metadata)
         if estimate is not None and not isinstance(estimate, UniformEstimate):

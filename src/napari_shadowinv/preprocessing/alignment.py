@@ -31,7 +31,7 @@ from napari_shadowinv._system.arrays import NORMAL_MAD, check_shape, complete_bl
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.options import DEFAULT_REGISTRATION, REFERENCE_BEAM, BeamPrior, Instrument
-from napari_shadowinv.preprocessing.image_checks import ReferencePair
+from napari_shadowinv.preprocessing.image_checks import border_ring
 
 _SIDE_PX = 512  # of the planes that are compared
 _CELLS = 24  # along the longer side
@@ -44,9 +44,12 @@ _FINE_PX, _COARSE_PX = 1.0, 4.0
 _PARTS = 8  # along each side
 _PART_DEVIATIONS = 4.0  # of the finest structure that image and source share
 _UNKNOWN_PX = 1e3
+# Of a shift by whole pixels: blur over the longer side, least common share of the borders, largest
+# misfit over that without it, which is half and more for beams that merely differ.
+_COARSE_BLUR, _MIN_OVERLAP, _COARSE_MISFIT = 0.03, 0.5, 0.4
 _MAX_STEPS, _LONGEST_STEP_PX = 12, 3.0
 _MAX_ERROR_PX = 0.5  # of a shift by which a source is moved
-_SIGNIFICANT_ERRORS = 3.0
+_SIGNIFICANT_ERRORS = 4.0
 _MIN_SHIFT_PX = 0.05  # interpolation would change more than it mends
 
 
@@ -58,7 +61,7 @@ class Shift(NamedTuple):
 
     @property
     def is_significant(self) -> BoolArray:
-        """Whether it is above three times its error and 0.05 px, along each axis."""
+        """Whether it is above four times its error and 0.05 px, along each axis."""
         limits = np.maximum(_SIGNIFICANT_ERRORS * self.error, _MIN_SHIFT_PX)
         return (self.error <= _MAX_ERROR_PX) & (np.abs(self.value) > limits)
 
@@ -66,6 +69,12 @@ class Shift(NamedTuple):
     def significant(self) -> FloatArray:
         """The shift along the axes where it is significant, 0 along others."""
         return np.where(self.is_significant, self.value, 0.0)
+
+    @property
+    def text(self) -> str:
+        """The shift with its errors, such as "y +2.01 ± 0.10, x -0.96 ± 0.12 px"."""
+        (y, x), (y_error, x_error) = self
+        return f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
 
     def left(self, expected: float) -> float:
         """Return the standard deviation of what is left of it without its significant part, px.
@@ -113,11 +122,9 @@ def register_source(
     error = shift.left(expected)
     if not shift.is_significant.any():
         return RegisteredSource(source, error, None)
-    (y, x), (y_error, x_error) = shift.significant, shift.error
     text = (
-        f"register: the source was moved by y {y:+.2f} ± {y_error:.2f} and x {x:+.2f} ± "
-        f"{x_error:.2f} px to fit the image; what is left of the shift is in the error. State a "
-        "registration of 0 if both are on the same pixels"
+        f"register: the source was moved by {shift.text} to fit the image; what is left of the "
+        "shift is in the error. State a registration of 0 if both are on the same pixels"
     )
     moved = np.where(usable, move(source, shift.significant), 0.0)
     return RegisteredSource(moved, error, Caution("register", text))
@@ -161,14 +168,13 @@ def measure_shift(
     image, source = (np.asarray(plane, dtype=np.float64) for plane in (image, source))
     check_shape("the source", source.shape, image.shape, "the image")
     usable = np.ones(image.shape, bool) if mask is None else mask
-    start = np.array(ReferencePair(image, source, usable).shift or (0.0, 0.0))
     block = -(-max(image.shape) // _SIDE_PX)
     whole = complete_block_means(usable, block) > 1 - 1e-9
     planes = (complete_block_means(plane, block) for plane in (image, source))
     if not whole.any():
         return Shift(np.zeros(2), np.full(2, _UNKNOWN_PX))
     shot, reference = (np.where(whole, p / max(p[whole].mean(), 1e-300), 1.0) for p in planes)
-    value = start / block
+    value = _coarse_shift(shot, reference, whole)
     for step in range(_MAX_STEPS):
         moved = (
             ndimage.shift(reference, value, order=3, mode="nearest") if any(value) else reference
@@ -184,6 +190,29 @@ def measure_shift(
         if is_settled or error.max() > _LONGEST_STEP_PX:
             break
     return Shift(block * value, block * error)
+
+
+def _coarse_shift(shot: FloatArray, source: FloatArray, usable: BoolArray) -> FloatArray:
+    """Return the whole pixels by which borders correlate best; 0 if they fit no better then."""
+    from skimage.registration import phase_cross_correlation
+
+    blur = _COARSE_BLUR * max(shot.shape)
+    shot, source = (ndimage.gaussian_filter(plane, blur) for plane in (shot, source))
+    border = usable & border_ring(shot.shape)
+    if not (np.ptp(shot[border]) > 0 and np.ptp(source[border]) > 0):
+        return np.zeros(2)
+    found, *_ = phase_cross_correlation(
+        shot, source, reference_mask=border, moving_mask=border, overlap_ratio=_MIN_OVERLAP
+    )
+
+    def misfit(shift: FloatArray) -> float:
+        moved = ndimage.shift(source, shift, order=1)
+        both = border & ndimage.shift(border, shift, order=0, cval=False)
+        difference = shot[both] / shot[both].mean() - moved[both] / moved[both].mean()
+        return float(np.median(np.abs(difference)))
+
+    shift = np.asarray(found, dtype=np.float64)
+    return shift if misfit(shift) < _COARSE_MISFIT * misfit(np.zeros(2)) else np.zeros(2)
 
 
 Step = tuple[FloatArray, FloatArray]

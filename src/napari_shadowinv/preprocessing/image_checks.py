@@ -29,7 +29,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -74,13 +74,6 @@ _COARSE_SIDE_PX = 128
 _MIN_BLOCKS = 16
 _MIN_USABLE_SHARE = 0.999  # share of a block's pixels
 _RING_SHARE = 0.2  # of the side: there is rarely an object
-_MAX_SHIFT = 0.2  # of the side
-# Share of the mismatch that may be left after a shift, by the blur (blocks) of both: a beam that
-# merely differs, smooth as it is, may match somewhere by chance to a quarter.
-_MAX_MATCH = {0.0: 0.5, 2.0: 0.15}
-_ABOVE_NOISE = 1.2  # of the median mismatch, so that a shift is detectable
-_MIN_SIDES = 3  # of the image, with enough blocks
-_MIN_OVERLAP = 0.4  # of the ring
 _MIN_CONTRAST = 0.01  # of the mean
 _NEGATIVE_CORRELATION = -0.4
 _DETAIL_BLOCKS = 9  # coarse pixels
@@ -402,14 +395,6 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
             "swapped: the source has far more structure than the image, so the two seem to be "
             "swapped: the field would have the wrong sign; swap the files",
         )
-    elif pair.shift is not None:
-        down, right = pair.shift
-        yield Caution(
-            "register",
-            f"register: at its borders the image lies {down:+.0f} px in y and {right:+.0f} px in x "
-            "from the source: the shift would be taken for a field; "
-            "align source and image, or crop both to the same part of the beam",
-        )
 
 
 def _sign_of_negative(image: CheckedImage, source: CheckedImage, pair: ReferencePair) -> str:
@@ -524,70 +509,6 @@ class ReferencePair:
         return -_neighbour_covariance(difference, beam, usable) > _MIN_SWAPPED_RATIO * size
 
     @cached_property
-    def shift(self) -> tuple[float, float] | None:
-        """Shift (y, x) of the image against the source in px; None if there is no sign of one.
-
-        The borders of both are compared, where an object displaces least.
-        """
-        if not self._has_border:
-            return None
-        return next(filter(None, map(self._shift_after_blur, _MAX_MATCH)), None)
-
-    def _shift_after_blur(self, blur: float) -> tuple[float, float] | None:
-        """Return the shift seen after a blur (blocks), which lifts a smooth beam above noise."""
-        shot, beam, _ = self._blocks
-        ring, step = self._ring, _coarse_step(self.image.shape)
-        pair = ring[:, 1:] & ring[:, :-1]
-        noise = float(np.median(np.diff(shot - beam, axis=1)[pair] ** 2)) / 2
-        if blur:
-            weights = np.where(ring, ndimage.gaussian_filter(ring.astype(float), blur), 1.0)
-            inside = (np.where(ring, plane, 0.0) for plane in (shot, beam))
-            shot, beam = (ndimage.gaussian_filter(plane, blur) / weights for plane in inside)
-            noise /= 4 * math.pi * blur**2
-        mismatch = _mismatch(shot, beam, ring)
-        reach = [max(2, round(_MAX_SHIFT * side)) for side in shot.shape]
-        near = mismatch[np.ix_(*(np.arange(-side, side + 1) for side in reach))]
-        best = np.unravel_index(int(near.argmin()), near.shape)
-        shift = np.array([int(place) - side for place, side in zip(best, reach, strict=True)])
-        if (np.abs(shift) == reach).any() or not shift.any():
-            return None
-        down, right = shift
-        if not self._fits_after(shot, beam, noise, (down, right), _MAX_MATCH[blur]):
-            return None
-        return float(down * step), float(right * step)
-
-    def _fits_after(
-        self, shot: FloatArray, beam: FloatArray, noise: float, shift: tuple[int, int], match: float
-    ) -> bool:
-        """Whether a shift by blocks makes most sides fit; an object displaces some of them."""
-        (height, width), (down, right) = shot.shape, shift
-        rows = slice(max(down, 0), height + min(down, 0))
-        columns = slice(max(right, 0), width + min(right, 0))
-        behind = (
-            slice(rows.start - down, rows.stop - down),
-            slice(columns.start - right, columns.stop - right),
-        )
-        common = self._ring[rows, columns] & self._ring[behind]
-        moved = (shot[rows, columns] - beam[behind]) ** 2
-        unmoved = (shot - beam)[rows, columns] ** 2
-
-        def gain(part: BoolArray) -> float:
-            """Return the share of the mismatch that remains, apart from noise."""
-            before, after = (float(np.median(values[part])) for values in (unmoved, moved))
-            return (after - noise) / max(before - noise, 1e-300)
-
-        if common.sum() < _MIN_BLOCKS or np.median(unmoved[common]) < _ABOVE_NOISE * noise:
-            return False
-        if gain(common) > match:
-            return False
-        y, x = np.ogrid[rows, columns]
-        y_top, x_left = height * _RING_SHARE, width * _RING_SHARE
-        sides = (y < y_top, y >= height - y_top, x < x_left, x >= width - x_left)
-        parts = [common & side for side in sides]
-        better = [gain(part) < 1 for part in parts if part.sum() >= _MIN_BLOCKS]
-        return len(better) >= _MIN_SIDES and sum(better) >= len(better) - 1
-
-    @cached_property
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Image and source in blocks of pixels, of mean 1, and the blocks that are usable."""
         step = _coarse_step(self.image.shape)
@@ -632,22 +553,6 @@ def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArr
     forth = first[:, 1:][pair], second[:, :-1][pair]
     back = first[:, :-1][pair], second[:, 1:][pair]
     return float(np.mean([((a - a.mean()) * (b - b.mean())).mean() for a, b in (forth, back)]))
-
-
-def _mismatch(image: FloatArray, source: FloatArray, ring: BoolArray) -> FloatArray:
-    """Return the mean square difference at every shift of image against source, in a ring."""
-    shape = [fft.next_fast_len(2 * side, real=True) for side in image.shape]
-    weights = ring.astype(float)
-    # About 1, where both are, so that rounding stays small.
-    shot, beam = (np.where(ring, plane - 1, 0.0) for plane in (image, source))
-    ring_, shot_, beam_, shot2_, beam2_ = (
-        fft.rfft2(values, shape) for values in (weights, shot, beam, shot**2, beam**2)
-    )
-    squares = shot2_ * np.conj(ring_) + ring_ * np.conj(beam2_) - 2 * shot_ * np.conj(beam_)
-    count = fft.irfft2(ring_ * np.conj(ring_), shape)
-    total = fft.irfft2(squares, shape)
-    overlaps = count > _MIN_OVERLAP * weights.sum()
-    return np.asarray(np.where(overlaps, total / np.where(overlaps, count, 1.0), np.inf))
 
 
 _WINDOW_PX = 4  # side of the squares in which noise is measured
