@@ -219,7 +219,8 @@ def collect_data(
     is_dimmed = source is None and instrument.gamma > 0
     # A beam of another shape, or behind an object that absorbs, does not have its source's.
     is_dimmed |= not single and (bool(imperfect.shapes) or instrument.absorption > 0)
-    align = "affine" if options.align == "none" and instrument.registration else options.align
+    shift = instrument.registration or 0.0
+    align = "affine" if options.align == "none" and shift else options.align
     start = value_of_first(shots, "start")
     near = start if isinstance(start, NearField) else None
     smoothness = (options.smoothness or 0.0, 0.0) if near is None else near.smoothness
@@ -236,7 +237,9 @@ def collect_data(
         beam_modes=options.beam_modes if unknown else 0,
         free_brightness=free_brightness or unknown or is_dimmed,
         free_frames=_ALIGNED[align],
-        shift_spread=options.align_spread if align == options.align else instrument.registration,
+        shift_spread=options.align_spread
+        if align == options.align
+        else instrument.registration or 0.0,
         fiducials=_checked_fiducials(value_of_first(shots, "fiducials"), (height, width)),
         threads=options.threads,
         added=additive_blocks(options),

@@ -245,5 +245,6 @@ class ShotSimulator:
         height, width = self._grid.shape
         corner = np.hypot(height, width) / 2
         y, x = (places[0] - (height - 1) / 2) / corner, (places[1] - (width - 1) / 2) / corner
-        down, right, turn, scale = self.inputs.instrument.registration * rng.normal(size=4)
+        size = self.inputs.instrument.registration or 0.0
+        down, right, turn, scale = size * rng.normal(size=4)
         return np.stack([down + turn * x + scale * y, right - turn * y + scale * x])

@@ -22,6 +22,7 @@ J. D. Angrist and J.-S. Pischke, *Mostly Harmless Econometrics* (Princeton, 2009
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -135,7 +136,8 @@ def move(source: FloatArray, shift: FloatArray) -> FloatArray:
     width = min(int(np.ceil(np.abs(shift).max())) + 2, min(source.shape) - 1)
     padded = np.pad(source, width, mode="reflect", reflect_type="odd")
     inside = np.s_[width:-width, width:-width]
-    return np.maximum(ndimage.shift(padded, shift, order=3, mode="nearest")[inside], 0.0)
+    moved = ndimage.shift(padded, shift, order=3, mode="nearest")[inside]
+    return np.asarray(np.maximum(moved, 0.0))
 
 
 def measure_shift(
@@ -201,7 +203,8 @@ def _coarse_shift(shot: FloatArray, source: FloatArray, usable: BoolArray) -> Fl
     border = usable & border_ring(shot.shape)
     if not (np.ptp(shot[border]) > 0 and np.ptp(source[border]) > 0):
         return np.zeros(2)
-    found, *_ = phase_cross_correlation(
+    correlate: Callable[..., tuple[FloatArray, float, float]] = phase_cross_correlation
+    found, *_ = correlate(
         shot, source, reference_mask=border, moving_mask=border, overlap_ratio=_MIN_OVERLAP
     )
 
