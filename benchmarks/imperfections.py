@@ -427,7 +427,7 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
     truth = shots.displacement()
     error = result.fields[0].displacement - truth
     share = float(np.sqrt((error**2).mean() / (truth**2).mean()))
-    bars, total = result.report.uncertainty, result.report.total
+    total = result.report.total
     mark = ""
     if is_right and result.verdict != "determined":
         mark = "FALSE ALARM"
@@ -435,7 +435,7 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
         mark = "SILENT"
     whiteness = result.report.pattern
     row = (
-        f"| {name} | {share:.1%} | {bars:.1%}, {total:.1%} | {whiteness:+.1f} "
+        f"| {name} | {share:.1%} | {total:.1%} | {whiteness:+.1f} "
         f"| {result.verdict.value}: {result.explanation} | {seconds:.0f} |"
     )
     return row, mark, result

@@ -541,8 +541,8 @@ def fit_outcome(
     exact_field = times * truth(side, name)
     (field,) = result.fields
     error = length(field.displacement - exact_field) / length(exact_field)
-    assert field.total_uncertainty is not None
-    off = np.abs(field.displacement - exact_field) / field.total_uncertainty
+    assert field.uncertainty is not None
+    off = np.abs(field.displacement - exact_field) / field.uncertainty
     within = (off < 1).mean(), (off < 1.96).mean()
     return FitOutcome(error, result.report.total, result.verdict, *within)
 

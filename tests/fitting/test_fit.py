@@ -56,13 +56,16 @@ def test_sampled_potentials_spread_as_far_as_the_total_error(found: Fit) -> None
     images = noisy([counted(WEAK, SIZE)], NOISE)
     assumed = fit(images, strengths=[1], noise=NOISE, options=FitOptions(samples=12, threads=1))
     assert assumed.report.beam is not None
-    assert assumed.report.beam.share > 2 * assumed.report.uncertainty
+    parts = assumed.report.parts
+    assert parts["beam"] > 2 * parts["noise"] > 0
+    assert np.hypot(*parts.values()) == pytest.approx(assumed.report.total)
+    assert assumed.report.causes == ["beam assumed, 5 %", "noise"]
     for result in (found, assumed):
         (field,) = result.fields
         assert field.samples is not None
         moves = [displacement_from_potential(change) for change in np.float64(field.samples)]
         spread = np.sqrt((np.stack(moves) ** 2).mean(axis=0).mean())
-        expected = np.sqrt((np.square(field.total_uncertainty)).mean())
+        expected = np.sqrt((np.square(field.uncertainty)).mean())
         assert spread == pytest.approx(expected, rel=0.2)
         (restored,) = Fit.from_dataset(result.to_dataset()).fields
         assert_array_equal(restored.samples, field.samples)
@@ -85,7 +88,7 @@ def test_the_error_bars_are_as_large_as_the_error(found: Fit) -> None:
     deviation = np.sqrt((field.uncertainty**2).mean())
     assert 1 / 3 < deviation / np.sqrt((error**2).mean()) < 3
     size = np.sqrt((field.displacement**2).mean())
-    assert found.report.uncertainty == pytest.approx(deviation / size)
+    assert found.report.total == pytest.approx(deviation / size)
 
 
 def test_the_parts_of_a_result_belong_together(found: Fit, folded_shots: list[FloatArray]) -> None:

@@ -88,7 +88,7 @@ def test_two_energies_determine_what_is_stated(
     for value, deviation in aware.report.numbers[key]:
         assert abs(value - imperfection[key]) < max(4 * deviation, 0.02)
     assert (aware.chi2 < blind.chi2).all()
-    assert aware.report.uncertainty > aware.report.parts["noise"] > 0
+    assert aware.report.total > aware.report.parts["noise"] > 0
 
 
 def test_a_point_spread_wider_than_stated_is_found() -> None:
@@ -160,8 +160,8 @@ def test_fitted_samples_are_compared_with_those_to_first_order() -> None:
     ]
     linear, solved = (each.report for each in fits)
     assert (linear.sampling, solved.sampling) == ("linear", "resolve")
-    assert solved.uncertainty == pytest.approx(linear.uncertainty, rel=0.15)
-    assert solved.uncertainty != linear.uncertainty
+    assert solved.total == pytest.approx(linear.total, rel=0.15)
+    assert solved.total != linear.total
     assert 0 < solved.nonlinearity < 0.3
     assert solved.spread_ratio == pytest.approx(1, abs=0.15)
     assert not any(caution.code == "samples" for each in fits for caution in each.warnings)
@@ -208,9 +208,8 @@ def test_energy_adds_to_the_errors_of_fields_in_si_units_alone() -> None:
 
 def test_stated_correlation_of_noise_widens_the_errors(assumed: Fit) -> None:
     correlated = fitted(shots(), Instrument(noise_correlation=1.0))
-    assert correlated.report.uncertainty == pytest.approx(
-        np.sqrt(4 * np.pi) * assumed.report.uncertainty
-    )
+    by_noise = [result.report.parts["noise"] for result in (correlated, assumed)]
+    assert by_noise[0] == pytest.approx(np.sqrt(4 * np.pi) * by_noise[1])
 
 
 def test_each_fit_states_its_sensitivities(plain: Fit) -> None:

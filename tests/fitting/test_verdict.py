@@ -29,22 +29,22 @@ GOOD: dict[str, Any] = {
     "single": False,
     "beam_unknown": False,
     "jacobian": np.ones((48, 48)),
-    "uncertainty": 0.02,
+    "total": 0.02,
     "ended": True,
     "pattern": Pattern(np.array([-1.0, 1.0])),
     "beam": None,
     "displacement": blob((24, 24)),
     "used": np.ones((48, 48), bool),
     "hidden": 0.0,
-    "parts": {},
+    "parts": {"noise": 0.02},
     "options": FitOptions(max_error=0.05),
-    "instrument": Instrument(beam_rms=0.01),
+    "instrument": Instrument(),
 }
 
 
 def assess(
     *,
-    uncertainty: float,
+    total: float,
     ended: bool,
     beam: BeamError | None,
     parts: dict[str, float],
@@ -80,7 +80,7 @@ def assess(
         folded=0.0,
         verdict=Verdict.UNCERTAIN,
         explanation="",
-        report=FitReport(0.0, 1, ended, {}, uncertainty, beam=beam, parts=parts),
+        report=FitReport(0.0, 1, ended, {}, total, beam=beam, parts=parts),
         options=options,
         instrument=instrument,
     )
@@ -104,7 +104,8 @@ def test_errors_that_are_underestimated_need_a_margin(part: str, side: int, safe
         displacement = np.pad(blob((24, 24)), ((0, 0), (20, side - 68), (20, 28)))
         used = np.ones((side, 96), bool)
         changes = {"displacement": displacement, "used": used}
-        changes |= {"uncertainty": share, "parts": {part: share}}
+        changes |= {"total": share, "parts": {part: share}}
+        changes |= {"instrument": Instrument(beam_rms=0.01)}
         verdict, why = assess(**GOOD | changes)
         assert verdict is expected
         if expected is Verdict.UNCERTAIN and safety > 1:
@@ -197,12 +198,17 @@ def test_verdict_names_a_mask_over_the_strongest_structure(hidden: float, expect
     assert ("mask hides" in why) == (hidden > 0.5)
 
 
+def of_assumed_beam(noise: float, share: float) -> dict[str, Any]:
+    beam = BeamError(sensitivity=0.1, variation=0.05, share=share, scale=0.25, assumed=True)
+    parts = {"beam": share, "noise": noise}
+    return {"beam": beam, "total": float(np.hypot(noise, share)), "parts": parts}
+
+
 @pytest.mark.parametrize(
     ("share", "expected"), [(0.03, Verdict.DETERMINED), (0.2, Verdict.CONDITIONAL)]
 )
 def test_a_beam_that_was_assumed_is_a_condition(share: float, expected: Verdict) -> None:
-    beam = BeamError(sensitivity=0.1, variation=0.05, share=share, scale=0.25, assumed=True)
-    verdict, why = assess(**GOOD | {"beam": beam})
+    verdict, why = assess(**GOOD | of_assumed_beam(0.02, share))
     assert verdict is expected
     if share > 0.05:
         # 1 % × √(0.05² - 0.02²) / 0.1, and √(0.02² + 0.2²)
@@ -214,24 +220,24 @@ def test_a_beam_that_was_assumed_is_a_condition(share: float, expected: Verdict)
     "fault",
     [
         {"hidden": 0.8},
-        {"uncertainty": 0.06},
+        of_assumed_beam(0.06, 0.2),
         {"ended": False},
         {"pattern": Pattern(np.array([9.0, 1.0]))},
         {"displacement": blob((46, 24))},
     ],
 )
 def test_an_assumed_beam_excuses_no_other_fault(fault: dict[str, Any]) -> None:
-    beam = BeamError(sensitivity=0.1, variation=0.05, share=0.2, scale=0.25, assumed=True)
-    verdict, _ = assess(**GOOD | {"beam": beam} | fault)
+    verdict, _ = assess(**GOOD | of_assumed_beam(0.02, 0.2) | fault)
     assert not verdict.level.is_success
 
 
 def test_a_beam_that_was_assumed_is_a_condition_of_a_fit_with_other_numbers() -> None:
-    of_beam: dict[str, Any] = {"uncertainty": 0.1, "parts": {"beam": 0.09, "gamma": 0.04}}
+    of_beam: dict[str, Any] = {"total": 0.1, "parts": {"beam": 0.09, "gamma": 0.04}}
     film = Instrument(gamma=0.03)
     big: dict[str, Any] = {"displacement": np.pad(blob((24, 24)), ((0, 0), (20, 20), (20, 20)))}
     big |= {"used": np.ones((88, 88), bool)}
-    assert assess(**GOOD | big | of_beam)[0] is Verdict.UNCERTAIN  # stated
+    stated = {"instrument": Instrument(beam_rms=0.05)}
+    assert assess(**GOOD | big | of_beam | stated)[0] is Verdict.UNCERTAIN
     assert assess(**GOOD | big | of_beam | {"instrument": film})[0] is Verdict.UNCERTAIN  # doubled
     of_beam["parts"] = {"beam": 0.09, "background": 0.04}
     film = Instrument(background=0.03)
@@ -264,7 +270,7 @@ def test_verdict_says_how_correlated_noise_widens_the_bars() -> None:
 
 
 def test_unknown_error_bars_do_not_speak_against_a_field() -> None:
-    verdict, why = assess(**GOOD | {"uncertainty": float("nan")})
+    verdict, why = assess(**GOOD | {"total": float("nan")})
     assert verdict is Verdict.DETERMINED
     assert "error bars were not" in why
 
@@ -368,14 +374,14 @@ def test_other_fields_do_not_matter_if_they_are_worse_or_the_same(
 
 
 def test_noise_that_leaves_much_open_is_told() -> None:
-    verdict, why = assess(**GOOD | {"uncertainty": 0.12})
+    verdict, why = assess(**GOOD | {"total": 0.12, "parts": {"noise": 0.12}})
     assert verdict is Verdict.UNCERTAIN
-    assert "12%" in why
+    assert "errors of 12.0%" in why
 
 
 def test_the_gravest_doubt_comes_first() -> None:
     """Images that are not explained, then one image, then other fields, then noise."""
-    all_of_them = GOOD | ALONE | {"beam_unknown": True, "rivals": [(0.0, 0.5)], "uncertainty": 0.5}
+    all_of_them = GOOD | ALONE | {"beam_unknown": True, "rivals": [(0.0, 0.5)], "total": 0.5}
     assert assess(**all_of_them | {"chi2": np.array([9.0])})[0] is Verdict.MISFIT
     assert assess(**all_of_them)[0] is Verdict.AMBIGUOUS
     assert assess(**all_of_them | {"beam_unknown": False})[0] is Verdict.SEVERAL

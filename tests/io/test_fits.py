@@ -97,7 +97,7 @@ def test_file_gives_back_every_bit(
 def test_unknown_parts_stay_unknown(tmp_path: Path, make_fit: MakeFit) -> None:
     complete_fit = make_fit(strengths=(1.0,), verdict=Verdict.AMBIGUOUS, explanation="cannot tell")
     fields = tuple(dataclasses.replace(field, uncertainty=None) for field in complete_fit.fields)
-    report = dataclasses.replace(complete_fit.report, uncertainty=float("nan"))
+    report = dataclasses.replace(complete_fit.report, total=float("nan"))
     fit = dataclasses.replace(complete_fit, fields=fields, report=report)
     again = Fit.from_dataset(read_back(tmp_path / "fit.shadowinv", fit))
     assert_same(fit, again)

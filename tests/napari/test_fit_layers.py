@@ -200,7 +200,7 @@ def test_significance_and_structures_are_among_the_other_layers(
     layers = more(viewer, layers)
     for part, fitted_field in zip(("", " E"), two_fields.fields, strict=True):
         length = np.hypot(*fitted_field.displacement)
-        std = fitted_field.total_uncertainty
+        std = fitted_field.uncertainty
         along = np.hypot(*(fitted_field.displacement * std)) / length
         np.testing.assert_allclose(layers[f"significance{part}"].data, length / along)
         structures = two_fields.structures(fitted_field)
@@ -208,20 +208,3 @@ def test_significance_and_structures_are_among_the_other_layers(
         np.testing.assert_array_equal(layers[f"structures{part}"].data, outline(structures.labels))
         assert structures.labels.any()
     assert layers["significance"].name.startswith("? |d|/σ – pack")
-
-
-def test_the_map_of_a_fit_is_that_of_its_total_error(two_fields: Fit) -> None:
-    field, *_ = two_fields.fields
-    assert field.uncertainty is not None
-    by_beam = replace(field, beam_uncertainty=np.sqrt(3) * field.uncertainty)
-    result = Result(replace(two_fields, fields=(by_beam,)), SETUPS[0])
-    usual = Result(replace(two_fields, fields=(replace(field, beam_uncertainty=None),)), SETUPS[0])
-    maps = [
-        next(data for data, keywords, _ in fit_layers(each, Frame(), "") if is_map(keywords))
-        for each in (result, usual)
-    ]
-    np.testing.assert_allclose(2 * maps[0], maps[1])
-
-
-def is_map(keywords: dict[str, Any]) -> bool:
-    return role_of(keywords) == "significance"

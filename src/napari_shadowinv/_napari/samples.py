@@ -83,7 +83,8 @@ def wakefield_run() -> LayerData:
     origin = f"{CAME_WITH} the sample 'wakefield run'"
     setup = phantoms.wakefield_setup()
     beam = _wakefield_beam()
-    name, facts = "wakefield run", {"setup_origin": origin}
+    name = "wakefield run"
+    facts: dict[str, Any] = {"setup_origin": origin}
     source, keywords, kind = shot_layer(beam, f"{name} source", setup, limits, SOURCE, **facts)
     shots = shot_layer(stack, name, setup, limits, source=beam, **facts)
     return [(source, {**keywords, "visible": False}, kind), shots]

@@ -276,7 +276,7 @@ def fit(
         iterations=taken,
         converged=ended,
         seconds=seconds,
-        uncertainty=float("nan"),
+        total=float("nan"),
         log_evidence=evidence,
         pattern=pattern.largest,
         noise_correlation=pattern.correlation,
@@ -573,7 +573,14 @@ def _result(
     pattern: Pattern,
 ) -> Fit:
     height, width = data.size
-    errors, by_beam = openness.errors, openness.by_beam
+    errors, by_beam, by_part = openness.errors, openness.by_beam, openness.by_part
+    if errors is not None and by_beam is not None:
+        by_part, errors = (
+            {"noise": errors, "beam": by_beam.errors},
+            np.hypot(errors, by_beam.errors),
+        )
+    elif errors is not None:
+        by_part = by_part or {"noise": errors}
     counts = scene.ray_counts(unknowns)
     units = data.units[:, None, None]
     used = scene.weights[:, :height, :width] > 0
@@ -590,12 +597,11 @@ def _result(
             displacements[m],
             None if errors is None else errors[m],
             (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1])),
-            None if by_beam is None else by_beam.errors[m],
             None if samples is None else samples[m],
         )
         for m, name in enumerate(names)
     ]
-    uncertainty = float("nan") if errors is None else largest_share(errors, displacements)
+    total = float("nan") if errors is None else largest_share(errors, displacements)
     beam = None
     if by_beam is not None:
         beam = BeamError(
@@ -605,9 +611,9 @@ def _result(
             scale=data.beam.length,
             assumed=data.assumed or (data.beam.rms > 0 and data.instrument.beam_rms is None),
         )
-    shares = {key: largest_share(each, displacements) for key, each in openness.by_part.items()}
+    shares = {key: largest_share(each, displacements) for key, each in by_part.items()}
     parts = dict(sorted(shares.items(), key=lambda part: -part[1]))
-    report = replace(report, uncertainty=uncertainty, parts=parts, beam=beam)
+    report = replace(report, total=total, parts=parts, beam=beam)
     jacobians = [
         jacobian_determinant(moved)
         for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)

@@ -108,10 +108,8 @@ class FittedField:
     displacement : ndarray, shape (2, H, W)
         Displacement in px, axis order (y, x).
     uncertainty : ndarray, shape (2, H, W), or None
-        Standard deviation of the displacement in px that the noise leaves, if it was asked for.
-    beam_uncertainty : ndarray, shape (2, H, W), or None
-        Standard deviation in px by a beam that differs from its source as far as `BeamError` says,
-        if it was asked for.
+        Standard deviation of the displacement in px by all parts of the error budget, if error
+        bars were asked for.
     smoothness : tuple of float
         The weights λ and κ of its squared fourth and sixth derivatives (px).
     samples : ndarray of float32, shape (n, H, W), or None
@@ -124,23 +122,15 @@ class FittedField:
     displacement: FloatArray
     uncertainty: FloatArray | None
     smoothness: tuple[float, float]
-    beam_uncertainty: FloatArray | None = None
     samples: AnyArray | None = None
-
-    @property
-    def total_uncertainty(self) -> FloatArray | None:
-        """Standard deviation of the displacement in px by noise and beam, shape (2, H, W)."""
-        if self.uncertainty is None or self.beam_uncertainty is None:
-            return self.uncertainty
-        return np.hypot(self.uncertainty, self.beam_uncertainty)
 
     def error_at(self, row: int, column: int) -> float:
         """Return the relative standard deviation of the displacement in a pixel; NaN if unknown."""
         move = self.displacement[:, row, column]
         length = np.hypot(*move)
-        if self.total_uncertainty is None or not length > 0:
+        if self.uncertainty is None or not length > 0:
             return float("nan")
-        error = deviation_along(move, self.total_uncertainty[:, row, column])
+        error = deviation_along(move, self.uncertainty[:, row, column])
         return float(error / length)
 
 
@@ -184,9 +174,9 @@ class FitReport:
     seconds : dict of str to float
         Time of each stage; of "samples" what they take longer than "full size", beside which they
         are drawn.
-    uncertainty : float
-        R.m.s. standard deviation of the displacement by noise and by what is stated of the
-        instrument, as a share of the displacement; NaN if not known.
+    total : float
+        R.m.s. standard deviation of the displacement by all `parts`, as a share of the
+        displacement; NaN if not known.
     log_evidence : float
         Logarithm of the evidence, up to a constant that is the same for all choices of fields; NaN
         if it was not requested.
@@ -202,8 +192,8 @@ class FitReport:
         Unknown light that adds to each image, by its title: for each image and each coefficient
         the value and its standard deviation, in the image's unit.
     parts : dict of str to float
-        What `uncertainty` is made of if an instrument was stated, the largest first: r.m.s.
-        standard deviations by noise and by each imperfection, as shares of the displacement.
+        What `total` is made of, the largest first: r.m.s. standard deviations by noise, by the
+        beam and by each stated imperfection, as shares of the displacement.
     numbers : dict of str to list
         Numbers of the instrument as fitted, by their names in `Instrument`, each with its standard
         deviation, for all images or for each; see `numbers_in_units`.
@@ -221,7 +211,7 @@ class FitReport:
     iterations: int
     converged: bool
     seconds: dict[str, float]
-    uncertainty: float
+    total: float
     log_evidence: float = float("nan")
     pattern: float = float("nan")
     noise_correlation: float = 0.0
@@ -251,21 +241,20 @@ class FitReport:
         return self.sampling == "resolve" or not (is_spread or self.nonlinearity > _LINEAR_ENOUGH)
 
     @property
-    def total(self) -> float:
-        """R.m.s. standard deviation by noise and beam as a share of the displacement."""
-        return float(np.hypot(self.uncertainty, 0.0 if self.beam is None else self.beam.share))
-
-    @property
     def ranking(self) -> str:
-        """The parts as shares of the displacement, the largest first; "" without an instrument."""
+        """The parts as shares of the displacement, the largest first."""
         return ", ".join(f"{TITLES[key]} {share:.2%}" for key, share in self.parts.items())
 
     @property
     def error_name(self) -> str:
         """Largest part of the total in a few words, such as "beam assumed, 5 %"."""
-        if self.parts:
-            return TITLES[next(iter(self.parts))]
-        return self.beam.name if self.beam else "noise"
+        return next(iter(self.causes), "noise")
+
+    @property
+    def causes(self) -> list[str]:
+        """The parts in a few words, the largest first."""
+        titles = TITLES if self.beam is None else {**TITLES, "beam": self.beam.name}
+        return [titles[key] for key in self.parts]
 
 
 @dataclass(frozen=True, repr=False)
@@ -363,31 +352,23 @@ class Fit(Summarised):
         """Largest part of the error with its share, such as "beam 3 %"; None if not computed."""
         if self.total_error is None:
             return None
-        parts = self.report.parts or {"noise": self.report.uncertainty}
-        if self.report.beam is not None:
-            parts = {"beam": self.report.beam.share, **parts}
-        key = max(parts, key=lambda part: parts[part])
-        return f"{TITLES[key]} {percent(parts[key])}"
+        key, share = next(iter(self.report.parts.items()))
+        return f"{TITLES[key]} {percent(share)}"
 
     def _error_facts(self) -> Iterator[Fact]:
         """The errors of the displacement, and its sensitivity to what is not stated."""
         report = self.report
-        if np.isnan(report.uncertainty):
+        if np.isnan(report.total):
             return
-        if report.parts:
-            text = f"{report.total:.2%} of the displacement (r.m.s.): {report.ranking}"
-            yield error_fact("errors", text)
+        text = f"{report.total:.2%} of the displacement (r.m.s.): {report.ranking}"
+        if report.noise_correlation > 0:
+            text += f"; noise is correlated over {report.noise_correlation:.1f} px"
+        yield error_fact("errors", text)
+        if report.numbers:
             numbers = "; ".join(number_text(*each) for each in report.numbers.items())
             yield error_fact("instrument", numbers)
-        else:
-            text = f"{report.uncertainty:.2%} of the displacement by noise (r.m.s.)"
-            if report.noise_correlation > 0:
-                text += f", which is correlated over {report.noise_correlation:.1f} px"
-            if report.beam is not None and report.beam.variation:
-                text = f"{report.total:.2%} of the displacement in total (r.m.s.); {text}"
-            yield error_fact("error bars", text)
-            if report.beam is not None:
-                yield error_fact("beam", report.beam.text)
+        if report.beam is not None:
+            yield error_fact("beam", report.beam.text)
         names = {each.key: each.name(each.tested) for each in IMPERFECTIONS}
         effects = ", ".join(
             f"{to_figures(share)} ({names[key]})" if share > 1 else f"{share:.2%} ({names[key]})"
@@ -465,13 +446,9 @@ class Fit(Summarised):
 
     def pixel_errors(self, field: FittedField) -> PixelErrors | None:
         """Return the total error of a field in every pixel with its causes; None if not known."""
-        std, report = field.total_uncertainty, self.report
-        if std is None:
+        if field.uncertainty is None:
             return None
-        causes = [TITLES[key] for key in report.parts] or ["noise"]
-        if report.beam is not None and report.beam.variation:
-            causes.append(report.beam.name)
-        return PixelErrors(std, tuple(causes))
+        return PixelErrors(field.uncertainty, tuple(self.report.causes))
 
     def structures(self, field: FittedField) -> Structures | None:
         """Return the regions where a field stands above its error; None if that is not known."""
@@ -701,7 +678,7 @@ def field_dataset(field: FittedField, setup: Setup | None) -> xarray.Dataset:
     """Return a field with its errors and samples, in the units of its setup as well."""
     part = dataset_from_field(field.displacement, field.potential, setup)
     part = part.drop_vars([name for name in part.data_vars if not belongs(name, field.name)])
-    optional = field.uncertainty, field.beam_uncertainty, field.samples
+    optional = field.uncertainty, field.samples
     for (name, (dims, *words)), values in zip(FIT_VARIABLES.items(), optional, strict=True):
         if values is not None:
             part[name] = dims, values, label(*words)
@@ -730,7 +707,7 @@ def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray:
 
 
 def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:
-    potential, displacement, uncertainty, by_beam, samples = (
+    potential, displacement, uncertainty, samples = (
         numbers_of(dataset, variable + ending) if variable + ending in dataset else None
         for variable in ("potential", "displacement", *FIT_VARIABLES)
     )
@@ -746,4 +723,4 @@ def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArr
     if samples is not None and samples.shape[1:] != potential.shape:
         raise ValueError(f"samples have shape {samples.shape}, potential {potential.shape}")
     weights = float(smoothness[0]), float(smoothness[1])
-    return FittedField(name, potential, displacement, uncertainty, weights, by_beam, samples)
+    return FittedField(name, potential, displacement, uncertainty, weights, samples)

@@ -131,7 +131,7 @@ def assess_verdict(
         Whether the fit has started from several fields.
     """
     report, chi2, used = fit.report, fit.chi2, fit.used
-    uncertainty, parts = report.uncertainty, report.parts
+    total, parts = report.total, report.parts
     max_error = fit.options.max_error
     displacement = np.sum([field.displacement for field in fit.fields], axis=0)
     names = [f"image {k + 1}" for k in range(len(chi2))]
@@ -202,22 +202,18 @@ def assess_verdict(
             "known"
         )
     is_small = min(used.shape) < SMALL_PX
-    safety = _SAFETY if parts and (is_small or _UNDERESTIMATED & parts.keys()) else 1.0
+    is_wide = fit.instrument.has_numbers and (is_small or _UNDERESTIMATED & parts.keys())
+    safety = _SAFETY if is_wide else 1.0
     condition = fit.beam_condition(max_error / safety)
-    if not condition and parts and safety * uncertainty > max_error:
+    if not condition and safety * total > max_error:
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
-        text = f"errors of {uncertainty:.1%} of the displacement (r.m.s.): {ranking}; "
-        if uncertainty <= max_error:
+        text = f"errors of {total:.1%} of the displacement (r.m.s.): {ranking}; "
+        if total <= max_error:
             small = f"with fewer than {SMALL_PX} px along a side"
             where = small if is_small else "where these are fitted"
             text += f"{where}, errors can be {safety:g} times as large; "
         return Verdict.UNCERTAIN, (
             f"{text}{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
-        )
-    if not condition and uncertainty > max_error:
-        return Verdict.UNCERTAIN, (
-            f"the noise leaves {uncertainty:.0%} of the displacement open (r.m.s.): average "
-            "shots, or take images at energies that differ more"
         )
     if not report.converged:
         return Verdict.UNCERTAIN, (
@@ -232,13 +228,13 @@ def assess_verdict(
         )
     if at_edge:
         return Verdict.EDGE, at_edge
-    if condition and safety * report.total > max_error:
+    if condition and safety * total > max_error:
         setup, field = fit.setup, fit.fields[0]
         deflector = deflector_titles()[field.name]
         (shown,) = shown_fields([field.displacement], setup, deflector, mask=used)
         return Verdict.CONDITIONAL, shown.conditional_text(condition)
-    unchecked = "" if np.isfinite(uncertainty) else "; error bars were not worked out"
-    if np.isfinite(uncertainty) and _share_squeezed(jacobian, displacement, 0.0) > _DEEP_FOLDS:
+    unchecked = "" if np.isfinite(total) else "; error bars were not worked out"
+    if np.isfinite(total) and _share_squeezed(jacobian, displacement, 0.0) > _DEEP_FOLDS:
         times = _BARS_DEEP_FOLDS_AND_BEAM if beam_unknown else _BARS_DEEP_FOLDS
         unchecked += f"; beyond deep folds the error bars are about {times:g} times too small"
     if pattern.correlation > 0:

@@ -515,8 +515,7 @@ def _pixel_errors(dataset: xarray.Dataset, name: str) -> PixelErrors | None:
     return PixelErrors(std, tuple(map(str, causes)))
 
 
-# A store does not keep the error by an assumed beam.
-_STORED_CAUSES = ("noise and stated instrument, without an assumed beam",)
+_STORED_CAUSES = ("noise, instrument and beam",)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -58,7 +58,6 @@ _DEVIATION = "Standard deviation of the displacement"
 _CHANGES = "Random changes of the potential as large as its error"
 FIT_VARIABLES = {
     "displacement_uncertainty": (_VECTORS, PIXEL, _DEVIATION),
-    "displacement_beam_uncertainty": (_VECTORS, PIXEL, f"{_DEVIATION} by the beam"),
     "potential_samples": (("sample", "y", "x"), PIXEL_AREA, _CHANGES),
 }
 """Variables of a fitted field in addition to potential and displacement."""

@@ -85,11 +85,6 @@ def _error(part: str) -> Callable[[Any], float]:
     return lambda result: math.nan if result.errors is None else float(rms(result))
 
 
-def _uncertainty(fit: Any) -> float | None:
-    error = float(fit.report.uncertainty)
-    return error if math.isfinite(error) else None
-
-
 # In the order of all tables.
 COLUMNS: tuple[Column, ...] = (
     Column("seconds", "Time its worker spent on the shot", unit="s", format=".1f"),
@@ -120,13 +115,6 @@ COLUMNS: tuple[Column, ...] = (
         title="crossed",
         value=attrgetter("folded"),
         format=".1%",
-    ),
-    _of_fits(
-        "uncertainty",
-        "Displacement's error bar, r.m.s., as a share of it",
-        title="error bars",
-        value=_uncertainty,
-        format=".2%",
     ),
     Column(
         "total_error",

@@ -478,12 +478,8 @@ def _parts_of(errors: Errors) -> dict[str, float]:
 def _fit_errors(result: Fit, inputs: ExperimentInputs) -> tuple[dict[str, float], float, Verdict]:
     """Return the parts of a fit's error, the total, and the verdict, with the energy's error."""
     report = result.report
-    if np.isnan(report.uncertainty):
-        return {}, np.nan, result.verdict
-    parts = dict(report.parts) or {"noise": report.uncertainty}
-    if report.beam is not None and report.beam.share:
-        parts["beam"] = report.beam.share
-    total, verdict, setup = report.total, result.verdict, inputs.setups[0]
+    parts, total = dict(report.parts), report.total
+    verdict, setup = result.verdict, inputs.setups[0]
     if setup is not None and inputs.instrument.energy:
         share = inputs.instrument.energy * abs(setup.sensitivity_to_beam(setup.main_field.name))
         parts["energy"] = share
