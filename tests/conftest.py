@@ -126,6 +126,8 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
             discretisation=ErrorEstimate(0.01, 0.02),
             noise=ErrorEstimate(0.1, 0.05),
             effects={"solver": ErrorEstimate(1e-5, 2e-5)},
+            edge=ErrorEstimate(0.05, 0.01),
+            sides=("left",),
             beam=ErrorEstimate(2.0, 1.0),
             beam_sensitivity=ErrorEstimate(0.4, 0.2),
             sensitivities={"blur, 1 px": ErrorEstimate(0.02, 0.03)},

@@ -112,8 +112,6 @@ def test_errors_of_zero_displacement_are_not_determined():
     [
         ("misfit", Verdict.MISFIT),
         ("folds", Verdict.AMBIGUOUS),
-        ("closed-edge", Verdict.EDGE),
-        ("cut-object", Verdict.EDGE),
         ("masked-peak", Verdict.UNCERTAIN),
     ],
 )

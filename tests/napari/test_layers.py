@@ -320,7 +320,7 @@ def test_masked_pixels_are_blank_and_set_no_limits(solved: Inversion) -> None:
     assert (masked.displacement[:, ~mask] == 100.0).all()
 
 
-EDGE = (Caution("closed-edge", "the field reaches the edge"),)
+EDGE = (Caution("edge", "the field reaches the edge"),)
 
 
 def test_doubtful_result_has_the_doubt_in_its_names(solved: Inversion) -> None:

@@ -186,7 +186,7 @@ def test_status_file_describes_the_newest_shot(folder, out, tmp_path, monkeypatc
     assert datetime.fromisoformat(newest["written"]).timestamp() == pytest.approx(written, abs=2e-3)
     assert datetime.fromisoformat(first["time"]).timestamp() > written
     warning = first["last_warning"]
-    assert (warning["name"], warning["code"]) == ("shot_2.npy", "closed-edge")
+    assert (warning["name"], warning["code"]) == ("shot_2.npy", "edge")
     assert json.loads(path.read_text())["state"] == "stopped"
 
 

@@ -437,14 +437,14 @@ class AxisymmetricProfile(Product):
         )
         if ends > _NOTABLE_END:
             yield Caution(
-                "cut-object",
+                "edge",
                 f"the object leaves the image along its axis, where its deflection is {ends:.0%} "
                 "of the largest: the closed edge of an inversion distorts the profile near it; use "
                 "a larger image, or a free boundary",
             )
         if edge > _NOTABLE_EDGE:
             yield Caution(
-                "cut-object",
+                "edge",
                 f"the deflection at the edge is {edge:.0%} of the largest: the object does not end "
                 "inside the radius, which shifts and bends the profile; use a wider image",
             )

@@ -186,7 +186,7 @@ class Filaments(Product):
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Caution]:
         if not np.isfinite(quantities["radius"].value):
             yield Caution(
-                "cut-object",
+                "edge",
                 "the autocorrelation does not fall to zero within 40 % of the image: the "
                 "structures are too large for it, and have no size here",
             )

@@ -76,6 +76,7 @@ from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.samples import Pairs
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
+from napari_shadowinv.physics.edge import edge_changes, edge_sides
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import Setup
 
@@ -560,6 +561,20 @@ def _added_light(
     return light
 
 
+def _changes_by_edge(
+    potentials: FloatArray, displacements: FloatArray, errors: FloatArray | None
+) -> FloatArray:
+    """Return each field's `edge_changes`, (M, k, 3, H, W), as far as they exceed other errors.
+
+    Other errors, (M, 2, H, W), move the fields at the edge, too.
+    """
+    changes = np.array(list(map(edge_changes, potentials, displacements)))
+    squares = (changes[:, :, 1:] ** 2).sum(axis=1).mean(axis=(1, 2, 3))
+    explained = 0.0 if errors is None else (errors**2).mean(axis=(1, 2, 3))
+    excess = np.maximum(1 - explained / np.maximum(squares, 1e-300), 0.0)
+    return np.asarray(np.sqrt(excess)[:, None, None, None, None] * changes)
+
+
 def _result(
     data: FitData,
     scene: Scene,
@@ -590,6 +605,16 @@ def _result(
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
     displacements = scene.displacement(unknowns)[..., :height, :width].copy()
     potentials = potentials_of(scene, unknowns, data.size)
+    changes = _changes_by_edge(potentials, displacements, errors)
+    by_edge = np.sqrt((changes[:, :, 1:] ** 2).sum(axis=1))
+    if by_edge.any():
+        by_part = {**by_part, "edge": by_edge}
+        errors = None if errors is None else np.hypot(errors, by_edge)
+        if samples is not None:
+            rng = np.random.default_rng([options.seed, *b"edge"])
+            draws = rng.normal(size=(samples.shape[1], changes.shape[1]))
+            moves = np.einsum("sk,mkyx->msyx", draws, changes[:, :, 0])
+            samples = samples + moves.astype(np.float32)
     fields = [
         FittedField(
             name,
@@ -613,7 +638,8 @@ def _result(
         )
     shares = {key: largest_share(each, displacements) for key, each in by_part.items()}
     parts = dict(sorted(shares.items(), key=lambda part: -part[1]))
-    report = replace(report, total=total, parts=parts, beam=beam)
+    sides = edge_sides((by_edge**2).sum(axis=(0, 1)))
+    report = replace(report, total=total, parts=parts, sides=sides, beam=beam)
     jacobians = [
         jacobian_determinant(moved)
         for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)

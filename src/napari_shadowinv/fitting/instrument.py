@@ -319,8 +319,9 @@ TITLES = {each.key: each.title for each in IMPERFECTIONS} | {
     "beam_between": "beam between energies",
     "other_field": "other field",
     "noise": "noise",
+    "edge": "edge",
 }
-"""Names of imperfections in texts."""
+"""Names of the parts of an error in texts."""
 
 
 def numbers_in_units(

@@ -193,7 +193,9 @@ class FitReport:
         the value and its standard deviation, in the image's unit.
     parts : dict of str to float
         What `total` is made of, the largest first: r.m.s. standard deviations by noise, by the
-        beam and by each stated imperfection, as shares of the displacement.
+        beam, by each stated imperfection and by the edge, as shares of the displacement.
+    sides : tuple of str
+        Sides of the image from which the part by the edge comes.
     numbers : dict of str to list
         Numbers of the instrument as fitted, by their names in `Instrument`, each with its standard
         deviation, for all images or for each; see `numbers_in_units`.
@@ -218,6 +220,7 @@ class FitReport:
     beam: BeamError | None = None
     added: dict[str, list[list[list[float]]]] = dataclasses.field(default_factory=dict)
     parts: dict[str, float] = dataclasses.field(default_factory=dict)
+    sides: tuple[str, ...] = ()
     numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
     sensitivities: dict[str, float] = dataclasses.field(default_factory=dict)
     sampling: str = "linear"

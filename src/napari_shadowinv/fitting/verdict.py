@@ -18,11 +18,7 @@ from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
-from napari_shadowinv.inversion.solution_checks import (
-    TURNED_BACK,
-    inner_sides,
-    turning_displacement,
-)
+from napari_shadowinv.physics.edge import edge_text
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import shown_fields
 
@@ -90,15 +86,9 @@ _ADVICE = {
     "noise": "average shots, or take images at energies that differ more",
     "other_field": "fit both fields, with images at more energies",
     "registration": "align the images by marks on each of them",
+    "edge": "record a larger field of view",
 }
-# Of blobs that the edge cuts, L2 error and the displacement's share there: 1.5 % at 0.30, 25 % at
-# 0.44; with a free edge 1.2 % at 0.61, 3.6 % at 0.88, 27 % at 0.97. It may come out too small, but
-# not its divergence: of toroids, ellipses, rims and turbulence its share is 0.03 and less where
-# nothing is cut, 0.18 and more where the error is 5 %; with a free edge 0.31.
-_AT_EDGE, _AT_FREE_EDGE = 0.3, 0.7
-_BENT, _BENT_AT_FREE_EDGE = 0.15, 0.3
 _HIDDEN_STRUCTURE = 0.5  # of the strongest contrast
-_SMOOTHED, _FROM_EDGE = 2.0, 2  # px
 
 
 def assess_verdict(
@@ -175,7 +165,11 @@ def assess_verdict(
             "which came from where: the same bright lines come from fields with other folds; take "
             "another energy"
         )
-    at_edge = _edge_text(displacement, used, fit.options.boundary == "free")
+    by_edge = parts.get("edge", 0.0)
+    others = float(np.sqrt(max(report.total**2 - by_edge**2, 0.0)))
+    # Errors half as large move the field at the edge by chance.
+    is_cut = by_edge > max_error and not by_edge < 2 * others
+    at_edge = edge_text(by_edge, report.sides) if is_cut else ""
     if pattern.is_certain:
         # An object that the edge cuts leaves a pattern, too.
         verdict = Verdict.EDGE if at_edge else Verdict.MISFIT
@@ -189,6 +183,8 @@ def assess_verdict(
             "linearise the images, or, if the counts were averaged, scaled or "
             "smoothed, give their noise"
         )
+    if at_edge:
+        return Verdict.EDGE, at_edge
     best, *alternatives = fit.basins
     rivals = [
         basin.distance
@@ -226,8 +222,6 @@ def assess_verdict(
             "surroundings allow, and the error bars do not include that; unmask what is sound, or "
             "add an image in which it is seen"
         )
-    if at_edge:
-        return Verdict.EDGE, at_edge
     if condition and safety * total > max_error:
         setup, field = fit.setup, fit.fields[0]
         deflector = deflector_titles()[field.name]
@@ -269,33 +263,6 @@ def _pattern_text(pattern: Pattern, names: Sequence[str]) -> str:
     )
 
 
-def _edge_text(displacement: FloatArray, used: BoolArray, free: bool) -> str:
-    """How the field goes on beyond the image's edge; "" if it does not."""
-    along_y, along_x = (np.gradient(part, axis=k) for k, part in enumerate(displacement))
-    divergence = np.abs(ndimage.gaussian_filter(along_y + along_x, _SMOOTHED))
-    at_edge = _share_at_edge(np.hypot(*displacement))
-    bent = _share_at_edge(divergence, _FROM_EDGE)
-    most, most_bent = (_AT_FREE_EDGE, _BENT_AT_FREE_EDGE) if free else (_AT_EDGE, _BENT)
-    sides = None if free else inner_sides(displacement, used)  # None, too, if masked there
-    rms = float(np.sqrt((displacement**2).sum(axis=0).mean()))
-    turned = 0.0 if sides is None else turning_displacement(sides) / max(rms, 1e-12)
-    if at_edge <= most and bent <= most_bent and turned <= TURNED_BACK:
-        return ""
-    if at_edge > most or bent > most_bent:
-        sign = (
-            f"at the image's edge the field has {at_edge:.0%} of its peak, and rays converge or "
-            f"diverge {bent:.0%} as much as anywhere"
-        )
-    else:
-        sign = (
-            "near the image's edge the field displaces rays towards or away from it on all sides, "
-            f"by {turned:.0%} of its r.m.s. displacement"
-        )
-    return f"{sign}: what lies beyond bends the field everywhere; record a larger field of view" + (
-        "" if free else ", or try a free boundary"
-    )
-
-
 def _share_squeezed(jacobian: FloatArray, displacement: FloatArray, least: float) -> float:
     """The share of an object, where it displaces rays, with less of a Jacobian; at 0, folded."""
     size = np.hypot(*displacement)
@@ -307,13 +274,6 @@ def _share_lost(displacement: FloatArray) -> float:
     landed = np.indices(displacement.shape[1:]) + displacement
     sides = np.array(displacement.shape[1:])[:, None, None]
     return float(((landed < -0.5) | (landed > sides - 0.5)).any(axis=0).mean())
-
-
-def _share_at_edge(values: FloatArray, inwards: int = 0) -> float:
-    """Largest value at, or `depth` pixels inside, an image's edge over the largest anywhere."""
-    first, last = inwards, -1 - inwards
-    sides = values[first], values[last], values[:, first], values[:, last]
-    return float(max(side.max() for side in sides) / max(values.max(), 1e-12))
 
 
 def _those(names: Sequence[str], chi2: FloatArray, which: BoolArray) -> str:

@@ -342,7 +342,9 @@ def invert(
     with measure_time("errors", seconds):
         errors = wait_for_errors()
     finest = adaptive and len(answer.weights) == levels.counts[-1]
-    by_errors: list[Caution | None] = [] if errors is None else [errors.beam_caution()]
+    by_errors: list[Caution | None] = []
+    if errors is not None:
+        by_errors = [errors.beam_caution(), errors.edge_caution(options.max_error)]
     by_accuracy: list[Caution | None] = []
     if finest and errors is not None and quality.warnings == prepared.warnings:
         why = "with the most sites placed unless more are given"
@@ -503,7 +505,7 @@ def _read_fields(
     moves = np.ascontiguousarray(plan.within(displacement))
 
     def estimate() -> Errors | None:
-        return budget.errors(solutions, moves) if solution.converged else None
+        return budget.errors(solutions, inner, moves) if solution.converged else None
 
     errors_at_end = begin(estimate, options.threads)
     with measure_time("read-out", seconds):
@@ -561,7 +563,6 @@ def _make_report(
             fields.jacobian,
             len(finest.weights),
             options,
-            beam_difference=budget.beam_difference,
         )
     return Report(
         converged=finest.converged,

@@ -22,8 +22,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial import KDTree
 
+from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.machine import begin
-from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent, round_down, to_figures
 from napari_shadowinv.inversion.imperfections import (
@@ -36,6 +37,7 @@ from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument, InversionOptions
+from napari_shadowinv.physics.edge import edge_changes, edge_sides, edge_text
 from napari_shadowinv.physics.units import BeamCondition, PeakError
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, Level, SitePlan
@@ -58,6 +60,8 @@ _NOISE_SAMPLES, _BEAM_SAMPLES = 16, 8
 _NEAR = 2.5  # site spacings
 _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 
+_EDGE_PLACES = 200  # along the shorter side, where the error by the edge is computed
+
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 _BEAM_BASES = {  # name of the part, and its basis in a text
     "assumed": ("beam assumed, {}", "assumed"),
@@ -69,7 +73,11 @@ _BEAM_BASES = {  # name of the part, and its basis in a text
 }
 
 _REDUCED_SHARE = 0.25  # of the wanted mean square, at least for parts that are to be reduced
-_REMEDIES = {"discretisation": "more sites", "solver": "a smaller tolerance"}
+_REMEDIES = {
+    "discretisation": "more sites",
+    "solver": "a smaller tolerance",
+    "edge": "a larger field",
+}
 
 
 class ErrorEstimate(NamedTuple):
@@ -87,8 +95,7 @@ class ErrorEstimate(NamedTuple):
 class Errors:
     """Error budget of an inversion: standard errors of the displacement, in px.
 
-    It does not include the effects of a blurred image, of crossing rays, or of a field that the
-    image's edge cuts off.
+    It does not include the effects of a blurred image or of crossing rays.
 
     Attributes
     ----------
@@ -101,6 +108,10 @@ class Errors:
     effects : dict of str to ErrorEstimate
         Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`, and of the
         instrument's imperfections.
+    edge : ErrorEstimate
+        Effect of what may lie beyond the image's edge, with what the other errors add to it.
+    sides : tuple of str
+        Sides of the image near which the edge matters most: 'top', 'bottom', 'left', 'right'.
     beam : ErrorEstimate or None
         Effect of a beam that differs from the source by `beam_variation`; None if the source is
         exact: stated so, or uniform and given, and no difference was seen.
@@ -132,6 +143,8 @@ class Errors:
     discretisation: ErrorEstimate
     noise: ErrorEstimate
     effects: dict[str, ErrorEstimate]
+    edge: ErrorEstimate
+    sides: tuple[str, ...]
     beam: ErrorEstimate | None
     beam_sensitivity: ErrorEstimate
     sensitivities: dict[str, ErrorEstimate]
@@ -171,6 +184,10 @@ class Errors:
         if self.beam is not None:
             parts[self._beam_name] = self.beam
         known = {name: error for name, error in parts.items() if not math.isnan(error.rms)}
+        # Other errors move the field at the edge, too: only what exceeds them is the object's.
+        excess = np.array(self.edge) ** 2 - (np.array(list(known.values())) ** 2).sum(axis=0)
+        if excess[0] > 0:
+            known["edge"] = _roots(*np.maximum(excess, 0.0))
         return dict(sorted(known.items(), key=lambda part: -part[1].rms))
 
     @property
@@ -348,6 +365,19 @@ class Errors:
         by_instrument = f"the displacement would move by (r.m.s.): {effects}"
         return [*rows, ("beam", by_beam), ("instrument", by_instrument)]
 
+    def edge_caution(self, max_error: float) -> Caution | None:
+        """Warn if what lies beyond the edge moves the displacement by more than `max_error` of it.
+
+        Not where other errors are half as large, which move it at the edge by chance.
+        """
+        edge = self.parts.get("edge")
+        if edge is None or not self.rms > 0:
+            return None
+        others = math.sqrt(max(self.total.rms**2 - edge.rms**2, 0.0))
+        if edge.rms < max(max_error * self.rms, 2 * others):
+            return None
+        return Caution("edge", edge_text(edge.rms / self.rms, self.sides))
+
     def beam_caution(self) -> Caution | None:
         """Warn if image and source differ outside the object so that the peak is uncertain."""
         if self.beam is None or self.beam_basis != "seen" or not self.peak > 0:
@@ -452,8 +482,10 @@ class Budget:
         excess = error / max(allowed, _SHARE_OF_NOISE * noise)
         return float(_SAFETY * excess ** (1 / power))
 
-    def errors(self, solutions: Sequence[LevelSolution], displacement: FloatArray) -> Errors:
-        """Return the errors of the last solution with its displacement, (2, H, W)."""
+    def errors(
+        self, solutions: Sequence[LevelSolution], potential: FloatArray, displacement: FloatArray
+    ) -> Errors:
+        """Return the errors of the last solution with its potential and displacement, (2, H, W)."""
         solved = _usable_levels(solutions)
         mask = self._prepared.mask
         variation, basis = self._beam_variation
@@ -512,12 +544,15 @@ class Budget:
         components = self._beam.components
         if components is not None and basis == components.basis:
             beam = estimate(response.to(self._beams_of(response, components)))
+        edge, sides = _error_by_edge(potential, displacement, mask, np.array([row, column]))
         return Errors(
             peak=lengths.at_peak,
             rms=lengths.rms,
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
             effects=effects,
+            edge=edge,
+            sides=sides,
             beam=beam,
             beam_sensitivity=by_percent,
             sensitivities=sensitivities,
@@ -684,6 +719,22 @@ def _solver_gap(
     rows, columns = ((solution.level.sites + 0.5) / response.spacing).astype(np.int64).T
     group = nearest[rows * width + columns]
     return np.bincount(group, gap, len(response.flux)).astype(np.float64)[None]
+
+
+def _error_by_edge(
+    potential: FloatArray, displacement: FloatArray, mask: BoolArray, peak: IntArray
+) -> tuple[ErrorEstimate, tuple[str, ...]]:
+    """Return the error of a field by what may lie beyond the edge, and the sides it comes from."""
+    step = max(1, min(mask.shape) // _EDGE_PLACES)
+    plane, down, right, used = (
+        block_means(values, step) for values in (potential, *displacement, mask)
+    )
+    changes = edge_changes(plane, np.array([down, right]), step)[:, 1:]
+    squares = used * (changes**2).sum(axis=(0, 1))
+    row, column = peak // step
+    along = displacement[:, *peak] / max(float(np.hypot(*displacement[:, *peak])), 1e-300)
+    at_peak = ((changes[:, :, row, column] @ along) ** 2).sum()
+    return _roots(squares.mean() / used.mean(), at_peak), edge_sides(squares)
 
 
 FluxErrors = Callable[[LinearResponse, LevelSolution, InversionOptions], FloatArray | None]

@@ -60,6 +60,7 @@ from napari_shadowinv.inversion.samples import (
 )
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.options import BeamPrior, Instrument, InversionOptions
+from napari_shadowinv.physics.edge import edge_changes
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.significance import PixelErrors
 from napari_shadowinv.physics.units import label
@@ -209,7 +210,8 @@ class Uncertainty(Summarised):
         Difference of their means, relative to the r.m.s. standard deviation; 0 where all were
         solved. With an instrument, means are corrected by it.
     imperfections : tuple of str
-        What the samples draw of the instrument besides the noise, such as "background, 5 %".
+        What adds to the noise: what is drawn of the instrument, such as "background, 5 %", and
+        "edge".
     quantities : dict of str to Quantity
         Numbers derived from the field, by their names.
     tolerance : float
@@ -339,8 +341,8 @@ def uncertainty(
     own noise, so their scatter is the effect of one dose of noise: the standard deviation that
     shots of the same object would show. With an instrument, each sample also draws its
     imperfections (beam, background, gamma, blur, absorption, registration, another field) and adds
-    them to image and source. Other errors are not included (an object at the edge, folds behind
-    caustics).
+    them to image and source. Where the object goes on beyond the edge, what may lie there is added.
+    Other errors are not included (folds behind caustics).
 
     Parameters
     ----------
@@ -454,7 +456,13 @@ def uncertainty(
     report = Reporter(on_progress, should_stop)
     image_fields = np.stack([inversion.potential, *inversion.displacement])
     functions: dict[str, QuantityOf] = {}
-    measure = partial(_measure, functions, image_fields)
+    by_edge = _changes_by_edge(inversion)
+
+    def measure(change: FloatArray, seed: Seed) -> dict[str, FloatArray]:
+        rng = np.random.default_rng([options.seed, *b"edge", *seed.spawn_key])
+        beyond = np.tensordot(rng.normal(size=len(by_edge)), by_edge, 1)
+        return _measure(functions, image_fields, change + beyond)
+
     asked = measure if quantities else None
     outcomes: list[tuple[int, float, bool]] = []
 
@@ -469,7 +477,13 @@ def uncertainty(
         head = list(solve_samples(seeds[:_CHECKED], report))
         functions.update(choose(np.array([change[0] for change in head])))
         changes = chain(head, solve_samples(seeds[_CHECKED:], report))
-        scatter = reduce(add, (Scatter.of(change, asked) for change in changes))
+        scatter = reduce(
+            add,
+            (
+                Scatter.of(change, asked and asked(change, seed))
+                for change, seed in zip(changes, seeds, strict=True)
+            ),
+        )
     else:
         quietly = Reporter(None, should_stop)
         clean = prepare(image, plan.source, clipping, plan.mask).floored_image
@@ -482,10 +496,12 @@ def uncertainty(
             linear = _in_thread(partial(response.changes, block), quietly)
             if not functions:
                 functions.update(choose(linear[:, 0]))
-            for pair in map(Pairs.of, linear, islice(solved, len(block))):
+            for seed, pair in zip(
+                block, map(Pairs.of, linear, islice(solved, len(block))), strict=True
+            ):
                 pairs = pair if pairs is None else pairs + pair
                 if asked is not None and draws is not None:
-                    of_solved.append(asked(pair.solved))
+                    of_solved.append(asked(pair.solved, seed))
         scatter = reduce(add, _in_order(response.scatter, _blocks(seeds), workers, report))
     mean, std, of_samples = scatter.mean, scatter.std, _joined(scatter.quantities)
     check = _LinearCheck()
@@ -499,6 +515,7 @@ def uncertainty(
             both = reduce(add, map(Pairs.of, few, exact.astype(np.float64)))
             of_samples[name] = both.correct(of_samples[name])
     mean = image_fields + mean
+    std = np.sqrt(std**2 + (by_edge**2).sum(axis=0))
     warnings = inversion.report.warnings
     if (caution := check.caution(with_instrument=draws is not None)) is not None:
         warnings = (caution, *warnings)
@@ -509,8 +526,8 @@ def uncertainty(
             "deviations are unreliable where the samples scatter most"
         )
         warnings = (Caution("samples", text), *warnings)
-    values = measure(np.zeros_like(image_fields))
-    names = () if draws is None else draws.names
+    values = _measure(functions, image_fields, np.zeros_like(image_fields))
+    names = (*(() if draws is None else draws.names), *("edge",) * bool(len(by_edge)))
     return Uncertainty(
         inversion=replace(inversion, pixel_errors=PixelErrors(std[1:], ("noise", *names))),
         potential_mean=mean[0],
@@ -556,6 +573,16 @@ def _measure(
     potential, *displacement = fields + change
     moves = np.array(displacement)
     return {name: np.asarray(of(potential, moves)) for name, of in quantities.items()}
+
+
+def _changes_by_edge(inversion: Inversion) -> FloatArray:
+    """Return `edge_changes` of the size in the error budget, (k, 3, H, W); k is 0 without."""
+    part = None if inversion.errors is None else inversion.errors.parts.get("edge")
+    if part is None:
+        return np.empty((0, 3, *inversion.mask.shape))
+    changes = edge_changes(inversion.potential, inversion.displacement)
+    squares = (changes[:, 1:, inversion.mask] ** 2).sum(axis=(0, 1)).mean()
+    return np.asarray(changes * part.rms / np.sqrt(squares))
 
 
 def _draws(image: ArrayLike, inversion: Inversion, plan: SitePlan) -> InstrumentDraws | None:

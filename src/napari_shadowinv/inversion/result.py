@@ -293,7 +293,8 @@ class Inversion(Summarised):
             return Assessment(Verdict.UNCERTAIN, reason, by_code.get("not-converged"))
         for code, verdict in DECISIVE.items():
             if code in by_code:
-                return Assessment(verdict, by_code[code].short, by_code[code])
+                reason = by_code[code].text if verdict is Verdict.EDGE else by_code[code].short
+                return Assessment(verdict, reason, by_code[code])
         errors, max_error = self.errors_in(setup), self.options.max_error
         if errors is None:
             return Assessment(Verdict.UNCERTAIN, "errors were not worked out")

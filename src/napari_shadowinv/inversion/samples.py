@@ -135,8 +135,8 @@ _LINEAR_TOLERANCE = 0.02
 _ROWS = 64  # read out between two calls of `should_stop`
 
 
-Measure = Callable[[FloatArray], dict[str, FloatArray]]
-"""Returns quantities of a change of potential and displacement, (3, H, W)."""
+Measure = Callable[[FloatArray, Seed], dict[str, FloatArray]]
+"""Returns quantities of a sample's change of potential and displacement, (3, H, W), by its seed."""
 
 
 class Sample(NamedTuple):
@@ -246,9 +246,8 @@ class Scatter:
     quantities: tuple[dict[str, FloatArray], ...] = ()  # of each sample
 
     @classmethod
-    def of(cls, change: FloatArray, measure: Measure | None = None) -> Scatter:
-        quantities = () if measure is None else (measure(change),)
-        return cls(1, change, change**2, quantities)
+    def of(cls, change: FloatArray, quantities: dict[str, FloatArray] | None = None) -> Scatter:
+        return cls(1, change, change**2, () if quantities is None else (quantities,))
 
     def __add__(self, other: Scatter) -> Scatter:
         return Scatter(*map(add, vars(self).values(), vars(other).values()))
@@ -401,7 +400,7 @@ class LinearResampling:
             self._readout.add(values, sums, squares, start, _ROWS)
         quantities: tuple[dict[str, FloatArray], ...] = ()
         if self._measure is not None:
-            quantities = tuple(map(self._measure, self._fields(values, len(seeds))))
+            quantities = tuple(map(self._measure, self._fields(values, len(seeds)), seeds))
         return Scatter(len(seeds), sums, squares, quantities)
 
     def changes(self, seeds: list[Seed]) -> FloatArray:

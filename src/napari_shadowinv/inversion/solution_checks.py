@@ -4,7 +4,6 @@
 - whether more sites would reduce it: `is_coarse`
 - the cautions about a solution: `find_cautions`
 - the verdicts that follow from them: `DECISIVE`
-- signs that a field continues beyond the edge of its image: `inner_sides`, `turning_displacement`
 
 Each sign was chosen to be absent in images whose field is known to be right and to appear where it
 is wrong; `docs/trust.md` lists them with advice. The limits, and the measurements on either side of
@@ -35,32 +34,17 @@ them (200 × 200 px and the reference images):
   strength the jump of a ring is at 0.6 to 1, hence the same with 0.85 and 0.6. A crescent has
   shallow tips: around its widest place, within twice the half-width, the shares are up to 0.79
   and 0.83 without deep folds, 0.86 to 0.95 and 0.87 to 0.98 with.
-- **The field continues beyond a closed edge.** Rays that a closed edge keeps from leaving must turn
-  back. A twentieth of the side inside the edge the mean displacement towards it or away from it
-  is 0.08 to 0.20 of the r.m.s. displacement for fields that fall like 1/r or r^-½ or not at all,
-  on all sides or two. The lesser of mean and median of the sides is at most 0.05 for contained
-  fields and 0.055 for real plumes; with noise, 8 and more times its noise against 3. An object
-  that the edge cuts in half has 0.87 to 1 of its peak along the edge, real plumes up to 0.72; a
-  jet is as strong at the edge as elsewhere, but nothing crosses the edge. A dipole's field, and an
-  object cut off by less than half, are indistinguishable from a plume.
-- **An edge cuts the object.** The contrast at the edge is 0.4 and more of the strongest inside for
-  21 of 22 random objects that a crop cuts and that no other sign shows, and at most 0.31 for real
-  plumes and reference images. Of another 100 cropped objects 42 were more than 5 % and three totals
-  wrong, 5 of them without a warning: faint ones at 400 to 900 counts, and fields that cross the
-  edge where they leave no contrast. None of 223 objects that end inside the image was doubted.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
-from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._system.machine import available_threads, begin, in_ranges
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -69,63 +53,6 @@ from napari_shadowinv.geometry.compiler import kernel
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.options import InversionOptions
-
-TURNED_BACK = 0.07
-"""Mean displacement across the edge over the r.m.s. one: 0.05 if contained, 0.08 if cut."""
-
-_DEPTH = 0.05  # of the shorter side
-_MAX_MASKED = 0.2  # of a side
-
-
-@dataclass(frozen=True)
-class Sides:
-    """Displacement along the four sides of an image, px.
-
-    `outwards` is its component across the edge, a twentieth of the shorter side (`depth` px) inside
-    it; `along` the component along the edge, at the edge.
-    """
-
-    depth: int
-    outwards: tuple[FloatArray, ...]
-    along: tuple[FloatArray, ...]
-
-
-def inner_sides(displacement: FloatArray, mask: BoolArray) -> Sides | None:
-    """Return a displacement along the sides; None if the used part of the image ends elsewhere.
-
-    Parameters
-    ----------
-    displacement : ndarray, shape (2, H, W)
-        In px.
-    mask : ndarray of bool, shape (H, W)
-        The pixels to use.
-    """
-    depth = max(2, round(_DEPTH * min(mask.shape)))
-    rows = slice(None)
-
-    def used(axis: int, *place: int | slice) -> FloatArray:
-        return np.where(mask[place], displacement[(axis, *place)], np.nan)
-
-    outwards = (
-        -used(0, depth),
-        used(0, -1 - depth),
-        -used(1, rows, depth),
-        used(1, rows, -1 - depth),
-    )
-    along = used(1, 0), used(1, -1), used(0, rows, 0), used(0, rows, -1)
-    if any(np.isnan(side).mean() > _MAX_MASKED for side in (*outwards, *along)):
-        return None
-    return Sides(depth, outwards, along)
-
-
-def turning_displacement(sides: Sides) -> float:
-    """Return the mean displacement towards or away from the edge on all sides, px.
-
-    An edge that keeps rays or fields from leaving turns them back on all sides.
-    """
-    means = [float(np.nanmean(side)) for side in sides.outwards]
-    return min(abs(float(np.mean(means))), abs(float(np.median(means))))
-
 
 _BRIGHT = 3.0  # times the source: a bright line, too fine for the pixels
 _LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 4), (4, 0))
@@ -148,25 +75,12 @@ _LEAST_STRIP = 0.003  # of the pixels
 _LEAST_CAUSTIC = 0.01  # of a strip
 _ENOUGH_PIXELS = 300  # of a side, to resolve the width of a strip
 
-_BAND_DEVIATIONS = 5.0
-_AT_EDGE = 0.8  # of the peak
-_CROSSING = 0.1  # of the displacement along the edge
-
-_CONTRAST_BLUR = 0.025  # of the shorter side
-_BIN_SHARE = 0.3  # of the blur's width: side of the pixels' bins
-_MIN_EDGE_CONTRAST = 0.4  # of the strongest contrast of the same sign
-_MAX_OPPOSITE_CONTRAST = 0.35  # of the contrast at an edge, at the opposite edge
-_MIN_SIGN_CONTRAST = 0.03  # of the strongest contrast
-_OPPOSITES = {"top": "bottom", "bottom": "top", "left": "right", "right": "left"}
-_CONTRAST_DEVIATIONS, _BEAM_DEVIATIONS = 7.0, 4.0
-
 DECISIVE = {
     "misfit": Verdict.MISFIT,
     "negative": Verdict.UNCERTAIN,
     "no-deflection": Verdict.UNCERTAIN,
     "folds": Verdict.AMBIGUOUS,
-    "closed-edge": Verdict.EDGE,
-    "cut-object": Verdict.EDGE,
+    "edge": Verdict.EDGE,
     "masked-peak": Verdict.UNCERTAIN,
     "correlated-noise": Verdict.UNCERTAIN,
 }
@@ -190,27 +104,13 @@ def find_cautions(
     jacobian: FloatArray,
     n_sites: int,
     options: InversionOptions,
-    *,
-    beam_difference: float = 0.0,
 ) -> tuple[Caution, ...]:
-    """Return the reasons to doubt a converged solution; empty if there are none.
-
-    Contrast at the edge counts as a cut object only if it is well above the relative
-    `beam_difference` of image and source outside the object.
-    """
+    """Return the reasons to doubt a converged solution; empty if there are none."""
     misfit_at_end = begin(partial(_misfit, prepared, reprojection, n_sites), options.threads)
-    is_closed = options.boundary == "closed"
-    if is_closed:
-        cut_by_edge = partial(_cut_by_edge, prepared, noise, beam_difference)
-        cut_at_end = begin(cut_by_edge, options.threads)
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
     mask = prepared.mask
     rms = float(np.sqrt(square[mask].mean()))
     folds, masked_peak = _deep_folds(jacobian, mask), _peak_at_mask(displacement, mask)
-    closed_edge = ""
-    if is_closed:
-        peak = float(np.sqrt(square[mask].max()))
-        closed_edge = _cut_off(displacement, mask, noise, rms, peak)
     misfit = misfit_at_end()
     # Where the finest structure is a pattern, it is no measure of noise.
     no_deflection = "" if misfit else _no_deflection(noise, rms)
@@ -221,10 +121,7 @@ def find_cautions(
         "folds": folds,
         "correlated-noise": _far_correlation(noise),
         "masked-peak": masked_peak,
-        "closed-edge": closed_edge,
     }
-    if is_closed and not closed_edge:
-        texts["cut-object"] = cut_at_end()
     return tuple(Caution(code, text) for code, text in texts.items() if text)
 
 
@@ -462,71 +359,6 @@ def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least:
         near = jacobian[y**2 + x**2 <= (2 * depth.max()) ** 2]
         largest = max(largest, float((near < inner).sum() / (near < outer).sum()))
     return largest
-
-
-def _cut_off(
-    displacement: FloatArray, mask: BoolArray, noise: ImageNoise, rms: float, peak: float
-) -> str:
-    """Describe a field that reaches the closed edge."""
-    sides = inner_sides(displacement, mask)
-    if sides is None:
-        return ""
-    turned = turning_displacement(sides)
-    by_noise = noise.largest * np.sqrt(sides.depth / sum(side.size for side in sides.outwards))
-    if turned > max(TURNED_BACK * rms, _BAND_DEVIATIONS * by_noise):
-        how = (
-            f"near the edge it displaces rays by {to_figures(turned)} px towards or away from the "
-            "edge on all sides"
-        )
-    elif rms > 2 * noise.displacements(noise.largest)[1] and _is_strongest_at_edge(
-        np.concatenate(sides.outwards), np.concatenate(sides.along), peak
-    ):
-        how = "it is strongest at the edge"
-    else:
-        return ""
-    return (
-        f"the field reaches the image's edge, which is closed: {how}, and truncating it there "
-        "distorts the field everywhere; try a free boundary, or record a larger field of view"
-    )
-
-
-def _is_strongest_at_edge(outwards: FloatArray, along: FloatArray, peak: float) -> bool:
-    """Return whether the field peaks at the edge and crosses it, unlike a jet along it."""
-    crossing = np.nanmean(outwards**2) > _CROSSING**2 * np.nanmean(along**2)
-    return bool(crossing and np.nanmax(np.abs(along)) > _AT_EDGE * peak)
-
-
-def _cut_by_edge(prepared: Prepared, noise: ImageNoise, beam_difference: float) -> str:
-    """Describe an object cut by an edge: strong contrast there, a calm opposite edge."""
-    mask = prepared.mask
-    mean = prepared.source[mask].mean()
-    width = _CONTRAST_BLUR * min(mask.shape)
-    is_lit = mask & (prepared.source > 0)
-    ratio = prepared.image / np.where(is_lit, prepared.source, 1.0)
-    contrast = np.where(is_lit, ratio / (prepared.image[mask].mean() / mean) - 1, 0.0)
-    step = max(1, int(_BIN_SHARE * width))
-    contrast = complete_block_means(contrast, step)
-    contrast = ndimage.gaussian_filter(contrast, width / step, truncate=3.0)
-    # Along an edge the noise is √2 times as large, in a corner twice.
-    by_noise = noise.typical * np.sqrt(noise.clumping / (2 * np.pi)) / width
-    strongest = float(np.abs(contrast).max())
-    least = max(_CONTRAST_DEVIATIONS * by_noise, _BEAM_DEVIATIONS * beam_difference)
-    for values in (contrast, -contrast):
-        largest = float(values.max())
-        if largest < _MIN_SIGN_CONTRAST * strongest:
-            continue
-        edges = values[0], values[-1], values[:, 0], values[:, -1]
-        peaks = {side: edge.max() for side, edge in zip(_OPPOSITES, edges, strict=True)}
-        for side, at_edge in peaks.items():
-            is_strong = at_edge > max(_MIN_EDGE_CONTRAST * largest, least)
-            if is_strong and peaks[_OPPOSITES[side]] < _MAX_OPPOSITE_CONTRAST * at_edge:
-                return (
-                    f"the {side} edge of the image seems to cut the object: the image's contrast "
-                    "is strong there and weak at the opposite edge, and what lies beyond is "
-                    "missing, which makes the field wrong, by 7 to 73 % in tests; use a wider crop "
-                    "or field of view, or try a free boundary"
-                )
-    return ""
 
 
 def _peak_at_mask(displacement: FloatArray, mask: BoolArray) -> str:

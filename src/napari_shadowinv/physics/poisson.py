@@ -109,9 +109,13 @@ def potential_from_displacement(displacement: FloatArray) -> FloatArray:
     slopes[1:] -= by_row
     slopes[:, :-1] += by_column
     slopes[:, 1:] -= by_column
-    # The cosines diagonalise the sum of squared differences of neighbours.
-    rows = 2 - 2 * np.cos(np.pi * np.arange(height) / height)
-    columns = 2 - 2 * np.cos(np.pi * np.arange(width) / width)
+    return potential_of_slopes(slopes)
+
+
+def potential_of_slopes(slopes: FloatArray) -> FloatArray:
+    """Potential, (H, W), whose differences to all neighbours add up to `slopes` at each pixel."""
+    # The cosines diagonalise the sum of differences of neighbours.
+    rows, columns = (2 - 2 * np.cos(np.pi * np.arange(n) / n) for n in slopes.shape)
     return _potential_by_cosines(slopes, rows[:, None] + columns)
 
 

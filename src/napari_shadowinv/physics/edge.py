@@ -1,0 +1,129 @@
+"""What a field owes to the unseen: objects beyond the edge of its image.
+
+- changes of a field by what may lie there: `edge_changes`
+- the sides of the image that they come from: `edge_sides`, in words `edge_text`
+
+An image fixes the divergence of the displacement inside it, but not the flux that crosses its edge.
+To first order, the potential of sources beyond the edge, which is harmonic inside, may be added to
+any answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.fft import dstn, idstn
+
+from napari_shadowinv._system.arrays import block_means
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.facts import percent
+from napari_shadowinv.physics.poisson import border_mean, potential_of_slopes
+
+SIDES = ("top", "bottom", "left", "right")
+
+
+def edge_changes(
+    potential: FloatArray, displacement: FloatArray, spacing: float = 1.0
+) -> FloatArray:
+    """Independent changes of a field, of one standard deviation each, by what lies beyond its edge.
+
+    Two opposite assumptions are made of it. The first lets no flux cross the edge, as if the object
+    went on as its mirror image; the second makes the potential constant along the edge, as if it
+    went on as its mirror image of opposite sign. A field that ends inside the image satisfies both,
+    so neither changes it. Objects beyond the edge that are like those inside add a field as strong
+    as the mirror image's. With half the sum of both changes nothing lies beyond, and half their
+    difference is the field of the mirror image: so the variance of any answer, whatever its own
+    boundary, is the mean of their squares.
+
+    The third change is by flux that leaves on all sides, which looks like another exposure: along
+    the edge the image is then brighter or darker than its source.
+
+    Parameters
+    ----------
+    potential : ndarray, shape (H, W)
+        In px², of at least 4 by 4 points.
+    displacement : ndarray, shape (2, H, W)
+        Its negative gradient, px.
+    spacing : float, default 1
+        Distance between the points, px.
+
+    Returns
+    -------
+    ndarray of float64, shape (3, 3, H, W)
+        The changes of the potential, px², and of the displacement's components, px.
+    """
+    outflow = np.zeros(potential.shape)
+    for axis, part in enumerate(displacement):
+        inwards, edges = np.moveaxis(part, axis, 0), np.moveaxis(outflow, axis, 0)
+        # Half a pixel outside the outermost points.
+        edges[0] -= 1.5 * inwards[0] - 0.5 * inwards[1]
+        edges[-1] += 1.5 * inwards[-1] - 0.5 * inwards[-2]
+    turned_back = potential_of_slopes(spacing * outflow)
+    # Sines vanish at the border, whose values act on the points next to it.
+    held = border_mean(potential) - potential
+    by_border = np.zeros([side - 2 for side in held.shape])
+    by_border[0] += held[0, 1:-1]
+    by_border[-1] += held[-1, 1:-1]
+    by_border[:, 0] += held[1:-1, 0]
+    by_border[:, -1] += held[1:-1, -1]
+    rows, columns = (2 - 2 * np.cos(np.pi * np.arange(1, n - 1) / (n - 1)) for n in held.shape)
+    held[1:-1, 1:-1] = idstn(dstn(by_border, type=1) / (rows[:, None] + columns), type=1)
+    leaving = _divergence_at_edge(displacement, spacing) * _even_source(held.shape, spacing)
+    changes = turned_back / np.sqrt(2), held / np.sqrt(2), leaving
+    return np.array([[each, *-np.array(np.gradient(each, spacing))] for each in changes])
+
+
+def _divergence_at_edge(displacement: FloatArray, spacing: float, tiles: int = 8) -> float:
+    """Divergence that three quarters of the squares along the edge reach, or else 0.
+
+    The squares are as wide as a `tiles`th of the shorter side.
+    """
+    along_y, along_x = (np.gradient(part, spacing, axis=k) for k, part in enumerate(displacement))
+    means = block_means(along_y + along_x, max(1, min(along_y.shape) // tiles))
+    at_edge = np.concatenate([means[0], means[-1], means[1:-1, 0], means[1:-1, -1]])
+    low, high = np.quantile(at_edge, [0.25, 0.75])
+    return float(max(low, 0.0) + min(high, 0.0))
+
+
+def _even_source(shape: tuple[int, ...], spacing: float) -> FloatArray:
+    """Potential, px², with a divergence of -1 and the same inflow all along the edge."""
+    y, x = (spacing * (np.arange(n) - (n - 1) / 2) for n in shape)
+    height, width = shape
+    square = (width * y[:, None] ** 2 + height * x**2) / (2 * (height + width))
+    return np.asarray(square - border_mean(square))
+
+
+def edge_sides(squares: FloatArray, strip: float = 0.1, share: float = 0.25) -> tuple[str, ...]:
+    """Return the sides near which squared changes are largest.
+
+    Parameters
+    ----------
+    squares : ndarray, shape (H, W)
+        Sums of the squares of `edge_changes`.
+    strip : float, default 0.1
+        Width of the strip along each side, as a share of the shorter one.
+    share : float, default 0.25
+        Least mean in a strip, as a share of the largest.
+    """
+    width = max(1, round(strip * min(squares.shape)))
+    strips = squares[:width], squares[-width:], squares[:, :width], squares[:, -width:]
+    means = [float(each.mean()) for each in strips]
+    return tuple(
+        side for side, mean in zip(SIDES, means, strict=True) if mean >= share * max(means)
+    )
+
+
+def edge_text(error: float, sides: Sequence[str]) -> str:
+    """Return in words how much of a field, as a share of it, rests on what lies beyond its sides.
+
+    >>> edge_text(0.4, ["left", "right"])[:80]
+    '40 % of the displacement (r.m.s.) rests on what lies beyond the left and right e'
+    """
+    *others, last = sides
+    listed = f"{', '.join(others)} and {last} edges" if others else f"{last} edge"
+    where = f"beyond the {listed}" if len(sides) < len(SIDES) else "beyond the image, on all sides"
+    return (
+        f"{percent(error)} of the displacement (r.m.s.) rests on what lies {where}: record a "
+        "larger field of view, or compare closed and free boundaries"
+    )
