@@ -43,7 +43,7 @@ GOOD: dict[str, Any] = {
 }
 
 
-CUT: dict[str, Any] = {"parts": {"edge": 0.3, "noise": 0.02}, "uncertainty": 0.3}
+CUT: dict[str, Any] = {"parts": {"edge": 0.3, "noise": 0.02}, "total": 0.3}
 
 
 def assess(
@@ -213,7 +213,8 @@ def test_a_beam_that_was_assumed_is_a_condition(share: float, expected: Verdict)
         of_assumed_beam(0.06, 0.2),
         {"ended": False},
         {"pattern": Pattern(np.array([9.0, 1.0]))},
-        {"displacement": blob((46, 24))},
+        {"parts": {"edge": 0.5, "beam": 0.2, "noise": 0.02}, "total": 0.54},
+        {"parts": {"edge": 0.2, "beam": 0.2, "noise": 0.02}, "total": 0.28},
     ],
 )
 def test_an_assumed_beam_excuses_no_other_fault(fault: dict[str, Any]) -> None:
@@ -274,7 +275,7 @@ def test_unknown_error_bars_do_not_speak_against_a_field() -> None:
     ],
 )
 def test_what_lies_beyond_the_edge_is_told(edge: float, noise: float, expected: Verdict) -> None:
-    errors = {"parts": {"edge": edge, "noise": noise}, "uncertainty": float(np.hypot(edge, noise))}
+    errors = {"parts": {"edge": edge, "noise": noise}, "total": float(np.hypot(edge, noise))}
     verdict, why = assess(**GOOD | errors)
     assert verdict is expected
     assert ("beyond the left and right edges" in why) == (expected is Verdict.EDGE)
