@@ -445,7 +445,10 @@ def uncertainty(
     threads = max(1, available_threads(options.threads) // workers)
     clipping = options.model_copy(update={"threads": threads, "negative": "clip"})
     plan = replace(plan, levels=plan.levels.up_to(len(inversion.weights)))
-    correlation = 0.0 if inversion.errors is None else inversion.errors.noise_correlation
+    errors = inversion.errors
+    # Structure that hides the noise does not correlate noise that is stated.
+    is_known = errors is not None and not (errors.noise_is_bound and np.ndim(noise) == 0)
+    correlation = errors.noise_correlation if errors is not None and is_known else 0.0
     if correlation and not isinstance(noise, str):
         noise_text += f", correlated over {to_figures(correlation)} px"
     resampling = FullResampling(
