@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv import InversionOptions, invert, synthetic_image
 from napari_shadowinv.cautions import CAUTION_CODES, Caution
@@ -122,3 +123,18 @@ def test_a_caution_about_the_solution_decides_the_verdict(image, code, verdict):
     assert doubtful.verdict is verdict
     assert doubtful.to_dataset().attrs["verdict"] == verdict
     assert doubtful.headline.text.startswith(f"{verdict.upper()}: {CAUTION_CODES[code]}; peak ")
+
+
+def test_a_recorded_reference_may_differ_from_the_beam(image):
+    speckles = np.exp(gaussian_filter(np.random.default_rng(0).normal(size=image.shape), 1.5))
+    recorded = synthetic_image(gaussian_blob(image.shape, 30.0, 8.0).displacement, speckles)
+    inversion = invert(recorded, source=speckles, options=FEW)
+    assert inversion.verdict is Verdict.CONDITIONAL
+    (even,) = re.findall(r"if beam and reference agree to ([\d.]+) %", inversion.headline.text)
+    assert "if they differ by 0.5 % (assumed)" in inversion.headline.text
+    options = {"source": speckles, "options": FEW}
+    known = invert(recorded, **options, instrument={"beam_rms": float(even) / 100})
+    assert known.verdict is Verdict.DETERMINED
+    stated = invert(recorded, **options, instrument={"beam_rms": 0.005})
+    assert stated.verdict is Verdict.UNCERTAIN
+    assert stated.errors.share == pytest.approx(inversion.errors.share)

@@ -635,6 +635,7 @@ def _result(
             share=largest_share(by_beam.errors, displacements),
             scale=data.beam.length,
             assumed=data.assumed or (data.beam.rms > 0 and data.instrument.beam_rms is None),
+            recorded=not data.assumed,
         )
     shares = {key: largest_share(each, displacements) for key, each in by_part.items()}
     parts = dict(sorted(shares.items(), key=lambda part: -part[1]))

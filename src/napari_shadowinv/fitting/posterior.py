@@ -490,7 +490,9 @@ class BeamError:
     scale : float
         Distance over which the beam varies, in shorter sides of the image.
     assumed : bool
-        Whether nobody measured the beam.
+        Whether nobody measured how far the beam may differ from its source.
+    recorded : bool
+        Whether the source was recorded.
     """
 
     sensitivity: float
@@ -498,6 +500,7 @@ class BeamError:
     share: float
     scale: float
     assumed: bool
+    recorded: bool = False
 
     @property
     def name(self) -> str:
@@ -508,7 +511,8 @@ class BeamError:
     @property
     def text(self) -> str:
         """The response in a sentence."""
-        beam = "the beam was assumed to be the source or uniform: " if self.assumed else ""
+        unmeasured = self.assumed and not self.recorded
+        beam = "the beam was assumed to be the source or uniform: " if unmeasured else ""
         sentence = (
             f"{beam}a beam that differs by 1 % (r.m.s.) over {to_figures(self.scale)} of the "
             f"image's shorter side would move the displacement by {self.sensitivity:.1%} (r.m.s.)"

@@ -500,9 +500,11 @@ class Fit(Summarised):
         at_peak = field.error_at(*shown.peak)
         scale = at_peak / report.total
         peak = scale * rest, scale * by_beam
-        condition = BeamCondition.within(share, variation, (rest, by_beam), peak)
-        totals = {"peak_if_uneven": at_peak, "field_if_uneven": report.total}
-        return condition and condition._replace(**totals)
+        recorded = beam is not None and beam.recorded
+        condition = BeamCondition.within(share, variation, (rest, by_beam), peak, recorded=recorded)
+        return condition and condition._replace(
+            peak_if_uneven=at_peak, field_if_uneven=report.total
+        )
 
     @property
     def _origins(self) -> tuple[ImageOrigin, ...]:

@@ -72,6 +72,8 @@ _BEAM_BASES = {  # name of the part, and its basis in a text
     "outside": ("beam measured outside the object, {}", "measured outside the object"),
 }
 
+_UNMEASURED = "assumed", "reference"  # bases that are conditions of a result
+
 _REDUCED_SHARE = 0.25  # of the wanted mean square, at least for parts that are to be reduced
 _REMEDIES = {
     "discretisation": "more sites",
@@ -245,12 +247,13 @@ class Errors:
         share : float
             Largest total of the displacement (r.m.s.).
         """
-        if self.beam is None or self.beam_basis != "assumed" or not self.rms > 0:
+        if self.beam is None or self.beam_basis not in _UNMEASURED or not self.rms > 0:
             return None
         rest = replace(self, beam=None).total
         field = rest.rms / self.rms, self.beam.rms / self.rms
         peak = rest.at_peak / self.peak, self.beam.at_peak / self.peak
-        return BeamCondition.within(share, self.beam_variation, field, peak)
+        recorded = self.beam_basis == "reference"
+        return BeamCondition.within(share, self.beam_variation, field, peak, recorded=recorded)
 
     def measure_next(self, share: float) -> str:
         """Return what has to be known better for a total of at most `share`, and that total.

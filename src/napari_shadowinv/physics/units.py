@@ -64,10 +64,17 @@ class BeamCondition(NamedTuple):
     peak_if_even: float
     peak_if_uneven: float
     field_if_uneven: float  # r.m.s.
+    recorded: bool  # whether it is a reference of another exposure that is uneven so
 
     @classmethod
     def within(
-        cls, largest: float, uneven: float, field: tuple[float, float], peak: tuple[float, float]
+        cls,
+        largest: float,
+        uneven: float,
+        field: tuple[float, float],
+        peak: tuple[float, float],
+        *,
+        recorded: bool,
     ) -> BeamCondition | None:
         """Return the condition for a total error of the field (r.m.s.) of at most `largest`.
 
@@ -80,7 +87,7 @@ class BeamCondition(NamedTuple):
             return None
         even = round_down(uneven * min(math.sqrt(allowed) / by_beam, 1.0))
         at_peak = math.hypot(peak[0], peak[1] * even / uneven)
-        return cls(even, uneven, at_peak, math.hypot(*peak), math.hypot(*field))
+        return cls(even, uneven, at_peak, math.hypot(*peak), math.hypot(*field), recorded)
 
 
 class PeakError(NamedTuple):
@@ -125,10 +132,18 @@ class ShownField:
     def conditional_text(self, condition: BeamCondition) -> str:
         """Write the largest magnitude with its errors by an even and by the assumed beam."""
         peak = self.short_peak_text(PeakError(condition.peak_if_even, ""))
-        if_uneven = to_figures(condition.peak_if_uneven * self.largest)
+        otherwise = (
+            f"± {to_figures(condition.peak_if_uneven * self.largest)} "
+            f"(field {percent(condition.field_if_uneven)})"
+        )
+        even, uneven = percent(condition.even), percent(condition.uneven)
+        if condition.recorded:
+            return (
+                f"{peak} if beam and reference agree to {even}; {otherwise} if they differ by "
+                f"{uneven} (assumed). Compare two references."
+            )
         return (
-            f"{peak} if the beam is even to {percent(condition.even)}; ± {if_uneven} (field "
-            f"{percent(condition.field_if_uneven)}) if it is {percent(condition.uneven)} uneven "
+            f"{peak} if the beam is even to {even}; {otherwise} if it is {uneven} uneven "
             "(assumed). Record a reference."
         )
 
