@@ -255,7 +255,7 @@ def inside(rng: np.random.Generator) -> dict[str, Displacement]:
 
 
 def filling(rng: np.random.Generator) -> dict[str, Displacement]:
-    """Return four objects that fill more than half of the frame and end within it."""
+    """Return four objects that fill half of the frame, with 1 % of their peak at its edge."""
     row, column = rng.uniform(-2, 2, 2) + MIDDLE
     lumps = [
         Gaussian(float(rng.normal()), *rng.uniform(5, 8, 2), 0.0, *rng.uniform(18, 78, 2))
@@ -267,8 +267,8 @@ def filling(rng: np.random.Generator) -> dict[str, Displacement]:
         for j in range(3)
     ]
     return {
-        "wide ring": gaussians([Gaussian(1, 14, 14, 0, row, column)]),
-        "wide ellipse": gaussians([Gaussian(1, 12, 15, 0.4, row, column)]),
+        "wide ring": gaussians([Gaussian(1, 13, 13, 0, row, column)]),
+        "wide ellipse": gaussians([Gaussian(1, 11, 13.5, 0.4, row, column)]),
         "many lumps": gaussians(lumps),
         "nine spots": gaussians(spots),
     }
@@ -388,7 +388,7 @@ def right_lines(answers: Sequence[Answer]) -> Iterator[Line]:
 
 
 def inputs(seed: int, count: int) -> Iterator[Answer]:
-    """Other beams than the source, a mask over the peak, crops through the object."""
+    """Other beams than the source, wrong references, a mask over the peak, cropped objects."""
     for number in range(count):
         rng = random_number(seed, "inputs", number)
         ring = gaussians([Gaussian(1, 9.6, 9.6, 0, *(MIDDLE + rng.uniform(-3, 3, 2)))])
@@ -404,12 +404,28 @@ def inputs(seed: int, count: int) -> Iterator[Answer]:
                 for origin, source in (("recorded", recorded), ("assumed", None)):
                     case = f"{title}, {origin}, slope {strength:g}"
                     yield answer("inputs", case, invert(shot, source=source), truth)
+        yield from references(displacement, rng)
         image = counted(rng, image_of(displacement, SIDE))
         yield from hidden_parts(image, truth, int(rng.integers(4)))
 
 
 def uneven(wave: Beam, size: float) -> Beam:
     return lambda y, x: 1 + size * (wave(y, x) + 0 * y)
+
+
+def references(displacement: Displacement, rng: np.random.Generator) -> Iterator[Answer]:
+    """References out of register, as smooth as an eighth of the frame, and negatives."""
+    wave, truth = Waves(rng, SIDE, SIDE / 8), truth_of(displacement, SIDE)
+    beam = uneven(wave, 0.1)
+    shot = counted(rng, image_of(displacement, SIDE, beam))
+    y, x = np.arange(float(SIDE))[:, None], np.arange(float(SIDE))[None, :]
+    for shift in (0.0, 0.5, 2.0):
+        reference = counted(rng, beam(y + 0.6 * shift, x - 0.8 * shift))
+        result = invert(shot, source=reference)
+        yield answer("inputs", f"reference shifted by {shift:g} px", result, truth)
+    dark = 1.1 * max(shot.max(), reference.max())
+    negatives = dark - shot, dark - counted(rng, beam(y, x))
+    yield answer("inputs", "both negatives", invert(negatives[0], source=negatives[1]), truth)
 
 
 def hidden_parts(image: FloatArray, truth: FloatArray, turns: int) -> Iterator[Answer]:
@@ -436,7 +452,8 @@ def turned(planes: FloatArray, turns: int) -> FloatArray:
 
 
 def input_lines(answers: Sequence[Answer]) -> Iterator[Line]:
-    right_ones = [each for each in answers if "beam 0% off, recorded" in each.case]
+    titles = "beam 0% off, recorded", "reference shifted by 0 px"
+    right_ones = [each for each in answers if each.case.startswith(titles)]
     wrong_ones = [each for each in answers if each not in right_ones]
     yield silent_line(wrong_ones, "wrong sources, masks and crops: silent")
     doubted = [each for each in right_ones if each.is_refused or each.cries]
