@@ -15,7 +15,6 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.fft import dstn, idstn
 
-from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.poisson import border_mean, potential_of_slopes
@@ -74,15 +73,19 @@ def edge_changes(
     return np.array([[each, *-np.array(np.gradient(each, spacing))] for each in changes])
 
 
-def _divergence_at_edge(displacement: FloatArray, spacing: float, tiles: int = 8) -> float:
-    """Divergence that three quarters of the squares along the edge reach, or else 0.
+def _divergence_at_edge(
+    displacement: FloatArray, spacing: float, depth: float = 1 / 32, count: int = 32
+) -> float:
+    """Divergence that three quarters of `count` stretches of the edge reach, or else 0.
 
-    The squares are as wide as a `tiles`th of the shorter side.
+    They are as deep as a share of the shorter side.
     """
     along_y, along_x = (np.gradient(part, spacing, axis=k) for k, part in enumerate(displacement))
-    means = block_means(along_y + along_x, max(1, min(along_y.shape) // tiles))
-    at_edge = np.concatenate([means[0], means[-1], means[1:-1, 0], means[1:-1, -1]])
-    low, high = np.quantile(at_edge, [0.25, 0.75])
+    rows, width = along_y + along_x, max(1, round(depth * min(along_y.shape)))
+    ends = slice(width), slice(-width, None)
+    lines = [plane[end].mean(axis=0) for plane in (rows, rows.T) for end in ends]
+    means = [part.mean() for part in np.array_split(np.concatenate(lines), count)]
+    low, high = np.quantile(means, [0.25, 0.75])
     return float(max(low, 0.0) + min(high, 0.0))
 
 
