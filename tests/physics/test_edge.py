@@ -35,6 +35,10 @@ def test_nothing_beyond_the_edge_moves_a_field_that_ends_inside():
     assert rms(changes_of(potential)[:, 1:].sum(axis=0)) < 1e-4 * rms(slopes(potential))
 
 
+def test_the_smallest_images_have_changes():
+    assert np.isfinite(changes_of(np.outer(np.arange(4.0), np.arange(4.0)))).all()
+
+
 def test_changes_have_no_sources_inside_but_an_even_one_of_another_exposure():
     for change in changes_of(blob(40, 3) - blob(5, 20, 6.0)):
         around = sum(np.roll(change[0], step, axis) for step in (1, -1) for axis in (0, 1))

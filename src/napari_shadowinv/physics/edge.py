@@ -84,7 +84,8 @@ def _divergence_at_edge(
     rows, width = along_y + along_x, max(1, round(depth * min(along_y.shape)))
     ends = slice(width), slice(-width, None)
     lines = [plane[end].mean(axis=0) for plane in (rows, rows.T) for end in ends]
-    means = [part.mean() for part in np.array_split(np.concatenate(lines), count)]
+    along = np.concatenate(lines)
+    means = [part.mean() for part in np.array_split(along, min(count, along.size))]
     low, high = np.quantile(means, [0.25, 0.75])
     return float(max(low, 0.0) + min(high, 0.0))
 
