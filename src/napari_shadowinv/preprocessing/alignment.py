@@ -34,11 +34,12 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.options import DEFAULT_REGISTRATION, REFERENCE_BEAM, BeamPrior, Instrument
 from napari_shadowinv.preprocessing.image_checks import border_ring
 
-_SIDE_PX = 512  # of the planes that are compared
+_SIDE_PX, _COARSE_SIDE_PX = 384, 128  # of the planes that are compared
 _CELLS = 24  # along the longer side
 _DEPTHS = 1, 2, 4  # cells, of the borders
 _AGREEING_ERRORS = 1.5  # of the shift by a border, for a deeper one to count
-_DIFFERENCES = 1.0, 2.5, 6.0, 16.0  # of the beams, over the expected one
+# Of the beams over the expected one, and of structure of a quarter of its length.
+_DIFFERENCES = (1.0, 0.0), (1.0, 2.0), (1.0, 8.0), (4.0, 0.0), (4.0, 8.0)
 _LEAST_NOISE = 1e-5  # of a cell
 _LEAST_LIGHT = 0.05  # of the mean
 _FINE_PX, _COARSE_PX = 1.0, 4.0
@@ -49,7 +50,6 @@ _UNKNOWN_PX = 1e3
 # misfit over that without it, which is half and more for beams that merely differ.
 _COARSE_BLUR, _MIN_OVERLAP, _COARSE_MISFIT = 0.03, 0.5, 0.4
 _MAX_STEPS, _LONGEST_STEP_PX = 12, 3.0
-_MAX_ERROR_PX = 0.5  # of a shift by which a source is moved
 _SIGNIFICANT_ERRORS = 4.0
 _MIN_SHIFT_PX = 0.05  # interpolation would change more than it mends
 
@@ -64,7 +64,7 @@ class Shift(NamedTuple):
     def is_significant(self) -> BoolArray:
         """Whether it is above four times its error and 0.05 px, along each axis."""
         limits = np.maximum(_SIGNIFICANT_ERRORS * self.error, _MIN_SHIFT_PX)
-        return (self.error <= _MAX_ERROR_PX) & (np.abs(self.value) > limits)
+        return np.abs(self.value) > limits
 
     @property
     def significant(self) -> FloatArray:
@@ -195,12 +195,17 @@ def measure_shift(
 
 
 def _coarse_shift(shot: FloatArray, source: FloatArray, usable: BoolArray) -> FloatArray:
-    """Return the whole pixels by which borders correlate best; 0 if they fit no better then."""
+    """Return the shift at which borders correlate best, in coarse pixels; 0 if none fits better."""
     from skimage.registration import phase_cross_correlation
 
-    blur = _COARSE_BLUR * max(shot.shape)
-    shot, source = (ndimage.gaussian_filter(plane, blur) for plane in (shot, source))
-    border = usable & border_ring(shot.shape)
+    block = -(-max(shot.shape) // _COARSE_SIDE_PX)
+    border = complete_block_means(usable, block) > 1 - 1e-9
+    border &= border_ring(border.shape)
+    blur = _COARSE_BLUR * max(border.shape)
+    shot, source = (
+        ndimage.gaussian_filter(complete_block_means(plane, block), blur)
+        for plane in (shot, source)
+    )
     if not (np.ptp(shot[border]) > 0 and np.ptp(source[border]) > 0):
         return np.zeros(2)
     correlate: Callable[..., tuple[FloatArray, float, float]] = phase_cross_correlation
@@ -215,7 +220,8 @@ def _coarse_shift(shot: FloatArray, source: FloatArray, usable: BoolArray) -> Fl
         return float(np.median(np.abs(difference)))
 
     shift = np.asarray(found, dtype=np.float64)
-    return shift if misfit(shift) < _COARSE_MISFIT * misfit(np.zeros(2)) else np.zeros(2)
+    fits = misfit(shift) < _COARSE_MISFIT * misfit(np.zeros(2))
+    return block * shift if fits else np.zeros(2)
 
 
 Step = tuple[FloatArray, FloatArray]
@@ -271,26 +277,24 @@ def _likeliest_shift(
     """Return the shift, by generalised least squares with the likeliest difference of beams."""
     of_source, of_shot = (np.stack([np.ones_like(ratio), *both], axis=1) for both in patterns)
     squares = ((places[:, None] - places) ** 2).sum(axis=2)
+    long, short = (np.exp(-squares / (2 * length**2)) for length in (beam.length, beam.length / 4))
+    columns = np.column_stack([of_source, of_shot, ratio])
     best, likeliest = _NO_STEP, -np.inf
-    for length in (beam.length, beam.length / 2):
-        correlation = np.exp(-squares / (2 * length**2))
-        for factor in _DIFFERENCES:
-            covariance = (factor * beam.rms) ** 2 * correlation + noise * np.eye(len(ratio))
-            root = linalg.cholesky(covariance, lower=True, check_finite=False)
-            columns = np.column_stack([of_source, of_shot, ratio])
-            white = linalg.solve_triangular(root, columns, lower=True, check_finite=False)
-            source, shot, values = white[:, :3], white[:, 3:6], white[:, 6]
-            normal = source.T @ shot
-            if not np.linalg.cond(normal) < 1e12:
-                continue
-            inverse = np.linalg.inv(normal)
-            answer = inverse @ (source.T @ values)
-            misfit = float(((values - shot @ answer) ** 2).sum())
-            evidence = -misfit / 2 - float(np.log(np.diag(root)).sum())
-            if evidence > likeliest:
-                likeliest = evidence
-                spread = inverse @ (source.T @ source) @ inverse.T
-                best = answer[1:], spread[1:, 1:] * max(1.0, misfit / len(ratio))
+    for of_beam, of_rest in _DIFFERENCES:
+        structure = of_beam**2 * long + of_rest**2 * short
+        covariance = beam.rms**2 * structure + noise * np.eye(len(ratio))
+        root = linalg.cholesky(covariance, lower=True, check_finite=False)
+        white = linalg.solve_triangular(root, columns, lower=True, check_finite=False)
+        source, shot, values = white[:, :3], white[:, 3:6], white[:, 6]
+        normal, square = source.T @ shot, source.T @ source
+        if not (np.linalg.cond(normal) < 1e12 and np.linalg.cond(square) < 1e12):
+            continue
+        misfit = float(((values - source @ np.linalg.solve(square, source.T @ values)) ** 2).sum())
+        evidence = -misfit / 2 - float(np.log(np.diag(root)).sum())
+        if evidence > likeliest:
+            likeliest, inverse = evidence, np.linalg.inv(normal)
+            spread = inverse @ square @ inverse.T * max(1.0, misfit / len(ratio))
+            best = (inverse @ (source.T @ values))[1:], spread[1:, 1:]
     return best
 
 
