@@ -661,12 +661,14 @@ def test_each_estimate_of_a_source_is_a_beam_that_nobody_measured(method, tmp_pa
     if method == "kriged":
         assert shot.beam_basis == of_stack["beam_basis"] == "outside"
         return
-    variation = (shot.beam_basis, shot.beam_variation, shot.beam_scale)
-    assert (
-        variation == ("assumed", ASSUMED_BEAM.rms, ASSUMED_BEAM.length) == ("assumed", 0.05, 0.25)
-    )
-    assert shot.parts["beam assumed, 5 %"].rms > shot.noise.rms
-    assert (of_stack["beam_basis"], of_stack["beam_variation"]) == ("assumed", 0.05)
+    assert (shot.beam_basis, shot.beam_scale) == ("assumed", ASSUMED_BEAM.length)
+    # An estimate from the image leaves a part of an uneven beam.
+    is_whole = method in ("uniform", "isotropic")
+    assert (shot.beam_variation == ASSUMED_BEAM.rms == 0.05) == is_whole
+    assert 0.005 < shot.beam_variation < 0.06
+    assert shot.beam.rms > shot.noise.rms
+    assert of_stack["beam_basis"] == "assumed"
+    assert of_stack["beam_variation"] == pytest.approx(shot.beam_variation, rel=1e-6)
 
 
 def test_an_estimate_passed_as_an_array_is_declared(image):

@@ -69,6 +69,7 @@ _BEAM_BASES = {  # name of the part, and its basis in a text
     "stated": ("beam stated, {}", "stated"),
     "seen": ("image and source differ by {}", "seen outside the object"),
     "references": ("beam by its references, {}", "by its references"),
+    "filtered": ("filters, {} taken from the object", "taken from the object"),
     "outside": ("beam measured outside the object, {}", "measured outside the object"),
 }
 
@@ -203,7 +204,8 @@ class Errors:
         return f"{self._title(name)} {_share_text(error.rms, self.rms)}"
 
     def _title(self, name: str) -> str:
-        return "beam" if name == self._beam_name else name.partition(",")[0]
+        is_filtered = self.beam_basis == "filtered"
+        return "beam" if name == self._beam_name and not is_filtered else name.partition(",")[0]
 
     @property
     def share(self) -> float:
@@ -230,7 +232,7 @@ class Errors:
         share = _share_text(self.parts[name].rms, self.rms)
         if name == self._beam_name:
             size = f"{percent(self.beam_variation)} rms over {self._beam_length}"
-            return f"beam {share} ({size}, {_BEAM_BASES[self.beam_basis][1]})"
+            return f"{self._title(name)} {share} ({size}, {_BEAM_BASES[self.beam_basis][1]})"
         title, _, size = name.partition(", ")
         return f"{title} {share} ({size})" if size else f"{title} {share}"
 
@@ -299,7 +301,7 @@ class Errors:
             return f"{shots:,} shots averaged", shots**-0.5
         if title in _REMEDIES:
             return _REMEDIES[title], factor
-        is_beam = name == self._beam_name and self.beam_variation
+        is_beam = title == "beam" and self.beam_variation
         if not is_beam and name not in self.sizes:
             return f"{factor:.1g} times the {title} error", factor
         size = self.beam_variation if is_beam else self.sizes[name]
@@ -584,8 +586,10 @@ class Budget:
         """Relative difference of beam and source, and its origin."""
         observed = self.beam_difference
         if (components := self._beam.components) is not None:
-            # Their r.m.s. was measured, so that a larger difference may be chance.
-            is_within = observed < _MAX_BEAM_DEVIATIONS * self._beam.rms
+            # Where their r.m.s. was measured, a larger difference may be chance.
+            is_measured = components.basis in ("references", "outside")
+            most = _MAX_BEAM_DEVIATIONS if is_measured else 1.0
+            is_within = observed <= most * self._beam.rms
             return (self._beam.rms, components.basis) if is_within else (observed, "seen")
         if observed > self._beam.rms:
             return observed, "seen"

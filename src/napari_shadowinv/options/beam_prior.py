@@ -50,7 +50,9 @@ class BeamComponents:
     rest : float
         Relative r.m.s. of the variation that the shapes leave; it has the length of the prior.
     basis : str
-        Origin: 'references', or 'outside' for an image outside its object.
+        Origin: 'references'; 'outside' for an image outside its object; 'assumed' or 'stated' for
+        what filters and a source estimate leave; 'filtered' for what they take from an object in an
+        exact beam.
     mean : ndarray, shape (H, W), optional
         The mean beam, whose mean is 1.
     """
@@ -59,7 +61,7 @@ class BeamComponents:
     block: int
     shape: tuple[int, int]
     rest: float
-    basis: Literal["references", "outside"]
+    basis: Literal["references", "outside", "assumed", "stated", "filtered"]
     mean: FloatArray | None = None
 
     def check_shape(self, shape: tuple[int, ...]) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -39,6 +40,7 @@ from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.io.files import join_address, sha256, split_address, text_of
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import deflection_warnings, setup_warnings
+from napari_shadowinv.pipeline.remaining_beam import after_steps
 from napari_shadowinv.preprocessing import (
     Estimate,
     MeasuredSource,
@@ -49,7 +51,7 @@ from napari_shadowinv.preprocessing import (
     uniform_warnings,
     with_prior_of,
 )
-from napari_shadowinv.preprocessing.estimates import centre_within
+from napari_shadowinv.preprocessing.estimates import IsotropicEstimate, centre_within
 from napari_shadowinv.provenance import ImageOrigin, MaskOrigin, Origin, Provenance, index_masks
 from napari_shadowinv.transport.sites import SitePlan
 
@@ -322,6 +324,16 @@ def run_prepared(
     instrument, estimate = inputs.recipe.instrument, inputs.recipe.estimate
     if estimate is not None:
         instrument = with_prior_of(estimate, shot, instrument, should_stop)
+    flattens = any(step.flattens for step in inputs.recipe.steps)
+    is_fitted = not isinstance(estimate, UniformEstimate | IsotropicEstimate | None)
+    is_fitted &= instrument.beam_rms is None  # else the number is that of the estimate
+    has_prior = instrument.beam_of(measured=False).components is not None
+    if (flattens or is_fitted) and not (has_prior or preview):
+        source_of = partial(_remaining_source, inputs, should_stop=should_stop)
+        with suppress(InputError):  # an estimate may refuse a changed image
+            instrument = after_steps(
+                instrument, inputs.recipe, inputs.shot, source_of, measured=estimate is None
+            )
     report("prepare", 0, None)
     prepare(shot.image, source, options, shot.mask)
     seconds["source"] = time.perf_counter() - clock
@@ -382,6 +394,19 @@ def _source(
     report("source", 0, None, estimate.title)
     cached = partial(cache.source, estimate, most_pixels=PREVIEW_PIXELS if preview else None)
     return estimate_source(estimate, shot, report.should_stop, doubts.append, by=cached)
+
+
+def _remaining_source(
+    inputs: Inputs, shot: Radiograph, should_stop: ShouldStop | None
+) -> FloatArray:
+    """Return the source of a shot with another beam, quickly; flat if its error is stated."""
+    estimate = inputs.recipe.estimate
+    if estimate is None or inputs.recipe.instrument.beam_rms is not None:
+        return np.ones(shot.shape)
+    recorded = inputs.shot.shape
+    estimate = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))
+    by = partial(quick_source, estimate, most_pixels=PREVIEW_PIXELS)
+    return estimate_source(estimate, shot, should_stop, lambda caution: None, by=by)
 
 
 def collect_inputs(

@@ -1,0 +1,142 @@
+"""What steps and an estimated source leave of an uneven beam, and take from the object.
+
+- an instrument that knows it: `after_steps`
+
+A high-pass filter, a divided background or a polynomial source removes a part of an uneven beam.
+What is left, as random beams show that go through the same steps, is the beam's error. The object
+has structure of the same scales, which is lost with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from napari_shadowinv._system.arrays import block_means
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument
+from napari_shadowinv.preprocessing import Radiograph, Recipe
+
+_BEAMS = 4
+_BLOCKS = 64  # along the longer side
+_DIMMEST = 0.05  # of the mean, for a ratio
+
+
+def after_steps(
+    instrument: Instrument,
+    recipe: Recipe,
+    recorded: Radiograph,
+    source_of: Callable[[Radiograph], FloatArray],
+    *,
+    measured: bool = False,
+) -> Instrument:
+    """Return an instrument with the beam's error after a recipe's steps and source estimate.
+
+    Parameters
+    ----------
+    instrument : Instrument
+        With the beam before them, stated or assumed.
+    recipe : Recipe
+        Its steps are applied to the shot with other beams.
+    recorded : Radiograph
+        The shot before them.
+    source_of : callable
+        Estimates the source of a shot after them, shape (H, W).
+    measured : bool, default False
+        Whether the source was recorded.
+
+    Notes
+    -----
+    Structure r that they remove is the beam's or the object's. How much an object like this one
+    loses, L (r.m.s.), is seen where it is shifted; b is what they remove of the beam, as the prior
+    says, or as r shows if that is more. Then the object has lost r L² / (L² + b²), with a variance
+    of L² b² / (L² + b²). An exact beam has b = 0, so that r is the loss.
+    """
+    beam = instrument.beam_of(measured=measured)
+    flattening, moving = (
+        recipe.model_copy(
+            update={"steps": tuple(step for step in recipe.steps if step.flattens is flattens)}
+        )
+        for flattens in (True, False)
+    )
+
+    def flatten(shot: Radiograph, by: Recipe = recipe) -> FloatArray:
+        """Return the image after all steps over its source, with a mean of 1; 0 where masked."""
+        ready = by.prepare(shot)
+        ratio = ready.image / np.maximum(source_of(ready), 1e-300)
+        return _normalise(ratio, ready)
+
+    def move(shot: Radiograph) -> FloatArray:
+        ready = moving.prepare(shot)
+        return _normalise(ready.image, ready)
+
+    usual, raw = flatten(recorded), move(recorded)
+    left, removed = [], []
+    for unevenness in _random_beams(recorded.shape, beam) if beam.rms else ():
+        uneven = replace(recorded, image=recorded.image * (1 + unevenness))
+        left.append(_change(usual, flatten(uneven)))
+        removed.append(_change(raw, move(uneven)) - left[-1])
+    patterns = [pattern / np.sqrt(_BEAMS) for pattern in left]
+    if recorded.source_mask is None:  # else the estimate has not seen the object
+        taken = _change(raw, usual)
+        lost = []
+        for shift in ((1, 1), (1, -1)):
+            steps = [sign * side // 4 for sign, side in zip(shift, usual.shape, strict=True)]
+            shifted = np.roll(usual, steps, (0, 1))
+            lost.append(
+                _change(shifted, flatten(Radiograph(shifted, setup=recorded.setup), flattening))
+            )
+        of_object, of_beam = (float(np.mean(np.square(each or [0.0]))) for each in (lost, removed))
+        if beam.rms:
+            of_beam = max(of_beam, float((taken**2).mean()) - of_object)
+        share = of_object / max(of_object + of_beam, 1e-300) if of_beam else 1.0
+        patterns.append(share * taken)
+        patterns += [np.sqrt((1 - share) / len(lost)) * pattern for pattern in lost]
+    rms = float(np.sqrt(np.square(patterns).sum(axis=0).mean()))
+    height, width = usual.shape
+    basis: Literal["assumed", "stated", "filtered"] = "filtered"
+    if beam.rms:
+        basis = "assumed" if instrument.beam_rms is None else "stated"
+    components = BeamComponents(
+        np.array(patterns),
+        -(-max(height, width) // _BLOCKS),
+        (height, width),
+        rest=0.0,
+        basis=basis,
+    )
+    prior = BeamPrior(rms=min(rms, 0.99), length=beam.length).with_components(components)
+    return instrument.with_beam(prior)
+
+
+def _normalise(image: FloatArray, shot: Radiograph) -> FloatArray:
+    values = image if shot.mask is None else np.where(shot.mask, image, 0.0)
+    return np.asarray(values / values.mean())
+
+
+def _change(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Return the relative change from one image to another in blocks; its mean is 0."""
+    block = -(-max(first.shape) // _BLOCKS)
+    before, after = block_means(first, block), block_means(second, block)
+    is_lit = np.minimum(before, after) > _DIMMEST
+    ratio = np.where(is_lit, after, 1.0) / np.where(is_lit, before, 1.0)
+    return np.asarray(ratio / ratio.mean() - 1)
+
+
+def _random_beams(shape: tuple[int, int], beam: BeamPrior) -> list[FloatArray]:
+    """Return random smooth variations of a prior's length and r.m.s."""
+    rng, block = np.random.default_rng(0), -(-max(shape) // _BLOCKS)
+    width = beam.length * min(shape) / block / np.sqrt(2)
+    around = int(4 * width) + 1
+    places = (np.indices(shape) + 0.5) / block - 0.5 + around
+    size = [-(-side // block) + 2 * around for side in shape]
+    fields = []
+    for _ in range(_BEAMS):
+        smooth = gaussian_filter(rng.normal(size=size), width)
+        field = map_coordinates(smooth, places, order=1)
+        field -= field.mean()
+        fields.append(beam.rms * field / field.std())
+    return fields
