@@ -22,6 +22,7 @@ from napari_shadowinv import (
     plan_sites,
     synthetic_image,
 )
+from napari_shadowinv.facts import Verdict
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.budget import Budget, ErrorEstimate, discretisation_share
 from napari_shadowinv.inversion.imperfections import motions
@@ -750,3 +751,23 @@ def test_a_reference_of_another_exposure_is_assumed_uneven_and_a_given_uniform_o
     assert "assumed" in recorded.rows()[0][1]
     assert invert(image, source=reference, instrument={"beam_rms": 0}).errors.beam is None
     assert invert(image, source=np.full((40, 40), 400.0)).errors.beam is None
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("is_masked", [True, False])
+def test_behind_an_obstacle_is_in_no_total_and_its_edge_in_the_peak(seed, is_masked):
+    setup = phantoms.paper_setup()
+    phantom, behind = phantoms.coaxial_line((200, 200), setup)
+    source = np.where(behind, 0.0, 400.0)
+    expected = synthetic_image(phantom.displacement, source)
+    mask = (source > 0) | (expected > 0) if is_masked else None
+    image = np.random.default_rng(seed).poisson(expected).astype(float)
+    inversion = invert(image, source=source, mask=mask)
+    np.testing.assert_array_equal(inversion.lit, inversion.mask & ~behind)
+    truth, found = (np.hypot(*d) for d in (phantom.displacement, inversion.displacement))
+    away = np.hypot(*(inversion.displacement - phantom.displacement))[inversion.lit]
+    true_share = np.sqrt((away**2).mean() / (truth[inversion.lit] ** 2).mean())
+    assert 0.5 < inversion.errors.share / true_share < 2
+    at_peak = abs(found[inversion.lit].max() / truth[~behind].max() - 1)
+    assert 0.5 < inversion.errors.of_peak.share / at_peak < 2
+    assert inversion.verdict is Verdict.DETERMINED

@@ -105,7 +105,11 @@ def _toroid_of(peak: float) -> phantoms.Phantom:
 def _proton_shot(name: str, phantom: phantoms.Phantom, beam: FloatArray | None = None) -> LayerData:
     source = _COUNTS * (np.ones(_SHAPE) if beam is None else beam)
     image = _counts_image(phantom.displacement, source, seed=1)
-    return radiograph_layers(Radiograph(image, setup=phantoms.paper_setup(), source=source), name)
+    # Pixels that no ray can reach, behind an obstacle, are dark in both.
+    lit = (source > 0) | (synthetic_image(phantom.displacement, source) > 0)
+    mask = None if lit.all() else lit
+    shot = Radiograph(image, setup=phantoms.paper_setup(), source=source, mask=mask)
+    return radiograph_layers(shot, name)
 
 
 def _counts_image(displacement: FloatArray, source: FloatArray, seed: int) -> FloatArray:

@@ -51,6 +51,7 @@ from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, s
 # Steps of the read-out: up to the first number the potential, then the re-projection.
 _READ_STEPS = 30
 _STEPS = 100
+_DARK = 0.05  # of the mean of a source, behind an obstacle
 
 # Of the re-projection, along one axis. For sites 2 px apart, 16 rays per pixel differ from 144 by
 # 0.01 to 0.06 % of the mean (r.m.s.), a fiftieth of the residual that so few sites leave.
@@ -257,6 +258,7 @@ def invert(
             image, source, mask = unpack_shot(image, source, mask)
             measured = measured and source is not None
         mask, unlit = mask_unlit(image, source if measured else None, mask)
+        is_dark = _dark_in_source(source if measured else None, mask)
         if unlit and plan is not None:
             plan, start = _plan(plan.source, options, mask, plan.measured), None
         prepared = prepare(image, source, options, mask)
@@ -338,7 +340,7 @@ def invert(
             break
         wait_for_errors()  # they use the budget that the next solution changes
         coarse = len(answer.weights)
-    quality = _make_report(units, noise(), solutions, fields, seconds, budget)
+    quality = _make_report(units, noise(), solutions, fields, seconds, budget, is_dark)
     with measure_time("errors", seconds):
         errors = wait_for_errors()
     finest = adaptive and len(answer.weights) == levels.counts[-1]
@@ -346,7 +348,9 @@ def invert(
     if errors is not None:
         by_errors = [errors.beam_caution(), errors.edge_caution(options.max_error)]
     by_accuracy: list[Caution | None] = []
-    if finest and errors is not None and quality.warnings == prepared.warnings:
+    is_asked = "accuracy" in options.model_fields_set
+    is_asked |= errors is not None and errors.share > options.max_error
+    if finest and is_asked and errors is not None and quality.warnings == prepared.warnings:
         why = "with the most sites placed unless more are given"
         by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
     with measure_time("prepare", seconds):
@@ -377,6 +381,14 @@ def invert(
         options=options,
         instrument=instrument,
     )
+
+
+def _dark_in_source(source: ArrayLike | None, mask: BoolArray | None) -> BoolArray | bool:
+    """Return the masked pixels where a recorded source is dark; False if there are none."""
+    if source is None or mask is None:
+        return False
+    beam = np.asarray(source, dtype=np.float64)
+    return np.asarray(~mask & (beam < _DARK * beam[mask].mean()))
 
 
 _checked_sources: WeakKeyDictionary[SitePlan, CheckedImage] = WeakKeyDictionary()
@@ -547,6 +559,7 @@ def _make_report(
     fields: _Fields,
     seconds: dict[str, float],
     budget: Budget,
+    is_dark: BoolArray | bool,
 ) -> Report:
     finest, options = solutions[-1], budget.options
     text = (
@@ -563,6 +576,7 @@ def _make_report(
             fields.jacobian,
             len(finest.weights),
             options,
+            is_dark=is_dark,
         )
     return Report(
         converged=finest.converged,

@@ -19,7 +19,13 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import (
+    binary_dilation,
+    gaussian_filter,
+    map_coordinates,
+    maximum_filter,
+    minimum_filter,
+)
 from scipy.spatial import KDTree
 
 from napari_shadowinv._system.arrays import block_means
@@ -494,12 +500,19 @@ class Budget:
         solved = _usable_levels(solutions)
         mask = self._prepared.mask
         variation, basis = self._beam_variation
-        length = np.where(mask, np.hypot(*displacement), 0.0)
+        lit = self._prepared.lit(self.options)
+        length = np.where(lit, np.hypot(*displacement), 0.0)
         row, column = np.unravel_index(length.argmax(), length.shape)
         peak = np.array([row, column], dtype=np.float64)
         along = displacement[:, row, column] / max(length[row, column], 1e-300)
         response = self._response(solved)
         self._look_ahead()
+        # No ray starts behind an obstacle: the field there is in no total.
+        places = (
+            np.clip(np.rint(p), 0, n - 1) for p, n in zip(response.places.T, lit.shape, strict=True)
+        )
+        shares = response.shares * lit[tuple(place.astype(np.int64) for place in places)]
+        shares /= shares.sum()
         near = _near(peak, response.places, response.spacing)
         close = np.flatnonzero(near)
         nothing_finer = np.zeros(len(near))
@@ -508,7 +521,7 @@ class Budget:
             squares = _with_finer(_mean_square(moves), finer)
             at_peak = ((moves[close] @ along) ** 2).mean(axis=1)
             at_peak = _with_finer(at_peak, finer[close] / 2)
-            return _roots((squares * response.shares).sum(), (at_peak * near[close]).sum())
+            return _roots((squares * shares).sum(), (at_peak * near[close]).sum())
 
         discretisation = ErrorEstimate(math.nan, math.nan)
         if len(solved) > 1:
@@ -516,7 +529,7 @@ class Budget:
             spacing = max(solved[-2].level.spacing, _stride(mask.shape))
             weights = _near(peak, self._places.T, spacing)
             discretisation = _roots(squares.mean(), (squares * weights).sum() / 2)
-        lengths = ErrorEstimate(float(np.sqrt(np.mean(length[mask] ** 2))), float(length.max()))
+        lengths = ErrorEstimate(float(np.sqrt(np.mean(length[lit] ** 2))), float(length.max()))
         shot = SolvedShot(self._prepared.in_units(), displacement, response, self.options.seed)
         effects: dict[str, ErrorEstimate] = {}
         sensitivities: dict[str, ErrorEstimate] = {}
@@ -535,6 +548,11 @@ class Budget:
         ends = np.cumsum([len(pattern) for *_, pattern in tests])
         for (errors, name, _), part in zip(tests, np.split(moves, ends[:-1], axis=1), strict=True):
             errors[name] = estimate(part)
+        if not lit.all():
+            beside = _beside_dark(length, lit, solved[-1].level.spacing)
+            effects["edges of dark areas"] = ErrorEstimate(
+                float(np.sqrt(np.mean(beside[lit] ** 2))), float(beside[row, column])
+            )
         if share := self.instrument.other_field:
             name = f"other field, {percent(share)}"
             effects[name], sizes[name] = lengths.times(share), share
@@ -753,6 +771,19 @@ A function takes the response, of n cells, the solution of the finest level and 
 returns k independent samples of the error, shape (k, n), or None if the options exclude it. Each
 sample sums to about 0: the total flux of the image is scaled to that of the source.
 """
+
+
+def _beside_dark(length: FloatArray, lit: BoolArray, spacing: float) -> FloatArray:
+    """Return the error of a field beside pixels from which no ray starts, (H, W), px.
+
+    Sites there lie on both sides of the edge, so that the field is that of a place up to their
+    spacing away: half of its range over as far.
+    """
+    reach = max(round(spacing), 1)
+    square = np.ones((2 * reach + 1, 2 * reach + 1), bool)
+    highest = maximum_filter(np.where(lit, length, -np.inf), footprint=square)
+    lowest = minimum_filter(np.where(lit, length, np.inf), footprint=square)
+    return np.where(binary_dilation(~lit, square) & lit, (highest - lowest) / 2, 0.0)
 
 
 def _mean_square(moves: FloatArray) -> FloatArray:

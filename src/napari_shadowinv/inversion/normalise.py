@@ -51,6 +51,10 @@ class Prepared:
     flux_scale: float  # divisor of the image
     warnings: tuple[Caution, ...]
 
+    def lit(self, options: InversionOptions) -> BoolArray:
+        """Return the used pixels from which rays start: not those behind an obstacle."""
+        return lit_pixels(self.source, self.mask, options)
+
     def in_units(self) -> Prepared:
         """Return the same with image and source also in units of `unit`."""
         return replace(self, image=self.image / self.unit, source=self.source / self.unit)
@@ -104,6 +108,7 @@ def prepare(
     floored_flux = masked_source(beam, usable, options).sum() if conserved else None
     floored = _raise_to_floor(values, least, floored_flux)
     below = int(np.count_nonzero(usable & (values < least)))
+    shadows = int(np.count_nonzero(usable & ~lit_pixels(beam, usable, options)))
     unit = power_of_two(beam)
     floored /= unit
     return Prepared(
@@ -115,7 +120,9 @@ def prepare(
         clipped_pixels=negative,
         floored_pixels=below,
         flux_scale=flux_scale,
-        warnings=_warnings(ratio if conserved else 1.0, negative, below, usable, options),
+        warnings=_warnings(
+            ratio if conserved else 1.0, negative, max(below - shadows, 0), usable, options
+        ),
     )
 
 
@@ -145,6 +152,11 @@ def mask_unlit(
         cautions += gaps
     lit, dark = mask_dark(values["image"], values.get("source"), lit)
     return lit, [*cautions, *dark]
+
+
+def lit_pixels(source: FloatArray, mask: BoolArray, options: InversionOptions) -> BoolArray:
+    """Return the used pixels of a source that is brighter than the floor."""
+    return np.asarray(mask & (source > options.floor * source[mask].mean()))
 
 
 def flooring_for(
@@ -229,7 +241,7 @@ def _warnings(
     if clipped > _NOTABLE_RAISED * size:
         text = f"negative pixels set to zero: {clipped} ({clipped / size:.2%})"
         cautions.append(Caution("negative-pixels", text))
-    dark = floored - clipped
+    dark = floored - clipped  # but for as many as the source has
     if dark > _NOTABLE_RAISED * size:
         text = (
             f"dark pixels raised to the floor: {dark} ({dark / size:.2%}); "

@@ -33,6 +33,7 @@ from napari_shadowinv.facts import (
     verdict_fact,
 )
 from napari_shadowinv.inversion.budget import Errors
+from napari_shadowinv.inversion.normalise import lit_pixels
 from napari_shadowinv.inversion.solution_checks import DECISIVE
 from napari_shadowinv.inversion.variables import (
     DISPLACEMENT_STD,
@@ -199,7 +200,7 @@ class Inversion(Summarised):
     pixel_errors: PixelErrors | None = None
 
     def _picture(self) -> FloatArray:
-        (field,) = shown_fields([self.displacement], self.setup, mask=self.mask)
+        (field,) = shown_fields([self.displacement], self.setup, mask=self.lit)
         return field.magnitude
 
     @property
@@ -239,6 +240,11 @@ class Inversion(Summarised):
     def cautions(self) -> tuple[Caution, ...]:
         """Reasons to doubt the result."""
         return self.report.warnings
+
+    @property
+    def lit(self) -> BoolArray:
+        """Used pixels from which rays start, (H, W): the field is that of these."""
+        return lit_pixels(self.source, self.mask, self.options)
 
     @property
     def structures(self) -> Structures | None:
@@ -304,7 +310,7 @@ class Inversion(Summarised):
         if errors.share <= max_error:
             return Assessment(Verdict.DETERMINED, f"{text}, the largest by {errors.limited_by}")
         if condition := errors.beam_condition(max_error):
-            (field,) = shown_fields([self.displacement], setup, mask=self.mask)
+            (field,) = shown_fields([self.displacement], setup, mask=self.lit)
             return Assessment(Verdict.CONDITIONAL, field.conditional_text(condition))
         parts = [f"{text}: {errors.largest_part}", errors.measure_next(max_error)]
         if errors.share > _MAX_LINEAR:
@@ -328,7 +334,7 @@ class Inversion(Summarised):
         """
         errors = self.errors_in(setup)
         error = None if errors is None else errors.of_peak
-        (field,) = shown_fields([self.displacement], setup, mask=self.mask)
+        (field,) = shown_fields([self.displacement], setup, mask=self.lit)
         assessment, cautions = self.assess_in(setup), self.report.warnings
         texts = [assessment.verdict.explain(assessment.reason)]
         texts += in_headline(each for each in cautions if each is not assessment.caution)
@@ -368,7 +374,7 @@ class Inversion(Summarised):
         return (
             verdict_fact(self.assess_in(setup).verdict),
             *caution_facts(report.warnings),
-            *peak_facts(self.displacement, setup, mask=self.mask, error=error_of_peak),
+            *peak_facts(self.displacement, setup, mask=self.lit, error=error_of_peak),
             Fact(
                 "image_residual",
                 "Image residual",

@@ -104,13 +104,18 @@ def find_cautions(
     jacobian: FloatArray,
     n_sites: int,
     options: InversionOptions,
+    *,
+    is_dark: BoolArray | bool = False,
 ) -> tuple[Caution, ...]:
-    """Return the reasons to doubt a converged solution; empty if there are none."""
+    """Return the reasons to doubt a converged solution; empty if there are none.
+
+    Masked pixels that `is_dark` in a recorded source hide no field: no ray starts there.
+    """
     misfit_at_end = begin(partial(_misfit, prepared, reprojection, n_sites), options.threads)
     square = np.einsum("cyx,cyx->yx", displacement, displacement)
     mask = prepared.mask
     rms = float(np.sqrt(square[mask].mean()))
-    folds, masked_peak = _deep_folds(jacobian, mask), _peak_at_mask(displacement, mask)
+    folds, masked_peak = _deep_folds(jacobian, mask), _peak_at_mask(displacement, mask | is_dark)
     misfit = misfit_at_end()
     # Where the finest structure is a pattern, it is no measure of noise.
     no_deflection = "" if misfit else _no_deflection(noise, rms)

@@ -90,7 +90,9 @@ def after_steps(
             lost.append(
                 _change(shifted, flatten(Radiograph(shifted, setup=recorded.setup), flattening))
             )
-        of_object, of_beam = (float(np.mean(np.square(each or [0.0]))) for each in (lost, removed))
+        of_object, of_beam = (
+            float(np.mean(np.square(each))) if each else 0.0 for each in (lost, removed)
+        )
         if beam.rms:
             of_beam = max(of_beam, float((taken**2).mean()) - of_object)
         share = of_object / max(of_object + of_beam, 1e-300) if of_beam else 1.0
