@@ -36,7 +36,8 @@ def edge_changes(
     boundary, is the mean of their squares.
 
     The third change is by flux that leaves on all sides, which looks like another exposure: along
-    the edge the image is then brighter or darker than its source.
+    the edge the image is then brighter or darker than its source. It is at most as large as the
+    field.
 
     Parameters
     ----------
@@ -69,8 +70,11 @@ def edge_changes(
     rows, columns = (2 - 2 * np.cos(np.pi * np.arange(1, n - 1) / (n - 1)) for n in held.shape)
     held[1:-1, 1:-1] = idstn(dstn(by_border, type=1) / (rows[:, None] + columns), type=1)
     leaving = _divergence_at_edge(displacement, spacing) * _even_source(held.shape, spacing)
-    changes = turned_back / np.sqrt(2), held / np.sqrt(2), leaving
-    return np.array([[each, *-np.array(np.gradient(each, spacing))] for each in changes])
+    planes = turned_back / np.sqrt(2), held / np.sqrt(2), leaving
+    changes = np.array([[each, *-np.array(np.gradient(each, spacing))] for each in planes])
+    largest = np.sqrt((displacement**2).sum() / max((changes[2, 1:] ** 2).sum(), 1e-300))
+    changes[2] *= min(1.0, float(largest))
+    return changes
 
 
 def _divergence_at_edge(
