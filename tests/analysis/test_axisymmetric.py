@@ -234,7 +234,10 @@ def test_band_of_a_cylinder_holds_it():
 
 
 def test_band_holds_what_a_closed_edge_takes_from_an_object():
-    """Its deflection is 3 % of the largest there; the error is long compared with the object."""
+    """Its deflection is 3 % of the largest there; the error is long compared with the object.
+
+    It leaves through two further edges, so that the band also holds what may lie beyond those.
+    """
     x, sigma = np.arange(100.0) - 49.5, 16.0
     moves = 3.0 * (x / sigma) * np.exp(0.5 - x**2 / (2 * sigma**2))
     displacement = np.stack([np.zeros((60, 100)), np.tile(moves, (60, 1))])
@@ -246,7 +249,7 @@ def test_band_holds_what_a_closed_edge_takes_from_an_object():
     error = (profile["profile"].value - exact)[5:35]
     deviation = profile["profile"].std[5:35]
     assert (error < 0).all()
-    assert ((0.5 * deviation < -error) & (-error < 1.3 * deviation)).all()
+    assert (-error < 1.3 * deviation).all()
 
 
 def codes(result) -> set[str]:
