@@ -26,7 +26,7 @@ _COUNTS = 400.0  # per pixel: 5 % noise
 _FILM_SHAPE = (96, 96)
 _FILMS = {14.7: 400.0, 3.0: 300.0}  # protons per pixel at each energy in MeV
 
-_RUN_SHAPE = (120, 320)
+_RUN_SHAPE = (160, 320)
 _RUN_LENGTH = 20
 
 
