@@ -72,7 +72,7 @@ def test_a_beam_that_nobody_measured_is_a_condition_unless_more_is_wrong(image):
     # What it says of an even beam is what an inversion with that beam says.
     stated = re.fullmatch(
         r"peak \|d\| ([\d.]+) ± ([\d.]+) px if the beam is even to ([\d.]+) %; ± ([\d.]+) "
-        r"\(field ([\d.]+) %\) if it is 5 % uneven \(assumed\). Record a reference.",
+        r"\(field ([\d.]+) %\) if it is 5 % uneven \(assumed\); record a reference",
         headline.text,
     )
     peak, if_even, even, if_uneven, share = map(float, stated.groups())

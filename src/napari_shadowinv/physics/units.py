@@ -140,11 +140,11 @@ class ShownField:
         if condition.recorded:
             return (
                 f"{peak} if beam and reference agree to {even}; {otherwise} if they differ by "
-                f"{uneven} (assumed). Compare two references."
+                f"{uneven} (assumed); compare two references"
             )
         return (
             f"{peak} if the beam is even to {even}; {otherwise} if it is {uneven} uneven "
-            "(assumed). Record a reference."
+            "(assumed); record a reference"
         )
 
     def peak_text(self, error: PeakError | None = None) -> str:
