@@ -164,7 +164,8 @@ _BLOCK_PX, _MAX_BLOCKS = 4, 2000
 _CALM_SHARE, _LESS_CALM_SHARE = 0.15, 0.5  # of the blocks
 _DARK = 0.2  # of the mean brightness
 _MIN_PIXELS = 40
-_MIN_RISE, _RISE_DEVIATIONS = 1.2, 20.0  # of V(2) over V(1): least, and in 1/√(pixels)
+_FLAT = slice(1, 4)  # lags at which white noise has V(1)
+_MIN_RISE, _RISE_DEVIATIONS = 1.2, 20.0  # of V over V(1): least, and in 1/√(pixels)
 _WIDTHS_PX = np.geomspace(0.3, 4.0, 24)
 _FIT_PX = 6  # lags up to which differences are compared with those of a blur
 _SCATTER = 0.25  # of V
@@ -173,7 +174,7 @@ _MAX_STATED = 2.5  # variance, over the measured one
 _MAX_WHITE = 1.0  # variance before the blur: of one quantum a pixel
 _CLIP_DEVIATIONS, _CLIPPED_VARIANCE = 2.5, 0.973
 _MIN_DEVIATION = 1e-4  # of the brightness; below are the smooth flanks of noiseless images
-_MIN_FAR_RISE, _MAX_FAR_UNEVENNESS = 1.4, 1.5
+_MIN_FAR_RISE, _MAX_FAR_UNEVENNESS = 1.8, 1.5
 
 # White noise on pixels has waves up to 3.51 rad/px, averaged over directions of its logarithm;
 # a Gaussian blur of standard deviation b ends them at exp(-γ/2) / b.
@@ -354,7 +355,7 @@ def measure_correlation(
     widths = _WIDTHS_PX if width is None else np.array([width])
     if width is None:
         least = max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(differences.count(_CALM_SHARE)))
-        if variances[1] < least * white:
+        if variances[_FLAT].max() < least * white:
             return CorrelatedNoise(white, is_far=differences.rise_evenly())
     elif 4 * math.pi * width**2 <= 1:
         return CorrelatedNoise(white)
@@ -398,9 +399,9 @@ class _CalmDifferences:
         if not used.any():
             return cls(excess, brightness, mask, np.zeros((0, 2), np.int64))
         mean = level[used].mean()
-        means = np.where(used, complete_block_means(excess, _BLOCK_PX), 0.0)
         smooth, level = (
-            ndimage.gaussian_filter(values, 1.0, mode="nearest") for values in (means, level)
+            ndimage.gaussian_filter(np.where(used, values, fill), 1.0, mode="nearest")
+            for values, fill in ((complete_block_means(excess, _BLOCK_PX), 0.0), (level, mean))
         )
         slopes = np.gradient(smooth) if min(smooth.shape) > 1 else [smooth]
         slope = np.hypot(*slopes) if len(slopes) > 1 else slopes[0]
