@@ -193,8 +193,8 @@ def test_images_at_nearly_one_energy_are_one_image(second: float, single: bool) 
 
 
 def test_images_are_in_units_of_their_beams() -> None:
-    source = np.random.default_rng(1).uniform(3, 5, SIZE)
-    data = given(source=source, brightness=[1, 2], noise=[0.1, 0.3])
+    source = np.add.outer(np.linspace(3, 4, SIZE[0]), np.linspace(0, 1, SIZE[1]))
+    data = given(source=source, brightness=[1, 2], noise=[0.1, 0.12])
     pad = data.scene.pad
     np.testing.assert_allclose(data.units, [source.mean(), 2 * source.mean()])
     for k, stack in enumerate(images()):
@@ -202,7 +202,7 @@ def test_images_are_in_units_of_their_beams() -> None:
         beam = data.scene.beams[k, pad : pad + 40, pad : pad + 51]
         np.testing.assert_allclose(beam * data.units[k], (1 + k) * source)
         noise = data.units[k] / np.sqrt(data.scene.weights[k, :40, :51])
-        np.testing.assert_allclose(noise, (0.1, 0.3)[k])
+        np.testing.assert_allclose(noise, (0.1, 0.12)[k])
 
 
 def test_without_a_source_the_beam_is_uniform_with_the_mean_of_each_image() -> None:

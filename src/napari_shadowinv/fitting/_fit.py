@@ -88,6 +88,7 @@ _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
 _DECIDES = 10.0  # in log evidence
 _MIN_BLUR_SCORE = 4.0  # standard deviations
+_NOISY_REFERENCE, _REFERENCE_BLUR_PX = 0.02, 1.5  # share of the variance; standard deviation
 _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
@@ -243,7 +244,14 @@ def fit(
         # A fit of one image absorbs too much of its noise for the counts to be tested.
         is_counted = data.counted and not data.single
         stated = data.instrument.noise_correlation
-        pattern = find_pattern(fine, unknowns, data.size, is_counted=is_counted, correlation=stated)
+        pattern = find_pattern(
+            fine,
+            unknowns,
+            data.size,
+            is_counted=is_counted,
+            correlation=stated,
+            noise=data.noise,
+        )
         if pattern.lacks_counts and openness.posterior is not None:
             posterior = openness.posterior.reporting(lambda: on_step("samples", value))
             absorbed = posterior.count_determined(np.random.default_rng(options.seed))
@@ -251,7 +259,13 @@ def fit(
             pattern = replace(pattern, missing_counts=share)
         # With several images the fit is repeated only if the residual asks for it.
         if data.single or pattern.blur_score > _MIN_BLUR_SCORE:
-            pattern = replace(pattern, blur_gain=gain_by_blur(scene, best, on_step))
+            sharp, smooth = scene, best
+            if data.reference_share > _NOISY_REFERENCE:
+                # A blur takes the noise of a reference away, too.
+                widths = 0, _REFERENCE_BLUR_PX, _REFERENCE_BLUR_PX
+                sharp = replace(scene, beams=gaussian_filter(scene.beams, widths))
+                smooth = settle_minimum(sharp, best, on_step, "point spread")
+            pattern = replace(pattern, blur_gain=gain_by_blur(sharp, smooth, on_step))
         if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
             cause = name_cause(scene, best, fields, data.setups, on_step)
             pattern = replace(pattern, cause=cause)
@@ -260,7 +274,9 @@ def fit(
         evidence = float("nan")
         if options.evidence:
             evidence = log_evidence(scene, best, fields, options, on_step)
-        amplification = noise_amplification(pattern.correlation)
+        # What the weights do not include of it.
+        least = float(np.sqrt(data.noise.expected_chi2.min()))
+        amplification = max(noise_amplification(pattern.correlation) * least, 1.0)
         potentials = None
         if errors is not None:
             potentials = sampled_potentials(
@@ -517,7 +533,9 @@ def reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
     unknowns = minimum.in_pixels(1)
     expected = scene.model(unknowns)
     units = data.units[:, None, None]
-    weights = units**2 / np.maximum(expected * units, 1.0)
+    references, factors = data.reference_noise, data.noise.factors
+    variances = np.maximum(expected * units, 1.0) + references[:, None, None] ** 2
+    weights = units**2 / (variances * factors[:, None, None])
     return replace(scene, weights=np.where(scene.weights > 0, weights, 0.0))
 
 
@@ -656,7 +674,7 @@ def _result(
         frames=unknowns.frames,
         reprojection=model,
         residual=np.where(used, images - model, 0.0),
-        chi2=scene.chi2(unknowns, counts),
+        chi2=data.noise.relative_chi2(scene.chi2(unknowns, counts)),
         basins=basins,
         folded=float((jacobian < 0).mean()),
         verdict=Verdict.UNCERTAIN,
@@ -675,5 +693,6 @@ def _result(
         beam_unknown=scene.beam_modes > 0,
         hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
         searched=data.near is None,
+        noise=data.noise,
     )
     return replace(unassessed, verdict=verdict, explanation=explanation)

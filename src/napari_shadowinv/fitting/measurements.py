@@ -40,7 +40,7 @@ from napari_shadowinv.fitting.shots import (
     value_of_first,
 )
 from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
-from napari_shadowinv.inversion.noise import finest_differences
+from napari_shadowinv.inversion.noise import finest_differences, measure_correlation
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
@@ -62,6 +62,8 @@ _BYTES_PER_PIXEL, _BYTES_PER_PIXEL_AND_IMAGE = 2000, 600  # measured peak
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
 _LARGEST_NOISE = 1e6  # of the beam, of the least noisy pixel
 _LEAST_COUNTS = 1.0
+_TOO_LARGE = 2.5  # times the variance that is measured
+_HIDDEN_TIMES = 9.0  # the same
 _SMOOTHED = 5  # px, over which images are averaged for the standard deviation of their noise
 _DARKEST = 1e-3  # of an image's mean
 _SAME = _ALIKE = 1e-6
@@ -103,6 +105,9 @@ class FitData:
     names: tuple[str, ...] | None  # if the images have any
     start: FloatArray | None  # potential in px² of the first field
     near: NearField | None  # the only start, if there is one
+    noise: NoiseMatch
+    reference_noise: FloatArray  # (L,), standard deviation of the beams' own, as recorded
+    reference_share: float  # of the variance of the noise, by that of the beams
 
     def noise_of(self, weights: FloatArray) -> FloatArray:
         """Return the standard deviation of each image's noise, or of each pixel's if it varies.
@@ -120,7 +125,7 @@ class FitData:
         height, width = self.size
         weights = weights[:, :height, :width]
         roots = np.sqrt(np.where(weights > 0, weights, np.nan))
-        noise = self.units[:, None, None] / roots
+        noise = (self.units * np.sqrt(self.noise.expected_chi2))[:, None, None] / roots
         least, largest = (limit(noise, axis=(1, 2)) for limit in (np.nanmin, np.nanmax))
         return noise if (least < largest).any() else np.asarray(least)
 
@@ -187,8 +192,23 @@ def collect_data(
     _refuse_what_is_given_twice(data, beams, used, matrix, names)
     unknown = isinstance(source, str)
     scaled = np.where(used, data / units[:, None, None], 0.0)
-    deviations = _deviations(noise, data, used) / units[:, None, None]
+    # Differences of image and beam contain the noise of both.
+    deviations = _deviations(noise, data - beams if noise is None else data, used)
+    references = np.array(list(map(estimated_noise, beams, used)))
+    if noise is not None:
+        deviations = np.hypot(deviations, references[:, None, None])
+    shares = np.median(references[:, None, None] / deviations, axis=(1, 2)) ** 2
+    deviations = deviations / units[:, None, None]
     _refuse_hopeless_noise(deviations, used, names)
+    match = match_noise(
+        deviations,
+        (data - beams) / units[:, None, None],
+        data / units[:, None, None],
+        used,
+        instrument.noise_correlation,
+        is_estimated=noise is None or (isinstance(noise, str) and noise == "proportional"),
+    )
+    deviations = deviations * np.sqrt(match.factors)[:, None, None]
     weights = np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0)
 
     free = options.boundary == "free"
@@ -261,6 +281,9 @@ def collect_data(
         names=names if any(shot.name for shot in shots) else None,
         start=_checked_start(near.potential if near else start, (height, width)),
         near=near,
+        noise=match,
+        reference_noise=references,
+        reference_share=float(shares.max()),
     )
 
 
@@ -329,6 +352,85 @@ def estimated_noise(image: FloatArray, used: BoolArray) -> float:
     """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
     all_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
     return float(NORMAL_MAD * np.median(finest_differences(image, all_used)))
+
+
+@dataclass(frozen=True)
+class NoiseMatch:
+    """Noise that is given or estimated, against that of the images' calm parts.
+
+    Weights are made for the power of the noise on long waves, where it bends fields: correlated
+    noise has more of it than white noise of the same pixels, smoothed counts less per pixel.
+
+    Attributes
+    ----------
+    factors : ndarray, shape (L,)
+        The variance that is used over that which is given or estimated from single pixels.
+    expected_chi2 : ndarray, shape (L,)
+        Variance of a pixel over the one that is used.
+    correlation : float
+        Standard deviation of the Gaussian that has blurred the noise, px; 0 for white noise.
+    is_estimated, is_hidden : bool
+        Whether the noise was estimated, and whether structure may hide much more than that.
+    """
+
+    factors: FloatArray
+    expected_chi2: FloatArray
+    correlation: float
+    is_estimated: bool
+    is_hidden: bool
+
+    def relative_chi2(self, chi2: FloatArray) -> FloatArray:
+        """Return χ² over the expected one; residuals below the stated noise are no misfit."""
+        relative = chi2 / self.expected_chi2
+        if self.is_estimated:
+            return relative
+        return np.maximum(self.factors * chi2, np.minimum(relative, 1.0))
+
+    @property
+    def stated_times(self) -> float:
+        """How many times the noise was stated too large; 1 if it was not."""
+        return float(np.sqrt(1 / self.factors.min(initial=1.0)))
+
+
+def match_noise(
+    deviations: FloatArray,
+    excess: FloatArray,
+    brightness: FloatArray,
+    used: BoolArray,
+    width: float | None,
+    *,
+    is_estimated: bool,
+) -> NoiseMatch:
+    """Compare the noise of images with its standard deviations, all in units of the beams.
+
+    Parameters
+    ----------
+    deviations, excess, brightness : ndarray, shape (L, H, W)
+        Standard deviations, images less beams, images.
+    used : ndarray of bool, shape (L, H, W)
+    width : float or None
+        Standard deviation of the blur that correlates the noise, px, if it is stated.
+    is_estimated : bool
+        Whether the standard deviations are those of differences between neighbouring pixels.
+    """
+    factors, expected = np.ones((2, len(excess)))
+    correlation, is_hidden = 0.0, False
+    for k, planes in enumerate(zip(excess, brightness, used, strict=True)):
+        noise = measure_correlation(*planes, width)
+        variance = float(np.median(deviations[k][used[k]] ** 2))
+        if noise.is_bound:
+            is_hidden |= is_estimated and noise.white_variance > _HIDDEN_TIMES * variance
+            continue
+        is_too_large = variance > _TOO_LARGE * noise.variance > 0
+        if noise.blurred and noise.white < variance / 2 and (is_estimated or not is_too_large):
+            factors[k] = noise.white_variance / variance
+        elif is_too_large:
+            factors[k] = min(noise.white_variance / variance, 1.0)
+        else:
+            continue
+        expected[k] = noise.variance / (factors[k] * variance)
+        correlation = max(correlation, noise.width)
+    return NoiseMatch(factors, expected, correlation, is_estimated, is_hidden)
 
 
 def _checked_images(images: ArrayLike) -> FloatArray:

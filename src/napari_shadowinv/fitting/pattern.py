@@ -26,7 +26,7 @@ from napari_shadowinv._system.progress import OnStep, run_in_parallel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import strengths_of
+from napari_shadowinv.fitting.measurements import NoiseMatch, strengths_of
 from napari_shadowinv.fitting.search import SMOOTHNESS_RATIO, Minimum, posterior_of, settle_minimum
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
@@ -235,11 +235,12 @@ def find_pattern(
     *,
     is_counted: bool = False,
     correlation: float | None = None,
+    noise: NoiseMatch | None = None,
 ) -> Pattern:
     """Test the residuals of all images, the first `size` pixels of the scene, for structure.
 
     Of images that `is_counted` calls counts, the noise is tested, too. Their `correlation` in px is
-    measured unless it is stated.
+    measured unless it is stated, in the residuals and before, as `noise`.
     """
     height, width = size
     counts = scene.ray_counts(unknowns)
@@ -248,11 +249,13 @@ def find_pattern(
     residuals = roots * (scene.images[:, :height, :width] - models)
     used = roots > 0
     if correlation is None:
-        correlation = max(map(correlation_length, residuals, used))
+        before = 0.0 if noise is None else noise.correlation
+        correlation = max(before, *map(correlation_length, residuals, used))
     strengths = [
         pattern_strength(residual, use, correlation)
         for residual, use in zip(residuals, used, strict=True)
     ]
+    chi2 = scene.chi2(unknowns, counts)
     missing, deviation = 0.0, np.inf
     if is_counted and not correlation:
         # The weight of a pixel is one over the variance of its counts in units of the beam.
@@ -260,7 +263,7 @@ def find_pattern(
     return Pattern(
         strengths=np.array(strengths),
         correlation=correlation,
-        chi2=float(scene.chi2(unknowns, counts).max()),
+        chi2=float((chi2 if noise is None else noise.relative_chi2(chi2)).max()),
         blur_score=blur_score(residuals, roots, models),
         missing_counts=missing,
         counts_deviation=deviation,

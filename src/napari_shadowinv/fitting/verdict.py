@@ -15,6 +15,7 @@ from scipy import ndimage
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Verdict, to_figures
 from napari_shadowinv.fitting.instrument import TITLES
+from napari_shadowinv.fitting.measurements import NoiseMatch
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
@@ -67,7 +68,7 @@ def hidden_contrast(contrast: FloatArray, used: BoolArray) -> float:
 _MEETING, _FEW = 0.2, 0.02  # Jacobian, and share of the object
 _OBJECT = 0.1  # of the largest displacement
 _MISFIT = 1.3  # χ²
-_HIDDEN = 0.4  # χ²; an estimated noise may be too large by a third
+_TOO_QUIET = 0.4  # χ²; an estimated noise may be too large by a third
 _AS_GOOD = 0.03  # of the objective
 _BLURRED = 10.0  # in the objective: that decides
 _OTHER_FIELD = 0.05  # of the displacement, r.m.s.
@@ -100,6 +101,7 @@ def assess_verdict(
     beam_unknown: bool,
     hidden: float,
     searched: bool = True,
+    noise: NoiseMatch | None = None,
 ) -> tuple[Verdict, str]:
     """Return the verdict on a fit, and a sentence that says why.
 
@@ -119,6 +121,8 @@ def assess_verdict(
         Contrast around the mask's holes as a share of the strongest; see `hidden_contrast`.
     searched : bool, default True
         Whether the fit has started from several fields.
+    noise : NoiseMatch, optional
+        The noise of the images against the one that is given or estimated.
     """
     report, chi2, used = fit.report, fit.chi2, fit.used
     total, parts = report.total, report.parts
@@ -136,12 +140,6 @@ def assess_verdict(
             causes = f"likely {pattern.cause}"
         return Verdict.MISFIT, (
             f"the forward model does not explain {worst}, where 1 is expected: {causes}"
-        )
-    if unsaid := _those(names, chi2, chi2 < _HIDDEN):
-        return Verdict.MISFIT, (
-            f"the noise is given too large: {unsaid}, where 1 is expected, so nothing "
-            "shows whether the forward model explains the images; give the noise as it is, or let "
-            "it be estimated"
         )
     if single and beam_unknown:
         return Verdict.AMBIGUOUS, (
@@ -211,6 +209,12 @@ def assess_verdict(
         return Verdict.UNCERTAIN, (
             f"{text}{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
         )
+    if single and noise is not None and noise.is_hidden:
+        return Verdict.UNCERTAIN, (
+            "the noise was not measured: structure fills the image, and noise that is correlated "
+            "over a few pixels looks like it; give the noise, and its correlation if the image was "
+            "smoothed or resampled"
+        )
     if not report.converged:
         return Verdict.UNCERTAIN, (
             "the search reached its maximum number of iterations before it ended: allow more"
@@ -236,6 +240,11 @@ def assess_verdict(
             f"; the noise is correlated over {pattern.correlation:.1f} px, which makes the error "
             f"bars {noise_amplification(pattern.correlation):.1f} times as large as for white noise"
         )
+    if quiet := _those(names, chi2, chi2 < _TOO_QUIET):
+        unchecked += f"; the noise is stated too large ({quiet}), and so are the error bars"
+    elif noise is not None and noise.stated_times > 1:
+        unchecked += f"; the noise was stated {noise.stated_times:.1f} times too large"
+        unchecked += ", so the measured one was used"
     several = "one image" if single else f"{len(chi2)} images"
     starts = "all starts lead to" if searched else "the given start leads to"
     unchecked += "" if searched else "; alternative solutions were not looked for"
