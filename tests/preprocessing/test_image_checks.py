@@ -423,3 +423,10 @@ def test_a_pair_of_negatives_is_seen_by_its_noise_and_by_its_rim(seed):
     dense = [np.exp(-plane / 1000) for plane in (image, source)]
     unexposed = [np.pad(plane, 8, constant_values=1.0) for plane in dense]
     assert "negative" in named(*unexposed)
+
+
+def test_a_source_without_noise_makes_no_negative():
+    rows, columns = np.indices(SHAPE) / SHAPE[0] - 0.5
+    source = 400 * (0.25 + np.exp(-4 * ((rows - 0.05) ** 2 + (columns + 0.08) ** 2) / 1.4))
+    image = np.random.default_rng(1).poisson(source).astype(float)
+    assert "negative" not in named(image, source)

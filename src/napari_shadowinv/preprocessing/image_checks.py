@@ -157,24 +157,25 @@ class CheckedImage:
         counts = np.array([len(part) for part in parts]) * _INDEPENDENT_SHARE
         return np.array([levels, noise, noise / np.sqrt(counts)])
 
-    @property
-    def has_falling_noise(self) -> bool:
-        """Whether the noise is weaker where the image is brighter, as in no positive.
+    @cached_property
+    def noise_slope(self) -> float:
+        """How the noise grows with the brightness, in standard deviations; 0 if not measured.
 
-        Noise of reading, of counting, and of an uneven response do not fall with the light.
+        Noise of reading, of counting, and of an uneven response do not fall with the light, but
+        that of a negative does.
         """
         if min(self.image.shape) < _WINDOW_PX or self.brightness.size < _MIN_PIXELS:
-            return False
+            return 0.0
         levels, noise, uncertainty = self.noise_bins
         if not ((noise > 0).all() and np.ptp(levels) > 0):
-            return False
+            return 0.0
         weights = 1 / (noise * uncertainty)
         levels = levels - np.average(levels, weights=weights**2)
         variances = noise**2 - np.average(noise**2, weights=weights**2)
         information = float(((levels * weights) ** 2).sum())
         slope = float((levels * variances * weights**2).sum()) / information
         misfit = float((((variances - slope * levels) * weights) ** 2).sum()) / (len(levels) - 2)
-        return slope * math.sqrt(information / max(misfit, 1.0)) < -_FALLING_DEVIATIONS
+        return slope * math.sqrt(information / max(misfit, 1.0))
 
     @cached_property
     def relative_differences(self) -> FloatArray:
@@ -401,7 +402,8 @@ def _sign_of_negative(image: CheckedImage, source: CheckedImage, pair: Reference
     """Return what shows that an image, or it and its source, is a negative; empty if nothing."""
     if pair.is_negative:
         return "the image is dark where it should be bright"
-    if source.has_falling_noise:
+    # A modelled or smoothed source has no noise, but bends, which are steepest beside its peak.
+    if source.noise_slope < -_FALLING_DEVIATIONS and image.noise_slope < 0:
         return "the source is noisier where it is darker"
     if is_lit_around(source.image) and is_lit_around(image.image):
         return "the rims of image and source are brighter than all the beam"
