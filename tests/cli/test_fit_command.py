@@ -132,7 +132,7 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
 
 def test_an_ambiguous_field_is_written_with_exit_code_3() -> None:
     arguments = ("fit", "a.tif", "--source", "unknown", "--samples", 0, "--max-iterations", 2)
-    result = shadowinv(*arguments, "--ambiguous", "--beam-modes", 3, "--quiet")
+    result = shadowinv(*arguments, "--ambiguous", "--quiet")
     assert result.exit_code == 3
     (line,) = result.stderr.splitlines()
     assert line.startswith("ONE IMAGE CANNOT TELL: a_fit.shadowinv was written, but one image")
@@ -290,9 +290,9 @@ def test_every_option_of_a_fit_has_a_flag() -> None:
     text = flat(shadowinv("fit", "--help-all").stdout)
     for name in FitOptions.model_fields:
         assert f"--{name.replace('_', '-')}" in text
-    flags = {"bin": 2, "ambiguous": True, "beam_modes": 4}
+    flags = {"bin": 2, "ambiguous": True, "max_iterations": 4}
     recipe = fit_recipe_of(flags, Recipe())
-    options = FitOptions(ambiguous=True, beam_modes=4)
+    options = FitOptions(ambiguous=True, max_iterations=4)
     assert recipe == Recipe(steps=(Bin(factor=2),), fit=FitChoices(options=options))
 
 

@@ -157,12 +157,29 @@ def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
         strengths=STRENGTHS,
         source="unknown",
         noise=NOISE,
-        options=FitOptions(samples=0, beam_modes=4, threads=1),
+        options=FitOptions(samples=0, threads=1),
     )
     assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
     assert result.verdict is Verdict.DETERMINED
     error = result.source / beam(*np.indices(SIZE).astype(float)) - 1
     assert np.sqrt((error**2).mean()) < 0.02
+
+
+def test_two_energies_correct_an_assumed_beam() -> None:
+    def beam(y: FloatArray, x: FloatArray) -> FloatArray:
+        return np.asarray(1 + 0.1 * np.cos(y / 15) * np.sin(x / 18))
+
+    result = fit(
+        noisy(shots_of(RING_AND_SPOT, beam=beam), NOISE),
+        strengths=STRENGTHS,
+        noise=NOISE,
+        options=FitOptions(samples=2, threads=1),
+    )
+    assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
+    assert result.report.parts.keys() == {"noise", "beam"}
+    assert result.report.beam is None
+    error = result.source / beam(*np.indices(SIZE).astype(float)) - 1
+    assert error.std() < 0.015
 
 
 def test_three_energies_tell_a_magnetic_field_from_an_electric_one() -> None:
@@ -191,7 +208,7 @@ def test_one_image_tells_a_weak_field() -> None:
 
 def test_one_image_does_not_tell_an_unknown_beam_from_the_field() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
-    options = HASTY.model_copy(update={"ambiguous": True, "beam_modes": 4})
+    options = HASTY.model_copy(update={"ambiguous": True})
     result = fit(image, source="unknown", noise=0.02, options=options)
     assert result.verdict is Verdict.AMBIGUOUS
     assert result.chi2[0] < 1.3

@@ -59,7 +59,6 @@ def scene() -> Scene:
         smoothness=np.array([[3.0, 20.0], [5.0, 1.0]]),
         decay=20.0,
         pad=PAD,
-        beam_modes=4,
         free_brightness=True,
         free_frames=np.ones(6, bool),
         fiducials=Fiducials(
@@ -91,7 +90,6 @@ def some(scene: Scene) -> Unknowns:
     bump = np.exp(-((y[:, None] - 14) ** 2 + (x - 22) ** 2) / 2 / 5**2)
     unknowns.potentials[0] = -18 * bump
     unknowns.potentials[1] = 9 * bump * np.cos(x / 3)
-    unknowns.beam[0, 1], unknowns.beam[2, 1] = 0.1, -0.05
     unknowns.common[:] = 0.5, 0.6, -0.4, 0.7, 0.3
     unknowns.separate[:] = [[0.5, -0.6, 0.4], [-0.3, 0.7, 0.2]]
     unknowns.brightness[:] = 0.1, -0.2
@@ -116,7 +114,7 @@ def only(part: str, change: Unknowns) -> Unknowns:
 
 
 @pytest.mark.parametrize(
-    "part", ["potentials", "beam", "brightness", "frames", "common", "separate", "added", "all"]
+    "part", ["potentials", "brightness", "frames", "common", "separate", "added", "all"]
 )
 @pytest.mark.parametrize("force", [False, True], ids=["plain", "forced"])
 def test_the_gradient_is_that_of_the_value(scene: Scene, part: str, force: bool) -> None:
@@ -126,9 +124,8 @@ def test_the_gradient_is_that_of_the_value(scene: Scene, part: str, force: bool)
     counts = scene.ray_counts(unknowns)
     _, slope = scene.value_and_gradient(unknowns, counts)
     change = random_like(unknowns, 1)
-    # Of the first image the frame is fixed, of the beam the mean and the finest cosines.
+    # Of the first image the frame is fixed.
     change.frames[0] = 0
-    change.beam[scene.prior.beam_weights == 0] = 0
     change = only(part, change)
     step = 1e-6
     ahead, behind = (
@@ -162,8 +159,6 @@ def test_what_is_not_free_has_no_slope(scene: Scene) -> None:
     assert not slope.brightness.any()
     assert not slope.frames[0].any()
     np.testing.assert_array_equal(slope.frames[1] != 0, fixed.free_frames)
-    assert slope.beam[0, 0] == 0  # the mean is for the brightness to tell
-    assert slope.beam[0, 1] != 0
 
 
 def test_masked_pixels_do_not_matter(scene: Scene) -> None:
@@ -195,7 +190,6 @@ def test_pulled_is_the_transpose_of_pushed(scene: Scene) -> None:
     counts = scene.ray_counts(unknowns)
     change = random_like(unknowns, 3)
     change.frames[0] = 0
-    change.beam[scene.prior.beam_weights == 0] = 0
     residuals = np.random.default_rng(4).normal(size=scene.images.shape)
     pushed = scene.linear(unknowns, counts).push(change) * residuals
     pulled = scene.linear(unknowns, counts).pull(residuals)
@@ -243,7 +237,7 @@ def test_normal_products_of_sharp_images_are_pulled_pushes(
         scene, psf=[0.0, 0.0], imperfect=replace(scene.imperfect, blur=0.0), threads=threads
     )
     if not everything:
-        fixed = {"beam_modes": 0, "free_brightness": False, "free_frames": np.zeros(6, bool)}
+        fixed = {"free_brightness": False, "free_frames": np.zeros(6, bool)}
         sharp = replace(sharp, **fixed, added=(), imperfect=EXACT)
     assert sharp.rays.seen == SIZE
     unknowns = sharp.nothing()
@@ -267,7 +261,6 @@ def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
     explained = replace(sharp, images=sharp.model(unknowns, counts))
     change = sharp._only_free(random_like(unknowns, 7))
     change.frames[0] = 0
-    change.beam[scene.prior.beam_weights == 0] = 0
     step = 1e-6
     (_, ahead), (_, behind) = (
         explained.value_and_gradient(unknowns.plus(unknowns.like(s * change.flat())), counts)
@@ -306,8 +299,8 @@ def test_gains_and_beam_multiply_the_image(scene: Scene) -> None:
     unknowns = scene.nothing()
     counts = scene.ray_counts(unknowns)
     plain = scene.model(unknowns, counts)
-    unknowns.brightness[1], unknowns.beam[0, 0] = np.log(1.5), np.log(1.2)
-    images = scene.model(unknowns, counts)
+    unknowns.brightness[1] = np.log(1.5)
+    images = replace(scene, beams=1.2 * scene.beams).model(unknowns, counts)
     np.testing.assert_allclose(images[0], 1.2 * plain[0], rtol=1e-12)
     np.testing.assert_allclose(images[1], 1.8 * plain[1], rtol=1e-12)
 
@@ -328,7 +321,7 @@ def test_a_kernel_is_the_image_of_a_point(scene: Scene) -> None:
     """Not its mirror image."""
     beams = np.zeros_like(scene.beams)
     beams[:, PAD + 15, PAD + 20] = 1.0
-    dot = replace(scene, beams=beams, beam_modes=0, spacing=0.1)
+    dot = replace(scene, beams=beams, spacing=0.1)
     nothing = dot.nothing()
     image = dot.model(nothing, dot.ray_counts(nothing))[1]
     np.testing.assert_allclose(image[14:17, 19:22], KERNEL, atol=0.02)

@@ -115,7 +115,7 @@ def test_an_unknown_beam_is_that_of_the_others() -> None:
 
     setups = [ProtonSetup(energy=energy, **LENGTHS) for energy in (5, 10, 20, 40)]
     images = images_of([1, 1, 1, 1.6], energies=setups, beam=beam)
-    options = FitOptions(beam_modes=3, spacing=0.25)
+    options = FitOptions(spacing=0.25)
     found = checked(images, setups=setups, source="unknown", options=options)
     np.testing.assert_array_equal(found.explained, [True, True, True, False])
 

@@ -162,16 +162,17 @@ def test_one_image_and_an_unknown_source_are_taken_if_asked_for() -> None:
         images=images(1)[0],
         strengths=None,
         source="unknown",
-        options=FitOptions(ambiguous=True, beam_modes=5),
+        options=FitOptions(ambiguous=True),
     )
     assert alone.single
-    assert alone.scene.beam_modes == 5
+    assert alone.unknown
+    assert alone.scene.imperfect.keys == {"beam"}
     assert alone.scene.free_brightness
 
 
 def test_a_known_source_leaves_no_beam_to_be_found() -> None:
     data = given(source=np.full(SIZE, 4.0))
-    assert data.scene.beam_modes == 0
+    assert not data.scene.imperfect.keys
     assert not data.scene.free_brightness
 
 

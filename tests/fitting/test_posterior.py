@@ -31,7 +31,6 @@ def weak_scene(size: tuple[int, int], smoothness: tuple[float, float]) -> Scene:
         psf=[0.0, 0.0],
         smoothness=np.array([smoothness]),
         pad=pad,
-        beam_modes=2,
         free_brightness=True,
         free_frames=np.array([True, False, False] * 2),
         threads=1,
@@ -60,7 +59,6 @@ def imperfect_scene() -> tuple[Scene, Unknowns]:
         weak_scene((20, 24), (30.0, 100.0)),
         weights=np.full((2, 20, 24), 1e4),
         psf=[1.0, 1.0],
-        beam_modes=0,
         free_brightness=False,
         free_frames=np.zeros(6, bool),
         imperfect=Imperfect(blur=0.5, background=0.1),
@@ -152,7 +150,7 @@ def test_samples_have_the_inverse_hessian_as_covariance(
         ways.append(way)
     ways.append(np.zeros(unknowns.flat().size))
     ways[-1][place[6, 7]], ways[-1][place[6, 8]], ways[-1][place[6, 6]] = 2, -1, -1
-    for part in ("beam", "brightness", "frames"):
+    for part in ("brightness", "frames"):
         like = unknowns.zeros()
         getattr(like, part)[-1, ...] = 1
         ways.append(like.flat())
@@ -196,7 +194,6 @@ def test_what_is_known_does_not_vary(
     sample = Posterior(scene, unknowns, np.random.default_rng(1)).draw_samples(1)[0].change
     assert not sample.frames[0].any()
     np.testing.assert_array_equal(sample.frames[1] != 0, scene.free_frames)
-    assert sample.beam[0, 0] == 0
 
 
 def test_the_same_seed_draws_the_same_samples(
@@ -236,7 +233,6 @@ def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
     """A field drawn from the prior, images with noise: λ comes back within a factor of two."""
     scene = replace(
         weak_scene((48, 48), (true, 0.0)),
-        beam_modes=0,
         free_brightness=False,
         free_frames=np.zeros(6, bool),
         spacing=1 / 3,
@@ -266,7 +262,7 @@ def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
 
 def test_moved_by_beams_is_the_response_of_the_best_field() -> None:
     """Against a dense solution, with the images' change by differences."""
-    scene = replace(weak_scene((12, 16), (30.0, 100.0)), beam_modes=0)
+    scene = weak_scene((12, 16), (30.0, 100.0))
     unknowns = scene.nothing()
     y, x = np.indices(scene.rays.shape)
     unknowns.potentials[0] = 2 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
@@ -289,68 +285,6 @@ def test_moved_by_beams_is_the_response_of_the_best_field() -> None:
     )
     assert np.abs(dense).max() > 1e-4
     assert np.abs(shift - dense).max() < 0.1 * np.abs(dense).max()
-
-
-@pytest.mark.parametrize("modes", [4, 8])
-def test_with_free_beam_spreads_beams_by_the_variation(modes: int) -> None:
-    scene = weak_scene((24, 32), (30.0, 100.0)).with_free_beam(modes, 0.05)
-    rng = np.random.default_rng(1)
-    weights = scene.prior.beam_weights
-    spread = np.divide(1, np.sqrt(weights), out=np.zeros_like(weights), where=weights > 0)
-    squares = []
-    for _ in range(300):
-        change = scene.nothing()._replace(beam=spread * rng.normal(size=weights.shape))
-        squares.append((scene._modes(change.beam) ** 2).mean())
-    assert np.sqrt(np.mean(squares)) == pytest.approx(0.05, rel=0.1)
-
-
-def test_open_beams_are_those_that_several_energies_cannot_exclude() -> None:
-    """One image excludes none; images of different strengths exclude those that show."""
-    scene = replace(weak_scene((24, 32), (0.1, 1.0)), beam_modes=0, free_brightness=False)
-    unknowns = scene.nothing()
-
-    def spread(strengths: list[float]) -> float:
-        shots = replace(
-            scene, strengths=np.array(strengths)[:, None], weights=np.full((2, 24, 32), 1e6)
-        )
-        posterior = Posterior(shots, unknowns, np.random.default_rng(0))
-        samples = posterior.draw_samples(4)
-        changes = posterior.open_beams(0.05, samples, np.random.default_rng(2))
-        freed = shots.with_free_beam(*changes[0].beam.shape[:1], 0.05)
-        beams = [freed._modes(change.beam) for change in changes]
-        return float(np.sqrt(np.mean(np.square(beams))))
-
-    assert spread([1.0, 1.0]) > 0.02
-    assert spread([1.0, 0.5]) < 0.01
-
-
-def test_open_beams_have_the_joint_posterior_and_move_the_fields() -> None:
-    """Their covariance is the inverse Schur complement of a dense Hessian with a free beam."""
-    scene = replace(weak_scene((12, 16), (30.0, 100.0)), beam_modes=0, free_brightness=False)
-    scene = replace(scene, free_frames=np.zeros(6, bool), weights=np.full((2, 12, 16), 1e4))
-    unknowns = scene.nothing()
-    y, x = np.indices(scene.rays.shape)
-    unknowns.potentials[0] = 2 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
-    posterior = Posterior(scene, unknowns, np.random.default_rng(0))
-    samples = posterior.draw_samples(DRAWS, 1e-4)
-    changes = posterior.open_beams(0.05, samples, np.random.default_rng(2))
-    freed = scene.with_free_beam(*changes[0].beam.shape[:1], 0.05)
-    matrix, free = dense_hessian(freed, unknowns._replace(beam=0 * changes[0].beam))
-    matrix = matrix[np.ix_(free, free)]
-    is_beam = free >= unknowns.potentials.size
-    inverse = np.linalg.pinv(matrix, rcond=1e-10, hermitian=True)
-    covariance = inverse[np.ix_(is_beam, is_beam)]
-    beams = np.stack([change.flat()[free][is_beam] for change in changes])
-    for way in np.eye(len(covariance))[[0, 1, 8, 20]]:
-        variance = ((beams @ way) ** 2).mean()
-        assert variance == pytest.approx(way @ covariance @ way, rel=4 * np.sqrt(2 / DRAWS))
-    # The fields follow the beams as those of a fixed, different beam do.
-    for change in changes[:3]:
-        moved = posterior.moved_by_beams([np.stack([freed._modes(change.beam)] * 2)])[0]
-        response, expected = (
-            scene.rays.displacement(each.potentials[0]) for each in (change, moved)
-        )
-        assert np.abs(response + expected).max() < 0.1 * np.abs(expected).max()
 
 
 def test_draw_variations_have_unit_rms_inside_and_the_length() -> None:

@@ -24,8 +24,6 @@ def prior() -> Prior:
         smoothness=np.array([[3.0, 20.0], [5.0, 1.0]]),
         tie=2.0,
         decay=15.0,
-        beam_modes=4,
-        beam_spread=0.3,
         fiducials=Fiducials(
             np.array([[9.3, 11.2], [20.0, 30.5]]),
             np.array([[0.3, -0.2], [1.0, 0.4]]),
@@ -37,10 +35,8 @@ def prior() -> Prior:
 
 def nothing(prior: Prior) -> Unknowns:
     shape = len(prior.smoothness), *prior.rays.shape
-    modes = prior.beam_modes, prior.beam_modes
     return Unknowns(
         potentials=np.zeros(shape),
-        beam=np.zeros(modes),
         common=np.zeros(2),
         brightness=np.zeros(3),
         frames=np.tile(at_rest(), (3, 1)),
@@ -99,7 +95,7 @@ def test_random_slopes_have_the_hessian_as_covariance(prior: Prior) -> None:
         ways[-1].potentials[field] = np.exp(-((y - 12) ** 2 + (x - 16) ** 2) / 50)
         ways.append(like.zeros())
         ways[-1].potentials[field] = np.cos(x / 30)
-    ways.append(like.zeros()._replace(beam=random(prior, 9).beam))
+    ways.append(like.zeros()._replace(common=random(prior, 9).common))
     ways.append(like.zeros()._replace(frames=random(prior, 9).frames))
     samples = np.stack([prior.draw(like, rng).flat() for _ in range(DRAWS)])
     table = samples @ np.stack([way.flat() for way in ways]).T
@@ -151,7 +147,7 @@ def test_the_strip_ties_the_potential_and_the_image_does_not() -> None:
     assert prior.value_and_slope(outside)[0] == pytest.approx(expected, rel=1e-12)
 
 
-def test_gains_frames_and_beam_are_held_with_their_spreads(prior: Prior) -> None:
+def test_gains_frames_and_numbers_are_held_with_their_spreads(prior: Prior) -> None:
     """A shift by 5 recorded px, a stretch by 5 %, a brightness of e cost ½ each."""
     free = replace(prior, fiducials=None)
     for number, change in ((0, 5 / 2), (3, 5 / 2), (1, 0.05), (5, 0.05)):
@@ -166,9 +162,7 @@ def test_gains_frames_and_beam_are_held_with_their_spreads(prior: Prior) -> None
     brighter.brightness[2] = 1
     assert free.value_and_slope(brighter)[0] == pytest.approx(0.5)
     uneven = nothing(prior)
-    uneven.beam[1, 2] = 0.3 / np.sqrt(5)
-    assert free.value_and_slope(uneven)[0] == pytest.approx(0.5)
-    uneven.beam[0, 0] = 9  # the mean is not held, nor used
+    uneven.common[1] = 1
     assert free.value_and_slope(uneven)[0] == pytest.approx(0.5)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -143,20 +144,27 @@ def test_counts_with_too_little_noise_have_a_dark_level(share: float, expected: 
     assert ("a dark level of about 10%" in why) == (share > 0.05)
 
 
-def test_images_that_are_explained_better_with_more_blur_do_not_fit() -> None:
-    small, large = (Pattern(np.array([-1.0, 1.0]), blur_gain=gain) for gain in (5.0, 30.0))
-    assert assess(**GOOD | {"pattern": small})[0] is Verdict.DETERMINED
-    verdict, why = assess(**GOOD | {"pattern": large})
+def test_a_cause_that_wins_is_a_misfit_without_a_pattern() -> None:
+    pattern = Pattern(np.array([-1.0, 1.0]), cause="blur: give the point spread", tried="blur")
+    verdict, why = assess(**GOOD | {"pattern": pattern})
     assert verdict is Verdict.MISFIT
     assert "give the point spread" in why
+    undecided = replace(pattern, cause="")
+    assert assess(**GOOD | {"pattern": undecided})[0] is Verdict.DETERMINED
+
+
+def test_a_misfit_without_a_cause_lists_what_was_tried() -> None:
+    pattern = Pattern(np.array([0.5, 40.0]), tried="a dark level, blur")
+    verdict, why = assess(**GOOD | {"pattern": pattern})
+    assert verdict is Verdict.MISFIT
+    assert "not explained by a dark level, blur" in why
 
 
 @pytest.mark.parametrize(
     ("strength", "cause", "expected"),
     [
-        (3.0, "the beam", Verdict.DETERMINED),
+        (3.0, "", Verdict.DETERMINED),
         (4.5, "", Verdict.DETERMINED),
-        (4.5, "the beam differs", Verdict.DETERMINED),
         (6.6, "", Verdict.MISFIT),
         (6.6, "the beam differs", Verdict.MISFIT),
         (40.0, "", Verdict.MISFIT),

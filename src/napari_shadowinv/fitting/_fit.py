@@ -32,17 +32,13 @@ from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import (
     EXACT,
     Imperfect,
-    Shapes,
-    absorption_shapes,
     numbers_in_units,
 )
 from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.pattern import (
     Pattern,
     find_pattern,
-    gain_by_blur,
     log_evidence,
-    name_cause,
     noise_amplification,
 )
 from napari_shadowinv.fitting.posterior import (
@@ -59,6 +55,7 @@ from napari_shadowinv.fitting.posterior import (
     shifts_by_beam,
 )
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
+from napari_shadowinv.fitting.rivals import compare_rivals, transmission_of
 from napari_shadowinv.fitting.search import (
     SMALL_PX,
     Minimum,
@@ -71,7 +68,7 @@ from napari_shadowinv.fitting.search import (
 )
 from napari_shadowinv.fitting.shots import Images, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
+from napari_shadowinv.fitting.verdict import MISFIT_CHI2, assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.samples import Pairs
@@ -90,7 +87,7 @@ _DECIDES = 10.0  # in log evidence
 _MIN_BLUR_SCORE = 4.0  # standard deviations
 _NOISY_REFERENCE, _REFERENCE_BLUR_PX = 0.02, 1.5  # share of the variance; standard deviation
 _DARKEST = 1e-3  # of a beam's mean
-_MAX_RIVAL_CHI2 = 3.0  # a fit that ended further away is no start for a rival
+_MAX_RIVAL_CHI2 = 100.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
 _CHECKED = 2  # samples of an instrument that are solved, too
 # Before a field has been found, they would take its place.
@@ -200,19 +197,20 @@ def fit(
     ensure_compiled(on_progress, should_stop)
     scene = data.scene
     on_step = report_steps("fit", on_progress, should_stop)
+    # One image cannot tell the instrument from the object: its numbers stay at 0.
+    alone = replace(EXACT, shapes=scene.imperfect.shapes[:1]) if data.unknown else EXACT
     with measure_time("starts", seconds):
         rough = replace(scene, held=_HELD_IN_SEARCH)
         if data.single:
-            rough = replace(scene, imperfect=EXACT)
+            rough = replace(scene, imperfect=alone)
         minima = search(rough, collect_starts(data, on_step, should_stop), on_step)
         imperfect = scene.imperfect
         if data.instrument.absorption:
-            transmission = _absorption(data, minima[0], data.instrument.absorption)
+            transmission = transmission_of(data, minima[0], data.instrument.absorption)
             imperfect = replace(imperfect, shapes=(*imperfect.shapes, transmission))
-        # One image cannot tell the instrument from the object: its numbers stay at 0.
-        scene = replace(scene, imperfect=EXACT if data.single else imperfect)
-        minima = [_with_numbers(scene, minimum) for minimum in minima]
-        if scene.imperfect.parts and min(data.size) < SMALL_PX and data.near is None:
+        scene = replace(scene, imperfect=alone if data.single else imperfect)
+        minima = [_adapt(minimum, scene.imperfect, rough.imperfect) for minimum in minima]
+        if scene.imperfect.of_response and min(data.size) < SMALL_PX and data.near is None:
             # In pixels of two, λ and the errors of the instrument's numbers come out too small.
             minima[0] = in_recorded_pixels(scene, minima[0])
     is_near = data.near is not None
@@ -225,7 +223,7 @@ def fit(
     unsure = scene
     if data.single:
         # One image does not determine its instrument.
-        unsure = replace(scene, imperfect=imperfect, held=imperfect.keys)
+        unsure = replace(scene, imperfect=imperfect, held=imperfect.keys - alone.keys)
 
     def refine(on_step: OnStep) -> tuple[Scene, Unknowns, float, int, bool]:
         with measure_time("full size", seconds):
@@ -233,7 +231,8 @@ def fit(
 
     def explore(on_step: OnStep) -> tuple[tuple[Basin, ...], _Openness]:
         basins = _basins(scene, best, minima[1:], on_step)
-        return basins, _find_openness(data, unsure, best, rng, options, on_step)
+        there = _adapt(best, unsure.imperfect, scene.imperfect)
+        return basins, _find_openness(data, unsure, there, rng, options, on_step)
 
     begun, threads = time.perf_counter(), available_threads(scene.threads)
     works: list[Any] = [refine, explore]
@@ -257,18 +256,19 @@ def fit(
             absorbed = posterior.count_determined(np.random.default_rng(options.seed))
             share = pattern.missing_counts - absorbed / np.count_nonzero(scene.weights)
             pattern = replace(pattern, missing_counts=share)
-        # With several images the fit is repeated only if the residual asks for it.
-        if data.single or pattern.blur_score > _MIN_BLUR_SCORE:
+        is_off = pattern.is_certain or pattern.chi2 > MISFIT_CHI2
+        # Blur leaves little of a pattern, and one image none.
+        is_blurred = data.single or pattern.blur_score > _MIN_BLUR_SCORE
+        if (is_off or is_blurred) and pattern.chi2 < _MAX_RIVAL_CHI2:
             sharp, smooth = scene, best
             if data.reference_share > _NOISY_REFERENCE:
                 # A blur takes the noise of a reference away, too.
                 widths = 0, _REFERENCE_BLUR_PX, _REFERENCE_BLUR_PX
                 sharp = replace(scene, beams=gaussian_filter(scene.beams, widths))
                 smooth = settle_minimum(sharp, best, on_step, "point spread")
-            pattern = replace(pattern, blur_gain=gain_by_blur(sharp, smooth, on_step))
-        if pattern.is_certain and pattern.chi2 < _MAX_RIVAL_CHI2:
-            cause = name_cause(scene, best, fields, data.setups, on_step)
-            pattern = replace(pattern, cause=cause)
+            only = "" if is_off else "blur"
+            rivals = compare_rivals(data, sharp, smooth, fields, on_step, only=only)
+            pattern = replace(pattern, cause=rivals.cause(), tried=rivals.tried)
     with measure_time("samples", seconds):
         samples, pairs, errors = openness.samples, openness.pairs, openness.errors
         evidence = float("nan")
@@ -300,7 +300,7 @@ def fit(
         added=_added_light(data, fine, unknowns, samples, amplification),
         numbers=numbers_in_units(
             imperfect,
-            _with_numbers(unsure, best).unknowns if data.single else unknowns,
+            imperfect.adapt(unknowns, scene.imperfect),
             [sample.change for sample in samples],
         ),
         sensitivities=openness.sensitivities,
@@ -396,8 +396,7 @@ def _find_openness(
 
     def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:
         middle = best.coarsen(scene, _SPACING_OF_SAMPLES)
-        ends = _with_numbers(scene, start).unknowns
-        return Posterior(middle, ends, rng, lambda: on_step("samples", best.value), modes)
+        return Posterior(middle, start.unknowns, rng, lambda: on_step("samples", best.value), modes)
 
     posterior = posterior_with(scene, best, None if data.single else copy(best.modes))
     samples = posterior.draw_samples(options.samples if options.samples > 1 else 0)
@@ -415,10 +414,7 @@ def _find_openness(
     sensitivities = {}
     if samples:
         tested = replace(scene, imperfect=_tested_instrument(data, best))
-        plain = best.unknowns._replace(
-            common=np.zeros(0), separate=np.zeros((len(scene.images), 0))
-        )
-        response = posterior_with(tested, replace(best, unknowns=plain))
+        response = posterior_with(tested, _adapt(best, tested.imperfect, EXACT))
         exact = None if scene.imperfect.parts else posterior
         sensitivities = response.sensitivities(np.random.default_rng(options.seed), exact)
     return _Openness(
@@ -443,9 +439,9 @@ def collect_starts(data: FitData, on_step: Any, should_stop: ShouldStop | None) 
     if not data.single:
         candidates.append(Start("from far", _FROM_FAR))
     candidates.append(Start("from near", _FROM_NEAR))
-    if scene.beam_modes and not data.single:
+    if data.unknown and not data.single:
         candidates.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
-    if scene.strengths.shape[1] > 1 or scene.beam_modes:
+    if scene.strengths.shape[1] > 1 or data.unknown:
         return candidates
     sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
     weakest = int(np.argmin(np.where(sizes > 0, sizes, np.inf)))
@@ -486,19 +482,10 @@ def _transport_potential(
         return None
 
 
-def _absorption(data: FitData, minimum: Minimum, rms: float) -> Shapes:
-    """Return the unknown transmission of the object that was found."""
-    height, width = data.size
-    blocks = np.ones((1, minimum.bin, minimum.bin))
-    displacement = np.kron(minimum.displacement.sum(axis=0), blocks)[:, :height, :width]
-    used = np.asarray((data.scene.weights[:, :height, :width] > 0).any(axis=0))
-    return absorption_shapes(rms, displacement, used, data.around)
-
-
 def _tested_instrument(data: FitData, minimum: Minimum) -> Imperfect:
     """Return the imperfections to which each fit states its sensitivity."""
     sizes = {each.key: each.tested for each in IMPERFECTIONS if each.tested}
-    shapes = _absorption(data, minimum, sizes.pop("absorption"))
+    shapes = transmission_of(data, minimum, sizes.pop("absorption"))
     return Imperfect(
         gamma=sizes["gamma"],
         blur=sizes["blur"] ** 2,
@@ -507,15 +494,8 @@ def _tested_instrument(data: FitData, minimum: Minimum) -> Imperfect:
     )
 
 
-def _with_numbers(scene: Scene, minimum: Minimum) -> Minimum:
-    """Return a minimum with all numbers of a scene's instrument; those it has not are 0."""
-    unknowns, (common, separate) = minimum.unknowns, scene.imperfect.counts
-    missing = common - unknowns.common.size, separate - unknowns.separate.shape[1]
-    unknowns = unknowns._replace(
-        common=np.pad(unknowns.common, (0, missing[0])),
-        separate=np.pad(unknowns.separate, ((0, 0), (0, missing[1]))),
-    )
-    return replace(minimum, unknowns=unknowns)
+def _adapt(minimum: Minimum, imperfect: Imperfect, before: Imperfect) -> Minimum:
+    return replace(minimum, unknowns=imperfect.adapt(minimum.unknowns, before))
 
 
 def _amplify_noise(
@@ -690,7 +670,7 @@ def _result(
         pattern,
         jacobian,
         single=data.single,
-        beam_unknown=scene.beam_modes > 0,
+        beam_unknown=data.unknown,
         hidden=hidden_contrast(model / np.maximum(beams, _DARKEST * units) - 1, used),
         searched=data.near is None,
         noise=data.noise,

@@ -39,7 +39,7 @@ from napari_shadowinv.fitting.search import (
 )
 from napari_shadowinv.fitting.shots import Images
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.options import FitOptions
+from napari_shadowinv.options import FitOptions, Instrument
 
 _LEAST_AGREEING = 2
 _LAST_GAIN = 0.5
@@ -93,7 +93,8 @@ def leave_one_out(
         If `should_stop` returned true.
     """
     options = as_model(FitOptions, options, "options")
-    data = collect_data(images, options=options, **{**keywords, "instrument": None})
+    exact = Instrument(beam_rms=0.0)
+    data = collect_data(images, options=options, **{**keywords, "instrument": exact})
     check_count(len(data.units))
     if data.scene.fiducials is not None or data.start is not None:
         raise InputError(
@@ -132,7 +133,7 @@ class _SampledFit:
         """Return the mean square of the changes in one image, in units of its noise."""
         no_change = linear.unknowns.zeros()
         residuals = [
-            linear.push(no_change._replace(potentials=change.potentials, beam=change.beam))
+            linear.push(no_change._replace(potentials=change.potentials, common=change.common))
             for change in self.changes
         ]
         return float(np.mean(np.square(residuals)[:, linear.scene.weights > 0]))

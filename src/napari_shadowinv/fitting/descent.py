@@ -170,11 +170,9 @@ class Preconditioner:
         matrix = data + of_prior[..., None] * np.eye(of_prior.shape[-1])
         roots = np.linalg.inv(np.linalg.cholesky(matrix))
         self._potentials = np.ascontiguousarray(np.moveaxis(roots, (2, 3), (0, 1)))
-        self._log_ratio = 0.5 * float(np.linalg.slogdet(matrix)[1].sum())
-        self._log_ratio -= 0.5 * float(np.log(of_prior).sum())
+        self.log_ratio = 0.5 * float(np.linalg.slogdet(matrix)[1].sum())
+        self.log_ratio -= 0.5 * float(np.log(of_prior).sum())
         pixels = scene.weights.sum(axis=(1, 2))
-        used = prior.beam_weights > 0
-        beam = np.where(used, 1 / np.sqrt(prior.beam_weights + pixels.sum() / 4), 0.0)
         brightness = np.where(scene.free_brightness, 1 / np.sqrt(pixels + 1), 0.0)
         # Images have contrasts of some tenths over some pixels; stretching moves the edge by more.
         arm = max(scene.rays.size) / 4
@@ -183,14 +181,14 @@ class Preconditioner:
         frames[0] = 0
         added = [block.scales(scene.weights) for block in scene.added]
         common, separate = scene.number_scales()
-        self._diagonals = [beam, common, brightness, frames, separate, *added]
+        self._diagonals = [common, brightness, frames, separate, *added]
 
     def held(self) -> Preconditioner:
         """Return scales in which the numbers of an instrument do not change."""
         scales = copy(self)
         scales._diagonals = [scale.copy() for scale in self._diagonals]
-        scales._diagonals[1][:] = 0
-        scales._diagonals[4][:] = 0
+        scales._diagonals[0][:] = 0
+        scales._diagonals[3][:] = 0
         return scales
 
     def damp(self, unknowns: Unknowns) -> Unknowns:
@@ -218,7 +216,7 @@ class Preconditioner:
         size = unknowns.potentials.size
         waves = self._potentials_times(scaled[:size].reshape(shape))
         potentials = idctn(waves, axes=(1, 2), norm="ortho")
-        others = self._flat_diagonals * scaled[size:]
+        others = self.others * scaled[size:]
         change = unknowns.like(np.concatenate([potentials.ravel(), others]))
         slope = linear.normal_times(change)
         prior.add_ties(change.potentials, slope.potentials)
@@ -227,11 +225,12 @@ class Preconditioner:
         result = slope.flat()
         result[:size] = self._potentials_times(of_data, _TRANSPOSE).ravel()
         result[size:] += linear.weights_of_others * others
-        result[size:] *= self._flat_diagonals
+        result[size:] *= self.others
         return result
 
     @property
-    def _flat_diagonals(self) -> FloatArray:
+    def others(self) -> FloatArray:
+        """Scales of all values but the potentials."""
         return np.concatenate([part.ravel() for part in self._diagonals])
 
     def _potentials_times(self, waves: FloatArray, sums: str = _SCALE) -> FloatArray:
@@ -242,8 +241,8 @@ class Preconditioner:
 
     def log_size(self) -> float:
         """Return log |det S| plus about half the log-determinant of the prior."""
-        scales = self._flat_diagonals
-        return -self._log_ratio + float(np.log(scales[scales > 0]).sum())
+        scales = self.others
+        return -self.log_ratio + float(np.log(scales[scales > 0]).sum())
 
 
 def descend(
@@ -344,10 +343,8 @@ def settle(
         Whether steps were left.
     """
     tolerance, solving = _NEWTON, _MOST_SOLVING
-    # Scales of numbers and beams, which fields may replace, of frames and added light are rough.
-    is_scaled = not (
-        scene.has_free_numbers or scene.beam_modes or scene.added or scene.free_frames.any()
-    )
+    # Scales of numbers, which fields may replace, of frames and added light are rough.
+    is_scaled = not (scene.has_free_numbers or scene.added or scene.free_frames.any())
     if scene.has_free_numbers and to_beat is None:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
         least_gain *= _GAIN_IN_VALLEY

@@ -111,7 +111,6 @@ class Scene(PriorTerms):
         common, separate = self.imperfect.counts
         return Unknowns(
             potentials=np.zeros((fields, *self.rays.shape)),
-            beam=np.zeros((self.beam_modes, self.beam_modes)),
             common=np.zeros(common),
             brightness=np.zeros(count),
             frames=np.tile(at_rest(), (count, 1)),
@@ -148,8 +147,7 @@ class Scene(PriorTerms):
     def beam(self, unknowns: Unknowns) -> FloatArray:
         """Return the beam of each image within it, without brightness, shape (L, H, W)."""
         height, width = self.rays.size
-        shape = self._beam_shape(unknowns)
-        beams = np.stack([shape * self._light(unknowns, k) for k in range(len(self.beams))])
+        beams = np.stack([self._light(unknowns, k) for k in range(len(self.beams))])
         return np.asarray(beams[:, self.pad : self.pad + height, self.pad : self.pad + width])
 
     def chi2(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> FloatArray:
@@ -186,7 +184,7 @@ class Scene(PriorTerms):
     ) -> tuple[float, Unknowns]:
         """Return the objective at fixed numbers of rays, and its derivatives."""
         value, slope = self._priors(unknowns)
-        of_shape, strengths = np.zeros(self.beams.shape[1:]), self.strengths_with(unknowns)
+        strengths = self.strengths_with(unknowns)
         shots = list(self._shots(unknowns, counts))
         differentiated = self._of_each(partial(self._pulls, unknowns), shots)
         for k, (of_image, of_brightness, seen, scaled, pulls) in enumerate(differentiated):
@@ -195,10 +193,9 @@ class Scene(PriorTerms):
             self._add_light_pulls(slope, k, scaled)
             seen.effects.add_pulls(slope, k, scaled)
             self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
-            entering = self._entering(unknowns, k)
-            of_shape += self._add_beam_pulls(slope, k, pulls.beam, entering)
+            if self.imperfect.changes_beam:
+                self._add_beam_pulls(slope, k, pulls.beam, self._entering(unknowns, k))
             slope.frames[k] += pulls.frame
-        slope.beam[:] += self._of_modes(of_shape * self._beam_shape(unknowns))
         return value, self._only_free(slope)
 
     def _pulls(
@@ -212,7 +209,7 @@ class Scene(PriorTerms):
         of_rays = self.rays.gradient(
             shot.traced,
             self._spread_back(k, seen.slope * scaled, unknowns),
-            of_beam=self._has_beam,
+            of_beam=self.imperfect.changes_beam,
             of_frame=k > 0 and bool(self.free_frames.any()),
         )
         value = float(np.einsum("yx,yx", residual, residual)) / 2
@@ -225,15 +222,6 @@ class Scene(PriorTerms):
         if not is_small or len(shots) < _IMAGES_PER_THREAD * threads:
             threads = 1  # here; the kernels have all of them
         return results_of([partial(function, shot) for shot in shots], threads)
-
-    def with_free_beam(self, modes: int, variation: float) -> Scene:
-        """Return the scene with an unknown beam that differs from the known one by an r.m.s."""
-        weights = replace(self, beam_modes=modes, beam_spread=1.0).prior.beam_weights
-        is_wavy = np.arange(modes) > 0
-        # Mean square of cos cos, and of cos alone.
-        means = np.where(is_wavy[:, None] & is_wavy, 0.25, 0.5)
-        total = np.sqrt((means[weights > 0] / weights[weights > 0]).sum())
-        return replace(self, beam_modes=modes, beam_spread=float(variation / total))
 
     def changed_by_beams(
         self, unknowns: Unknowns, counts: list[IntArray], variations: FloatArray
@@ -253,7 +241,7 @@ class Scene(PriorTerms):
     def linear(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> Linear:
         """Return the scene to first order around unknowns."""
         shots = list(self._shots(unknowns, counts))
-        of_beam, of_frame = self._has_beam, bool(self.free_frames.any())
+        of_beam, of_frame = self.imperfect.changes_beam, bool(self.free_frames.any())
 
         def differentiate(shot: _Shot) -> csr_array:
             of_its_frame = shot.number > 0 and of_frame
@@ -327,20 +315,14 @@ class Scene(PriorTerms):
             part.of(common, separate)[...] = 0 if is_held else 1 / np.sqrt(1 + curvature)
         return common, separate
 
-    @property
-    def _has_beam(self) -> bool:
-        """Whether light that enters is unknown."""
-        return bool(self.beam_modes) or self.imperfect.changes_beam
-
     def _shots(self, unknowns: Unknowns, counts: list[IntArray] | None) -> Iterator[_Shot]:
-        shape = self._beam_shape(unknowns)
         counts = counts or self.ray_counts(unknowns)
         for k, psi in enumerate(self.potentials(unknowns)):
-            beam = self._light(unknowns, k) * shape
+            beam = self._light(unknowns, k)
             yield _Shot(k, TracedBeam(psi, counts[k], beam, unknowns.frames[k]))
 
     def _light(self, unknowns: Unknowns, k: int) -> FloatArray:
-        """Light of an image's beam by its source, without the modes of an unknown beam."""
+        """The light that enters for an image."""
         numbers = unknowns.common, unknowns.separate[k]
         light = self.imperfect.entering(self.beams[k], *numbers)
         return np.asarray(light * self.imperfect.excess(*numbers))
@@ -397,50 +379,23 @@ class Scene(PriorTerms):
         """The light of an image's beam, and its relative changes by the instrument's numbers."""
         imperfect, numbers = self.imperfect, (unknowns.common, unknowns.separate[k])
         light = self._light(unknowns, k)
-        if not imperfect.changes_beam:
-            return _Entering(light, light, _Effects())
-        effects = _Effects(imperfect.entering_changes(self.beams[k], *numbers))
-        return _Entering(light, light * self._beam_shape(unknowns), effects)
+        return _Entering(light, _Effects(imperfect.entering_changes(self.beams[k], *numbers)))
 
     def _add_beam_pulls(
         self, slope: Unknowns, k: int, pull: FloatArray, entering: _Entering
-    ) -> FloatArray:
-        """Add derivatives by the light that enters; return those by the beam's modes."""
-        if not self._has_beam:
-            return pull
-        if self.imperfect.changes_beam:
-            shaped = pull * entering.shaped
-            entering.effects.add_pulls(slope, k, shaped)
-            self.imperfect.pull_shapes(shaped, slope.common, slope.separate[k])
-        return pull * entering.light
+    ) -> None:
+        """Add derivatives by the light that enters."""
+        of_logarithm = pull * entering.light
+        entering.effects.add_pulls(slope, k, of_logarithm)
+        self.imperfect.pull_shapes(of_logarithm, slope.common, slope.separate[k])
 
     def _only_free(self, slope: Unknowns) -> Unknowns:
         frames = np.where(self.free_frames, slope.frames, 0.0)
         frames[0] = 0
         return slope._replace(
-            beam=np.where(self.prior.beam_weights > 0, slope.beam, 0.0),
             brightness=np.where(self.free_brightness, slope.brightness, 0.0),
             frames=frames,
         )
-
-    @cached_property
-    def _cosines(self) -> tuple[FloatArray, FloatArray]:
-        orders = np.arange(self.beam_modes)[:, None]
-        along_y, along_x = (
-            np.cos(np.pi * orders * (np.arange(n) + 0.5) / n) for n in self.beams.shape[1:]
-        )
-        return along_y, along_x
-
-    def _modes(self, beam: FloatArray) -> FloatArray:
-        along_y, along_x = self._cosines
-        return np.asarray(np.einsum("iy,ix->yx", along_y, np.einsum("ij,jx->ix", beam, along_x)))
-
-    def _of_modes(self, shape: FloatArray) -> FloatArray:
-        along_y, along_x = self._cosines
-        return np.asarray(np.einsum("iy,yj->ij", along_y, np.einsum("yx,jx->yj", shape, along_x)))
-
-    def _beam_shape(self, unknowns: Unknowns) -> FloatArray:
-        return np.exp(self._modes(unknowns.beam))
 
     def _inner(self, image: FloatArray) -> FloatArray:
         inner = self.rays.beyond
@@ -489,10 +444,9 @@ class _Effects(list[tuple[Part, FloatArray]]):
 
 
 class _Entering(NamedTuple):
-    """Light of a beam by its source, and with unknown modes; effects of numbers on its log."""
+    """Light of a beam, and effects of numbers on its logarithm."""
 
     light: FloatArray
-    shaped: FloatArray
     effects: _Effects
 
 
@@ -546,12 +500,12 @@ class Linear:
             if self._has_light
             else self._dark,
         )
-        slope, of_shape = self.unknowns.zeros(), np.zeros(scene.beams.shape[1:])
+        slope = self.unknowns.zeros()
         for k in range(count):
             if self._has_light:
                 self._add_light_pulls(slope, k, pulls[k])
-            self._add_columns(slope, of_shape, k, totals[k])
-        return self._complete(slope, of_shape)
+            self._add_columns(slope, k, totals[k])
+        return scene._only_free(slope)
 
     def push(self, change: Unknowns) -> FloatArray:
         """Return the change of all residuals (f - I) / σ, to first order, shape (L, H, W)."""
@@ -568,33 +522,32 @@ class Linear:
     def pull(self, residuals: FloatArray) -> Unknowns:
         """Return the transpose of `push` times residuals."""
         scene = self.scene
-        slope, of_shape = self.unknowns.zeros(), np.zeros(scene.beams.shape[1:])
+        slope = self.unknowns.zeros()
         for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
             pull = self._roots[k] * residuals[k]
             self._add_light_pulls(slope, k, pull)
             back = scene._spread_back(k, seen.slope * pull, self.unknowns)
-            self._add_columns(slope, of_shape, k, scene.rays.pull(jacobian, back))
-        return self._complete(slope, of_shape)
+            self._add_columns(slope, k, scene.rays.pull(jacobian, back))
+        return scene._only_free(slope)
 
     def _columns(self, change: Unknowns, potentials: FloatArray, k: int) -> FloatArray:
         """Changes of the columns of an image's Jacobian."""
         columns = potentials[k].reshape(-1)
         if not self._has_others:
             return np.asarray(columns)
-        of_beam = self._entering[k].light * (self._beam_shape * self._beam_change(change, k))
+        of_beam = self._entering[k].light * self._beam_change(change, k)
         return np.concatenate([columns, of_beam.ravel(), change.frames[k]])
 
-    def _add_columns(
-        self, slope: Unknowns, of_shape: FloatArray, k: int, columns: FloatArray
-    ) -> None:
-        """Add derivatives by the columns of an image's Jacobian; of the beam to `of_shape`."""
+    def _add_columns(self, slope: Unknowns, k: int, columns: FloatArray) -> None:
+        """Add derivatives by the columns of an image's Jacobian."""
         scene = self.scene
         size = math.prod(scene.rays.shape)
         psi = columns[:size].reshape(scene.rays.shape)
         scene._add_potential_pulls(slope, self.unknowns, self._strengths[k], k, psi)
         if self._has_others:
-            of_beam = columns[size:-6].reshape(of_shape.shape)
-            of_shape += scene._add_beam_pulls(slope, k, of_beam, self._entering[k])
+            if scene.imperfect.changes_beam:
+                of_beam = columns[size:-6].reshape(scene.beams.shape[1:])
+                scene._add_beam_pulls(slope, k, of_beam, self._entering[k])
             slope.frames[k] = columns[-6:]
 
     def _light_change(self, change: Unknowns, k: int) -> FloatArray:
@@ -609,12 +562,6 @@ class Linear:
         self.scene._add_light_pulls(slope, k, pull)
         self.seen[k].effects.add_pulls(slope, k, pull)
 
-    def _complete(self, slope: Unknowns, of_shape: FloatArray) -> Unknowns:
-        """Derivatives with those by the beam's modes, of unknowns that are free."""
-        if self.scene.beam_modes:
-            slope.beam[:] = self.scene._of_modes(of_shape * self._beam_shape)
-        return self.scene._only_free(slope)
-
     def _potential_changes(self, change: Unknowns) -> FloatArray:
         imperfect = self.scene.imperfect
         changes = np.einsum("lm,myx->lyx", self._strengths, change.potentials)
@@ -625,9 +572,8 @@ class Linear:
 
     def _beam_change(self, change: Unknowns, k: int) -> FloatArray:
         """Relative change of the light that enters for an image."""
-        scene, imperfect = self.scene, self.scene.imperfect
-        total = scene._modes(change.beam) if scene.beam_modes else np.zeros(())
-        total = self._entering[k].effects.push(change, k, total)
+        imperfect = self.scene.imperfect
+        total = self._entering[k].effects.push(change, k, np.zeros(()))
         if imperfect.shapes:
             total = total + imperfect.shape_changes(change.common, change.separate[k])
         return np.asarray(total)
@@ -641,10 +587,6 @@ class Linear:
     def weights_of_others(self) -> FloatArray:
         """1 / s² by the prior of all values but the potentials."""
         return self.scene.prior.flat_weights(self.unknowns)
-
-    @cached_property
-    def _beam_shape(self) -> FloatArray:
-        return self.scene._beam_shape(self.unknowns)
 
     @cached_property
     def _entering(self) -> list[_Entering]:

@@ -248,6 +248,27 @@ class Imperfect:
         shapes = tuple(each.coarsen(factor) for each in self.shapes)
         return replace(self, blur=self.blur / factor**2, shapes=shapes)
 
+    def adapt(self, unknowns: Unknowns, before: Imperfect) -> Unknowns:
+        """Return unknowns with as many numbers; those that `before` has not are 0."""
+        common, separate = self.counts
+        adapted = unknowns._replace(
+            common=np.zeros(common), separate=np.zeros((len(unknowns.separate), separate))
+        )
+        places = {part.key: part for part in before.parts}
+        for part in self.parts:
+            numbers = part.of(adapted.common, adapted.separate)
+            if part.key not in places:
+                continue
+            known = places[part.key].of(unknowns.common, unknowns.separate)
+            if known.shape == numbers.shape:
+                numbers[...] = known * before.size(part.key) / self.size(part.key)
+        return adapted
+
+    def size(self, key: str) -> float:
+        """Return the r.m.s. change of a beam by an imperfection; 1 if it does not change it."""
+        squares = [each.mean_squares.sum() for each in self.shapes if each.key == key]
+        return float(np.sqrt(sum(squares))) or 1.0
+
     def _change(self, key: str, numbers: FloatArray) -> float:
         """The change by the one number of an imperfection, among the numbers of its kind."""
         size: float = getattr(self, key)
@@ -392,7 +413,6 @@ def imperfect_instrument(
     around: Around,
     *,
     is_common: bool,
-    is_unknown: bool,
     other_strengths: FloatArray | None,
 ) -> Imperfect:
     """Return the standard deviations of an instrument's numbers for the images of a fit.
@@ -407,27 +427,20 @@ def imperfect_instrument(
         Pixels in which the variation of beams has its r.m.s.
     around : pairs of int
         Pixels by which the scene's beams reach beyond the images.
-    is_unknown : bool
-        Whether the beam is fitted in any case.
     other_strengths : ndarray, shape (L, M), or None
         Of the displacement by another field, if one was equal to each field in the first image.
     """
-    weights, beyond = used.astype(np.float64), ((0, 0), *around)
     shapes = []
-    if beam.rms and not is_unknown:
-        excess = BeamExcess(beam, weights, _FITTED_VARIANCE)
-        planes = np.pad(beam.rms * excess.shapes, beyond, mode="edge")
-        rest = ProductShapes.of_field(excess.rest, beam.rms * excess.rest_share, around)
-        shapes.append(Shapes("beam", planes, rest, is_common))
+    if beam.rms:
+        shapes.append(replace(beam_shapes(beam, used, around), is_common=is_common))
     if beam.between and len(sources) > 1:
-        smooth = SmoothField(beam.length * min(weights.shape), weights, _FITTED_VARIANCE)
-        rest = ProductShapes.of_field(smooth, beam.between, around)
-        shapes.append(Shapes("beam_between", _no_planes(rest), rest, is_common=False))
+        shapes.append(beam_shapes(beam, used, around, between=True))
     if instrument.registration and is_common:
         source = np.maximum(sources[0], _DIMMEST)
         planes = instrument.registration * motions(source) / source
         if np.any(planes):
-            shapes.append(Shapes("registration", np.pad(planes, beyond, mode="edge")))
+            planes = np.pad(planes, ((0, 0), *around), mode="edge")
+            shapes.append(Shapes("registration", planes))
     return Imperfect(
         gamma=instrument.gamma,
         blur=instrument.blur**2,
@@ -439,6 +452,21 @@ def imperfect_instrument(
         ),
         shapes=tuple(shapes),
     )
+
+
+def beam_shapes(
+    beam: BeamPrior, used: BoolArray, around: Around, *, between: bool = False
+) -> Shapes:
+    """Return the differences of beams and sources, or those of each image's beam `between` all."""
+    weights = used.astype(np.float64)
+    if between:
+        smooth = SmoothField(beam.length * min(weights.shape), weights, _FITTED_VARIANCE)
+        rest = ProductShapes.of_field(smooth, beam.between, around)
+        return Shapes("beam_between", _no_planes(rest), rest, is_common=False)
+    excess = BeamExcess(beam, weights, _FITTED_VARIANCE)
+    planes = np.pad(beam.rms * excess.shapes, ((0, 0), *around), mode="edge")
+    rest = ProductShapes.of_field(excess.rest, beam.rms * excess.rest_share, around)
+    return Shapes("beam", planes, rest)
 
 
 def absorption_shapes(

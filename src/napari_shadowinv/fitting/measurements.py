@@ -44,6 +44,7 @@ from napari_shadowinv.inversion.noise import finest_differences, measure_correla
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
+    UNKNOWN_BEAM_RMS,
     BeamPrior,
     FitOptions,
     Instrument,
@@ -86,8 +87,8 @@ class FitData:
     `scene` has the sides of blocks, and λ and κ if they are given, else 0; the images are its first
     `size` pixels. `units` (L,) are the recorded values of one unit, `brightness` (L,) the
     brightness of each image relative to its source, approximate where it is unknown; `counted` is
-    true for Poisson noise. The beam is `assumed` if no source was given, and `common` if its source
-    is the same for all images.
+    true for Poisson noise. The beam is `assumed` if no source was given, `unknown` if it has none,
+    and `common` if its source is the same for all images.
     """
 
     scene: Scene
@@ -98,6 +99,7 @@ class FitData:
     counted: bool
     single: bool  # one image, or several with the same information
     assumed: bool
+    unknown: bool
     common: bool
     instrument: Instrument
     beam: BeamPrior
@@ -219,22 +221,23 @@ def collect_data(
     around = (pad, pad + fill[1][1]), (pad, pad + fill[2][1])
     is_common = all(np.allclose(beam, shapes[0], rtol=_SAME, atol=0) for beam in shapes[1:])
     is_assumed = source is None or not all(shot.measured for shot in shots)
+    spread = np.linalg.norm(matrix, axis=1)
+    single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
     prior = instrument.beam_of(measured=not is_assumed, source=shapes[0])
+    if unknown and not instrument.beam_rms:
+        prior = prior.model_copy(update={"rms": UNKNOWN_BEAM_RMS})
     # Displacement by an electric field that is equal to the field in image 1.
     has_other = setups is not None and tuple(fields) == ("B",)
     other_strengths = strengths_of(setups, ("E",), count) if has_other else matrix
     imperfect = imperfect_instrument(
         instrument,
-        prior if instrument.has_numbers else BeamPrior(),
+        prior if unknown or not single or instrument.has_numbers else BeamPrior(),
         beams / units[:, None, None],
         np.asarray(used.any(axis=0)),
         around,
         is_common=is_common,
-        is_unknown=unknown,
         other_strengths=other_strengths,
     )
-    spread = np.linalg.norm(matrix, axis=1)
-    single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
     # Of a detector that is not linear, an assumed source does not have the image's mean.
     is_dimmed = source is None and instrument.gamma > 0
     # A beam of another shape, or behind an object that absorbs, does not have its source's.
@@ -254,7 +257,6 @@ def collect_data(
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
         decay=(options.decay_length or pad) if free else np.inf,
-        beam_modes=options.beam_modes if unknown else 0,
         free_brightness=free_brightness or unknown or is_dimmed,
         free_frames=_ALIGNED[align],
         shift_spread=options.align_spread
@@ -274,6 +276,7 @@ def collect_data(
         counted=isinstance(noise, str) and noise == "poisson",
         single=single,
         assumed=is_assumed,
+        unknown=unknown,
         common=is_common,
         instrument=instrument,
         beam=prior,

@@ -1,8 +1,7 @@
-"""Structure in the residuals of a fit, and its likeliest cause: `Pattern`, `find_pattern`.
+"""Structure in the residuals of a fit: `Pattern`, `find_pattern`.
 
 - tests of the residuals: `pattern_strength`, `correlation_length`, `blur_score`
 - the noise of counts: `lack_of_noise`
-- fits with one more unknown: the cause of a pattern, `name_cause`; missing blur, `gain_by_blur`
 - the likelihood of a choice of fields: `log_evidence`
 
 χ² hides structure: a beam that is 2 % wrong adds 0.1 to χ² at 5 % noise, spread over the whole
@@ -13,24 +12,20 @@ the noise in each pixel.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from zlib import crc32
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, laplace
 
-from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import OnStep, run_in_parallel
+from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import NoiseMatch, strengths_of
+from napari_shadowinv.fitting.measurements import NoiseMatch
 from napari_shadowinv.fitting.search import SMOOTHNESS_RATIO, Minimum, posterior_of, settle_minimum
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
-from napari_shadowinv.physics.setup import Setup
 
 _WIDTHS_PX = (2.0, 4.0, 8.0)
 _SMALLEST_VARIANCE = 1e-12  # of the noise
@@ -192,25 +187,25 @@ class Pattern:
         The largest of all images.
     blur_score : float
         See `blur_score`.
-    blur_gain : float
-        How much a wider point spread lowers the objective; see `gain_by_blur`.
     missing_counts : float
         Share by which the noise is smaller than counts imply, as a dark level of that share
         makes it.
     counts_deviation : float
         Standard deviation of `missing_counts`.
     cause : str
-        The likeliest cause, as a clause; "" if none is likely or none was looked for.
+        The likeliest cause, as a clause; "" if none wins or none was looked for.
+    tried : str
+        All causes that were looked for.
     """
 
     strengths: FloatArray
     correlation: float = 0.0
     chi2: float = 1.0
     blur_score: float = 0.0
-    blur_gain: float = 0.0
     missing_counts: float = 0.0
     counts_deviation: float = np.inf
     cause: str = ""
+    tried: str = ""
 
     @property
     def largest(self) -> float:
@@ -270,86 +265,6 @@ def find_pattern(
     )
 
 
-# Images that are blurred by 1 px or more are then explained better.
-_WIDER_PX, _MUCH_WIDER_PX = 1.5, 3.0
-# A free beam lowers Σχ² by at most 19 where the beam was right, by 584 and more where it was off.
-_MIN_GAIN = 60.0
-_AS_LIKELY = 0.7  # of the largest gain
-# Of the excess of Σχ² over the number of pixels; a cause that explains less is doubtful.
-_MIN_EXPLAINED_SHARE = 0.5
-_BEAM_MODES, _FINE_BEAM_MODES = 8, 20
-_BEAM_SPREAD = 0.3
-_SHIFT = np.array([True, False, False] * 2)
-_STEPS = 12
-_PEDESTALS = 0.09, 0.17  # of each image's mean: dark levels of 10 and 20 % of the beam
-
-
-@dataclass(frozen=True)
-class _Rival:
-    """A scene with one more unknown, the start of its search, and the cause that it stands for."""
-
-    scene: Scene
-    unknowns: Unknowns
-    free_numbers: int
-    cause: str
-
-
-def name_cause(
-    scene: Scene,
-    best: Minimum,
-    names: Sequence[str],
-    setups: Sequence[Setup] | None,
-    on_step: OnStep,
-) -> str:
-    """Return the likeliest reason why a fit leaves a pattern, as a clause; "" if none is likely.
-
-    Each rival frees or changes one assumption, and is fitted from the best unknowns. The one
-    that lowers Σχ² most, beyond one for each of its numbers, is named.
-
-    Parameters
-    ----------
-    scene, best
-        The fit that leaves a pattern.
-    names : sequence of str
-        The fields.
-    setups : sequence of Setup, optional
-        The experiment of each image.
-    on_step : callable
-        Receives the stage and the objective.
-    """
-    pixels = best.coarsen(scene)
-    misfit = pixels.chi2(best.unknowns) - 1
-    excess = float((misfit * (pixels.weights > 0).sum(axis=(1, 2))).sum())
-
-    def settle_rival(rival: _Rival, on_step: OnStep) -> tuple[float, str]:
-        start = replace(best, unknowns=rival.unknowns, modes=SoftModes())
-        end = settle_minimum(
-            rival.scene, start, on_step, "rivals", steps=_STEPS, to_beat=best.value, is_rough=True
-        )
-        return 2 * (best.value - end.value) - rival.free_numbers, rival.cause
-
-    works = [partial(settle_rival, rival) for rival in _rivals(scene, best, names, setups)]
-    threads = available_threads(scene.threads)
-    gains = sorted(run_in_parallel(works, threads, on_step), reverse=True)
-    largest, _ = gains[0]
-    if largest < _MIN_GAIN:
-        return ""
-    is_doubtful = largest < _MIN_EXPLAINED_SHARE * excess
-    least = _MIN_GAIN if is_doubtful else _AS_LIKELY * largest
-    # Two rivals may have the same cause.
-    likely = dict.fromkeys(cause for gain, cause in gains if gain >= least)
-    falls = f"Σχ² falls by {largest:.0f}"
-    if is_doubtful:
-        falls += f", of an excess of {excess:.0f}: something else is wrong, too"
-    return f"{', or '.join(list(likely)[:2])} ({falls})"
-
-
-def gain_by_blur(scene: Scene, best: Minimum, on_step: OnStep) -> float:
-    """Return by how much a wider point spread lowers the objective; kernels stay."""
-    wider = settle_minimum(_wider(scene, _WIDER_PX), best, on_step, "point spread")
-    return best.value - wider.value
-
-
 def log_evidence(
     scene: Scene, best: Minimum, names: Sequence[str], options: FitOptions, on_step: OnStep
 ) -> float:
@@ -371,82 +286,3 @@ def log_evidence(
     ended = settle_minimum(scene, best, on_step, "evidence", least_gain=0.1)
     chances = [np.random.default_rng([options.seed, crc32(name.encode())]) for name in names]
     return posterior_of(scene, ended, chances[0], on_step, "evidence").log_evidence(chances)
-
-
-def _rivals(
-    scene: Scene, best: Minimum, names: Sequence[str], setups: Sequence[Setup] | None
-) -> Iterator[_Rival]:
-    several = len(scene.images) > 1
-    if several:
-        yield from _with_free_beam(scene, best)
-    if several and not scene.free_frames.any():
-        shifted = replace(scene, free_frames=_SHIFT)
-        cause = (
-            "the images are not in register: a shift between them explains them better; align "
-            "them by a shift"
-        )
-        yield _Rival(shifted, best.unknowns, 2 * (len(scene.images) - 1), cause)
-    if several and not scene.free_brightness:
-        cause = (
-            "the brightness of an image differs from its source's: a factor for each image "
-            "explains them better; free the brightness"
-        )
-        yield _Rival(replace(scene, free_brightness=True), best.unknowns, len(scene.images), cause)
-    if several and setups and set(names) == {"B"}:
-        yield from _with_electric_field(scene, best, setups)
-    cause = "the images are blurred by more than the point spread that was given"
-    for width in (_WIDER_PX, _MUCH_WIDER_PX):
-        yield _Rival(_wider(scene, width), best.unknowns, 0, cause)
-    cause = (
-        "a constant lies under the images: with less of it they are explained better; subtract "
-        "the detector's dark level"
-    )
-    for pedestal in _PEDESTALS:
-        yield _Rival(_without_pedestal(scene, pedestal), best.unknowns, 0, cause)
-
-
-def _with_free_beam(scene: Scene, best: Minimum) -> Iterator[_Rival]:
-    """Beams that differ from the assumed one on long waves, or also on the object's scale."""
-    advice = "give a reference of this shot, or fit the beam, as a source that is unknown"
-    causes = {
-        _BEAM_MODES: f"the beam differs from its source, smoothly over the image; {advice}",
-        _FINE_BEAM_MODES: (
-            "the object absorbs or scatters, or the beam has finer structure than its source; "
-            "give a reference of this shot, or images in which the object absorbs less"
-        ),
-    }
-    for modes, cause in causes.items():
-        if modes <= scene.beam_modes:
-            continue
-        beam = np.pad(best.unknowns.beam, (0, modes - scene.beam_modes))
-        freed = replace(scene, beam_modes=modes, beam_spread=_BEAM_SPREAD, free_brightness=True)
-        free_numbers = int((freed.prior.beam_weights > 0).sum())
-        yield _Rival(freed, best.unknowns._replace(beam=beam), free_numbers, cause)
-
-
-def _with_electric_field(scene: Scene, best: Minimum, setups: Sequence[Setup]) -> Iterator[_Rival]:
-    strengths = strengths_of(setups, ("B", "E"), len(setups))
-    strengths = strengths / strengths[0]
-    if np.linalg.matrix_rank(strengths, tol=0.02) < 2:
-        return
-    both = replace(scene, strengths=strengths, smoothness=np.tile(scene.smoothness, (2, 1)))
-    potentials = np.concatenate([best.unknowns.potentials, 0 * best.unknowns.potentials])
-    # Of an added field the smoothness lets through about as many numbers as waves of 16 px.
-    free_numbers = scene.images[0].size // 64
-    cause = "an electric field deflects beside the magnetic one; fit both fields, B and E"
-    yield _Rival(both, best.unknowns._replace(potentials=potentials), free_numbers, cause)
-
-
-def _wider(scene: Scene, added: float) -> Scene:
-    widths = [
-        float(np.hypot(width, added)) if isinstance(width, float) else width for width in scene.psf
-    ]
-    return replace(scene, psf=widths)
-
-
-def _without_pedestal(scene: Scene, pedestal: float) -> Scene:
-    """The images less a constant, brought back to their mean; so is their noise."""
-    share = 1 - pedestal
-    means = scene.images.sum(axis=(1, 2)) / np.maximum((scene.images != 0).sum(axis=(1, 2)), 1)
-    images = (scene.images - pedestal * means[:, None, None]) / share
-    return replace(scene, images=images, weights=scene.weights * share**2)

@@ -42,10 +42,7 @@ from napari_shadowinv.physics.poisson import border_mean
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
 # Fields and numbers of an instrument that explain an image alike are found last of all.
 _IN_VALLEY = 1e-4
-# It makes the error 1 to 2 % smaller, 0.1 would 1 to 6 %; two sets of samples differ by 10 %.
-_OPEN_BEAMS = 0.05
 _MOVED_BY_BEAMS = 0.01
-_BEAM_MODES = 8
 _RESPONSE, _RESPONSE_SEED = 0.01, 2  # of fields to numbers of an instrument
 _REFITTED = 0.02
 _MOST_STEPS = 600
@@ -355,48 +352,6 @@ class Posterior:
         ]
         return self._changes(slopes, _MOVED_BY_BEAMS)
 
-    def open_beams(
-        self, variation: float, samples: Sequence[Sample], rng: np.random.Generator
-    ) -> list[Unknowns]:
-        """Return random differences of a common beam that the images leave possible.
-
-        Parameters
-        ----------
-        variation : float
-            R.m.s. difference that is possible before the images are looked at.
-        samples : sequence of Sample
-            For the beam as it is; each makes one of the differences.
-        rng : numpy.random.Generator
-            For the beam's prior.
-
-        Returns
-        -------
-        list of Unknowns
-            The beam's difference, `Scene.with_free_beam`'s, with the change of the other unknowns
-            that it causes.
-
-        Notes
-        -----
-        With J and B the derivatives of the residuals by the unknowns and by the beam's cosines, H
-        and P the Hessian and the beam's prior, a sample x = H⁻¹ (Jᵀη + ξ) becomes one of both,
-        (x + δ, θ), by
-
-            [H  JᵀB; BᵀJ  BᵀB + P] (δ, θ) = (0, Bᵀ(η - Jx) + P^½ζ),
-
-        which is the response δ = -H⁻¹JᵀBθ to the sampled beam θ.
-        """
-        freed = self.scene.with_free_beam(_BEAM_MODES, variation)
-        weights = freed.prior.beam_weights
-        unknowns = self._unknowns._replace(beam=np.zeros(weights.shape))
-        posterior = Posterior(freed, unknowns, rng, self._after_step)
-        slopes = []
-        for sample in samples:
-            residuals = sample.noise - self._linear.push(sample.change)
-            pull = posterior._linear.pull(residuals).beam
-            pull += np.sqrt(weights) * rng.normal(size=weights.shape)
-            slopes.append(unknowns.zeros()._replace(beam=pull))
-        return posterior._changes(slopes, _OPEN_BEAMS)
-
     def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
         """Return half the log-determinant of the Hessian relative to the prior of potentials.
 
@@ -485,8 +440,7 @@ class BeamError:
     variation : float
         R.m.s. difference that the total error takes into account.
     share : float
-        R.m.s. error of the displacement, as a share of it, by beams that differ that far and are
-        compatible with the images.
+        R.m.s. error of the displacement, as a share of it, by beams that differ that far.
     scale : float
         Distance over which the beam varies, in shorter sides of the image.
     assumed : bool
@@ -518,10 +472,7 @@ class BeamError:
             f"image's shorter side would move the displacement by {self.sensitivity:.1%} (r.m.s.)"
         )
         if self.variation:
-            sentence += (
-                f"; of beams that differ by {percent(self.variation)} the images leave "
-                f"{self.share:.1%} open"
-            )
+            sentence += f", one by {percent(self.variation)} by {self.share:.1%}"
         return sentence
 
 
@@ -562,7 +513,7 @@ def draw_variations(
 
 
 _PART_SAMPLES, _PARTS = 3, 0.02
-_BEAM_SAMPLES, _OPEN_BEAM_SAMPLES, _BEAM_SEED = 2, 3, 1  # least numbers of changes
+_BEAM_SAMPLES, _BEAM_SEED = 3, 1  # least number of changes
 _SAMPLES_PER_BEAM = 2
 _SMOOTHED_ERRORS = 4.0  # px
 
@@ -611,7 +562,7 @@ class BeamShifts:
     """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
 
     `by_percent` is for beams that vary by 1 %. `errors` is for beams that vary as far as is stated
-    or assumed, and the images do not exclude, of which `changes` are random examples.
+    or assumed, of which `changes` are random examples.
     """
 
     by_percent: FloatArray
@@ -630,33 +581,26 @@ def shifts_by_beam(
 
     `samples` are the posterior's.
     """
-    if not samples or scene.beam_modes or scene.imperfect.parts:
+    if not samples or scene.imperfect.parts:
         return None
     variation = data.beam.rms
     middle = posterior.scene
     rng = np.random.default_rng([options.seed, _BEAM_SEED])
     length = data.beam.length * min(data.size)
     count = 1 if data.common else len(scene.images)
-    has_open_beam = data.common and variation > 0
-    enough = len(samples) // _SAMPLES_PER_BEAM
     variations = [
         np.broadcast_to(
             draw_variations(middle, length / middle.bin, count, rng), middle.beams.shape
         )
-        for _ in range(_BEAM_SAMPLES if has_open_beam else max(_BEAM_SAMPLES, enough))
+        for _ in range(max(_BEAM_SAMPLES, len(samples) // _SAMPLES_PER_BEAM))
     ]
     changes = posterior.moved_by_beams([0.01 * each for each in variations])
     by_percent = displacement_errors(scene, changes, data.size, length / 3)
     if not variation:
         return BeamShifts(by_percent, 0 * by_percent)
-    if not data.common:
-        scale = 100 * variation
-        scaled = tuple(change.like(scale * change.flat()) for change in changes)
-        return BeamShifts(by_percent, scale * by_percent, scaled)
-    # Several images exclude most of the beams that would move the field far.
-    changes = posterior.open_beams(variation, samples[: max(_OPEN_BEAM_SAMPLES, enough)], rng)
-    errors = displacement_errors(scene, changes, data.size, length / 3)
-    return BeamShifts(by_percent, errors, tuple(changes))
+    scale = 100 * variation
+    scaled = tuple(change.like(scale * change.flat()) for change in changes)
+    return BeamShifts(by_percent, scale * by_percent, scaled)
 
 
 def sampled_potentials(

@@ -33,7 +33,6 @@ FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
 _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
 _COARSE_STEPS, COARSE_GAIN, _FINE_GAIN = 60, 3.0, 2.0
 _LAST_GAIN = 0.5  # in pixels of two, where it costs little
-_HELD_BEAM = 0.01  # spread of an unknown beam's cosines before the field has been found
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
 _COARSE_SPACING, _MIDDLE_SPACING = 1 / 3, 0.25
 _BLURRED, _SPACING_OF_BLURRED = 2.0, 0.5  # px: so wide a blur hides how far apart rays are
@@ -179,7 +178,7 @@ def _is_shared(start: Start) -> bool:
 
 
 def _descend_together(scene: Scene, descents: Sequence[_Descent], on_step: OnStep) -> list[Minimum]:
-    held = replace(scene, beam_spread=_HELD_BEAM)
+    held = replace(scene, held=scene.held | {"beam"})
     works = [partial(each.run, held if each.start.beam_held else scene) for each in descents]
     return run_in_parallel(works, available_threads(scene.threads), on_step)
 
@@ -342,7 +341,7 @@ def refine_minimum(
     """
     unknowns, steps = _in_smaller_pixels(scene, minimum), 0
     modes = minimum.modes if minimum.bin == scene.bin else SoftModes()
-    has_dense_rays = bool(scene.imperfect.parts) and not is_near
+    has_dense_rays = bool(scene.imperfect.of_response) and not is_near
     usual = [_SPACING_WITH_NUMBERS] if has_dense_rays else list(_SPACINGS)
     denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))

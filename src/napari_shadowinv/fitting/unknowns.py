@@ -2,14 +2,14 @@
 
 - all numbers that a fit determines: `Unknowns`; displacements known beforehand: `Fiducials`
 - light that adds to each image, such as a background: `AdditiveBlock`, listed in `ADDITIVE`
-- the prior of potentials, beam, brightness, frames and light: `Prior`
+- the prior of potentials, instrument, brightness, frames and light: `Prior`
 
-The prior is quadratic; for the potentials and the beam it is
+The prior is quadratic; for the potentials it is
 
     ½ Σ_m (λ_m |∇⁴φ_m|² + κ_m |∇⁶φ_m|²) + ½ µ Σ_pad (|∇φ|² + φ²/ℓ²)
-    + ½ Σ (θ_ij / s_ij)² + ½ Σ |d(x_k) - d_k|² / σ_k²
+    + ½ Σ |d(x_k) - d_k|² / σ_k²
 
-and brightness, frames and light have the same form. Of a smooth object the data make λ small and
+and that of all other numbers is a sum ½ Σ (θ / s)². Of a smooth object the data make λ small and
 κ large, of one with kinks the other way round.
 """
 
@@ -30,20 +30,19 @@ from napari_shadowinv.fitting._ray_kernels import KNOT, add_ties, spline_tables
 from napari_shadowinv.fitting.rays import RayModel, at_rest
 from napari_shadowinv.options import FitOptions
 
-_COMMON = 3  # blocks that the images share; the others have a row for each image
+_COMMON = 2  # blocks that the images share; the others have a row for each image
 
 
 class Unknowns(NamedTuple):
     """The unknowns of a fit, or derivatives by them, or changes of them.
 
-    `potentials` (M, …) are B-spline coefficients of the fields' potentials, `beam` (n, n) cosine
-    coefficients of the beam's logarithm, `common` (n,) and `separate` (L, n) the numbers of an
-    `Imperfect` instrument, `brightness` (L,) logarithms, `frames` (L, 6) as a `RayModel` takes
-    them, `added` the coefficients (L, …) of each `AdditiveBlock`.
+    `potentials` (M, …) are B-spline coefficients of the fields' potentials, `common` (n,) and
+    `separate` (L, n) the numbers of an `Imperfect` instrument and of its beam, `brightness` (L,)
+    logarithms, `frames` (L, 6) as a `RayModel` takes them, `added` the coefficients (L, …) of each
+    `AdditiveBlock`.
     """
 
     potentials: FloatArray
-    beam: FloatArray
     common: FloatArray
     brightness: FloatArray
     frames: FloatArray
@@ -58,8 +57,8 @@ class Unknowns(NamedTuple):
     @classmethod
     def from_blocks(cls, blocks: Iterable[FloatArray]) -> Unknowns:
         """Return unknowns with the arrays of `blocks`."""
-        potentials, beam, common, brightness, frames, separate, *added = blocks
-        return cls(potentials, beam, common, brightness, frames, separate, tuple(added))
+        potentials, common, brightness, frames, separate, *added = blocks
+        return cls(potentials, common, brightness, frames, separate, tuple(added))
 
     def flat(self) -> FloatArray:
         """Return all values as one array."""
@@ -180,10 +179,6 @@ class PriorTerms:
         λ and κ of each field.
     tie, decay : float
         µ, and the length ℓ in px over which potentials fade in the pad.
-    beam_modes : int
-        Cosines of the beam's logarithm along each axis.
-    beam_spread : float
-        Standard deviation of the first of them.
     fiducials : Fiducials or None
         Displacements known at points.
     bin : int
@@ -197,8 +192,6 @@ class PriorTerms:
     smoothness: FloatArray
     tie: float = 30.0
     decay: float = np.inf
-    beam_modes: int = 0
-    beam_spread: float = 0.3
     fiducials: Fiducials | None = None
     bin: int = 1
     shift_spread: float = 5.0
@@ -313,15 +306,7 @@ class Prior(PriorTerms):
         """1 / s² of the values of each block but the potentials."""
         added = (block.prior_weights() for block in self.added)
         brightness = np.array(_BRIGHTNESS_WEIGHT)
-        return [self.beam_weights, _NORMAL, brightness, self.frame_weights, _NORMAL, *added]
-
-    @cached_property
-    def beam_weights(self) -> FloatArray:
-        """1 / s² of the beam's cosines, zero for those that are not used."""
-        order = np.arange(self.beam_modes)
-        square = order[:, None] ** 2 + order**2
-        used = (square > 0) & (square < self.beam_modes**2)
-        return np.where(used, square / self.beam_spread**2, 0.0)
+        return [_NORMAL, brightness, self.frame_weights, _NORMAL, *added]
 
     @cached_property
     def frame_weights(self) -> FloatArray:

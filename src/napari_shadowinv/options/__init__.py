@@ -10,6 +10,7 @@ window, and is saved with each result: there is no second list of defaults.
 from napari_shadowinv.options.beam_prior import (
     ASSUMED_BEAM,
     REFERENCE_BEAM,
+    UNKNOWN_BEAM_RMS,
     BeamComponents,
     BeamPrior,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "MAX_DEFAULT_SITES",
     "MAX_STRENGTH",
     "REFERENCE_BEAM",
+    "UNKNOWN_BEAM_RMS",
     "BeamComponents",
     "BeamPrior",
     "FitChoices",

@@ -187,6 +187,9 @@ ASSUMED_BEAM = BeamPrior(rms=0.05, length=0.25)
 REFERENCE_BEAM = BeamPrior(rms=0.005, length=0.25)
 """Prior of a beam whose source was recorded in another exposure, unless another one is stated."""
 
+UNKNOWN_BEAM_RMS = 0.15
+"""Relative r.m.s. variation of a beam that is called unknown, unless another one is stated."""
+
 
 def _normalise(images: Iterable[ArrayLike]) -> list[FloatArray]:
     """Return references with a mean of 1, all of one shape."""

@@ -86,12 +86,6 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
         description="Expected misalignment of later images (standard deviation in px after all "
         "steps). A small value attributes more of the displacement to the fields.",
     )
-    beam_modes: int = Field(
-        default=8,
-        ge=2,
-        le=32,
-        description="Number of cosine modes per axis for the logarithm of an unknown beam.",
-    )
     max_error: MaxError = 0.05
     samples: int = Field(
         default=6,
