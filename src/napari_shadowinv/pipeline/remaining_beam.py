@@ -1,4 +1,4 @@
-"""What steps and an estimated source leave of an uneven beam, and take from the object.
+"""Remains of an uneven beam after steps and source estimate, and their loss of the object.
 
 - an instrument that knows it: `after_steps`
 
