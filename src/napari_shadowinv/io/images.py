@@ -23,7 +23,6 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise, sha256
 from napari_shadowinv.io.formats import format_of
-from napari_shadowinv.preprocessing.image_checks import is_lit_around
 
 CHANNELS = ("red", "green", "blue", "mean")
 
@@ -62,6 +61,8 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
 
 def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, ...]:
     """Warn of a picture in colour, or with a bright rim: it may be a film, dark with dose."""
+    from napari_shadowinv.preprocessing.image_checks import is_lit_around
+
     grey = to_grey(array, "mean", "")
     if array.ndim == 3 and not np.array_equal(grey, to_grey(array, 0, "")):
         sign = f"channel {channel!r} of a colour image was used as the fluence"
