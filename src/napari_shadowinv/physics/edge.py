@@ -1,4 +1,4 @@
-"""What a field owes to the unseen: objects beyond the edge of its image.
+"""Errors of a field by the unseen: objects beyond the edge of its image.
 
 - changes of a field by what may lie there: `edge_changes`
 - the sides of the image that they come from: `edge_sides`, in words `edge_text`
