@@ -190,7 +190,8 @@ def test_three_energies_tell_a_magnetic_field_from_an_electric_one() -> None:
         counted(lambda y, x: b * magnetic(y, x) + e * electric(y, x), SIZE)  # noqa: B023
         for b, e in strengths_of(setups, ("B", "E"), 3)
     ]
-    result = fit(noisy(images, 0.02), setups=setups, fields=("B", "E"), noise=0.02, options=PLAIN)
+    known = {"setups": setups, "source": np.ones(SIZE), "noise": 0.02}
+    result = fit(noisy(images, 0.02), fields=("B", "E"), options=PLAIN, **known)
     assert [field.name for field in result.fields] == ["B", "E"]
     assert distance(result.fields[0].displacement, on_pixels(magnetic, SIZE)) < 0.06
     assert distance(result.fields[1].displacement, on_pixels(electric, SIZE)) < 0.12
@@ -284,7 +285,8 @@ def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
     cut = bump(0.7, 8, (0, 30))
     images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
     options = FitOptions(samples=0, boundary=boundary)
-    result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=options)
+    known = {"strengths": [1, 0.7], "source": np.ones(SIZE), "noise": 0.02}
+    result = fit(noisy(images, 0.02), options=options, **known)
     assert result.chi2.max() < 1.3
     assert result.verdict is Verdict.EDGE
     assert "larger field of view" in result.explanation

@@ -87,7 +87,7 @@ _DECIDES = 10.0  # in log evidence
 _MIN_BLUR_SCORE = 4.0  # standard deviations
 _NOISY_REFERENCE, _REFERENCE_BLUR_PX = 0.02, 1.5  # share of the variance; standard deviation
 _DARKEST = 1e-3  # of a beam's mean
-_MAX_RIVAL_CHI2 = 100.0  # a fit that ended further away is no start for a rival
+_MAX_RIVAL_CHI2 = 25.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
 _CHECKED = 2  # samples of an instrument that are solved, too
 # Before a field has been found, they would take its place.
