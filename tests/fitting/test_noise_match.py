@@ -59,7 +59,11 @@ def test_the_noise_of_a_reference_is_no_misfit(clean: FloatArray) -> None:
     image, reference = rng.poisson(4 * COUNTS * clean), rng.poisson(4 * COUNTS, SIZE)
     for noise in (None, "poisson"):
         found = fit(
-            image.astype(float), source=reference.astype(float), noise=noise, options=OPTIONS
+            image.astype(float),
+            source=reference.astype(float),
+            noise=noise,
+            options=OPTIONS,
+            instrument={"beam_rms": 0},
         )
         assert found.verdict is Verdict.DETERMINED
         assert found.chi2 == pytest.approx(1, abs=0.3)

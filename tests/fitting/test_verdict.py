@@ -183,7 +183,7 @@ def test_verdict_names_a_residual_that_is_no_noise(
 
 
 def test_verdict_takes_a_misfit_of_a_cut_object_for_the_edge() -> None:
-    verdict, why = assess(**GOOD | {"displacement": blob((24, 46)), "chi2": np.array([1.6, 1.0])})
+    verdict, why = assess(**GOOD | CUT | {"chi2": np.array([1.6, 1.0])})
     assert verdict is Verdict.EDGE
     assert "larger field of view" in why
     assert "image 1: χ² 1.6" in why

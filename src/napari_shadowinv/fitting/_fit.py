@@ -287,7 +287,10 @@ def fit(
                 errors.ravel(), errors.ravel()
             )
             potentials *= np.float32(np.sqrt(ratio))
-            openness = replace(openness, errors=amplified)
+            by_part = dict(openness.by_part)
+            if by_part:
+                by_part["noise"] = amplification * by_part["noise"]
+            openness = replace(openness, errors=amplified, by_part=by_part)
     found_by = FitReport(
         objective=value,
         iterations=taken,

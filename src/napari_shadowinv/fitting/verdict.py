@@ -145,9 +145,9 @@ def assess_verdict(
             causes = f"the object may have changed between images, or energies, {causes}"
         causes = _cause_text(pattern) or causes
         # An object that the edge cuts is explained by nothing within it.
-        verdict = Verdict.EDGE if at_edge else Verdict.MISFIT
+        verdict = Verdict.EDGE if at_edge and not pattern.cause else Verdict.MISFIT
         misfit = f"the forward model does not explain {worst}, where 1 is expected"
-        return verdict, f"{misfit}: {at_edge or causes}"
+        return verdict, f"{misfit}: {causes if verdict is Verdict.MISFIT else at_edge}"
     if single and beam_unknown:
         return Verdict.AMBIGUOUS, (
             "one image cannot tell the beam from the object: many pairs of them explain it; take "
@@ -194,10 +194,10 @@ def assess_verdict(
             "known"
         )
     is_small = min(used.shape) < SMALL_PX
-    is_fitted = bool(parts.keys() - {"noise", "edge"}) and (
-        fit.instrument.has_numbers or not single
-    )
-    is_unsure = is_fitted and (is_small or _UNDERESTIMATED & parts.keys())
+    # That of one image, or of a recorded source, is a linear response.
+    numbers = {key for key, share in parts.items() if share} - {"noise", "edge"}
+    is_fitted = fit.instrument.has_numbers or report.beam is None
+    is_unsure = bool(numbers) and is_fitted and (is_small or _UNDERESTIMATED & numbers)
     safety = _SAFETY if is_unsure or beam_unknown else 1.0
     if fit.instrument.beam_between and not single:
         safety = _SAFETY_BETWEEN
