@@ -22,7 +22,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.inversion import Inversion, Report
-from napari_shadowinv.inversion.budget import ErrorEstimate, Errors
+from napari_shadowinv.inversion.error_budget import ErrorEstimate, Errors
 from napari_shadowinv.inversion.solution_checks import image_residual
 from napari_shadowinv.options import FitOptions, InversionOptions
 from napari_shadowinv.physics.beam import BeamSetup

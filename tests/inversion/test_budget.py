@@ -24,7 +24,8 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.budget import Budget, ErrorEstimate, discretisation_share
+from napari_shadowinv.inversion.budget import Budget, discretisation_share
+from napari_shadowinv.inversion.error_budget import ErrorEstimate
 from napari_shadowinv.inversion.imperfections import motions
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare

@@ -19,7 +19,7 @@ from helpers.toroid import noisy_toroid_image, toroid_image
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.inversion import invert, solution_checks
-from napari_shadowinv.inversion.budget import ErrorEstimate
+from napari_shadowinv.inversion.error_budget import ErrorEstimate
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.solution_checks import (

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv import InversionOptions, invert, synthetic_image
 from napari_shadowinv.cautions import CAUTION_CODES, Caution
 from napari_shadowinv.facts import Level, Verdict
-from napari_shadowinv.inversion.budget import ErrorEstimate
+from napari_shadowinv.inversion.error_budget import ErrorEstimate
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 
 FEW = InversionOptions(n_sites=900)

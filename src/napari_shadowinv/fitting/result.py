@@ -637,6 +637,7 @@ class Fit(Summarised):
         content = json.loads(attributes["report"])
         if content["beam"] is not None:
             content["beam"] = BeamError(**content["beam"])
+        content["sides"] = tuple(content["sides"])
         names = [str(name) for name in dataset["field"].values]
         fields = [
             _field(dataset, name, f"_{name}" if len(names) > 1 else "", smoothness)

@@ -28,7 +28,8 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import to_figures
 from napari_shadowinv.inversion import normalise
-from napari_shadowinv.inversion.budget import Budget, Errors
+from napari_shadowinv.inversion.budget import Budget
+from napari_shadowinv.inversion.error_budget import Errors
 from napari_shadowinv.inversion.machine_code import loading_kernels
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, mask_unlit, prepare

@@ -1,7 +1,6 @@
 """The error budget of an inversion, and the number of sites that it needs.
 
-- the errors of a result: `Errors`, of which each is an `ErrorEstimate`
-- their computation from the solved levels, and the number of sites still needed: `Budget`
+- its computation from the solved levels, and the number of sites still needed: `Budget`
 - add a quantity: one entry of `FLUX_ERRORS`
 
 Between two levels, one with four times the sites of the other, the displacement changes by the
@@ -13,10 +12,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.ndimage import (
@@ -31,8 +28,14 @@ from scipy.spatial import KDTree
 from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.cautions import Caution
-from napari_shadowinv.facts import percent, round_down, to_figures
+from napari_shadowinv.facts import percent
+from napari_shadowinv.inversion.error_budget import (
+    SHARE_OF_NOISE,
+    ErrorEstimate,
+    Errors,
+    root_of,
+    share_of,
+)
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
     SolvedShot,
@@ -43,8 +46,7 @@ from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument, InversionOptions
-from napari_shadowinv.physics.edge import edge_changes, edge_sides, edge_text
-from napari_shadowinv.physics.units import BeamCondition, PeakError
+from napari_shadowinv.physics.edge import edge_changes, edge_sides
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, Level, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
@@ -55,11 +57,8 @@ _USUAL_RATE, _RATES = 0.35, (0.25, 0.7)  # of the change between levels to the o
 _MIN_STEP = 3.0  # times the sites of the level before, for a full step
 _SAFETY = 1.3
 _MAX_RESIDUAL = 0.1  # of a level, for its error to be estimated
-_SHARE_OF_NOISE = 0.2
 _MAX_SHARE_OF_NOISE = 0.8  # above it, an estimate of the noise suffices
-_MAX_BEAM_AT_PEAK = 0.1  # of the displacement, without a warning
 _MAX_BEAM_DEVIATIONS = 3.0  # of a beam from its measured prior
-_MAX_BEAM_RMS = 0.25  # of the displacement, without a warning
 
 _MAX_RESPONSE_SITES = 4500  # of a level whose linear response is computed
 _NOISE_SAMPLES, _BEAM_SAMPLES = 16, 8
@@ -69,340 +68,6 @@ _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 _EDGE_PLACES = 200  # along the shorter side, where the error by the edge is computed
 
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
-_BEAM_BASES = {  # name of the part, and its basis in a text
-    "assumed": ("beam assumed, {}", "assumed"),
-    "reference": ("beam of another exposure, assumed {}", "another exposure, assumed"),
-    "stated": ("beam stated, {}", "stated"),
-    "seen": ("image and source differ by {}", "seen outside the object"),
-    "references": ("beam by its references, {}", "by its references"),
-    "filtered": ("filters, {} taken from the object", "taken from the object"),
-    "outside": ("beam measured outside the object, {}", "measured outside the object"),
-}
-
-_UNMEASURED = "assumed", "reference"  # bases that are conditions of a result
-
-_REDUCED_SHARE = 0.25  # of the wanted mean square, at least for parts that are to be reduced
-_REMEDIES = {
-    "discretisation": "more sites",
-    "solver": "a smaller tolerance",
-    "edge": "a larger field",
-}
-
-
-class ErrorEstimate(NamedTuple):
-    """A standard error of the displacement, px."""
-
-    rms: float  # length of the error, root mean square over the image
-    at_peak: float  # of the largest displacement
-
-    def times(self, factor: float) -> ErrorEstimate:
-        """Return the error in another unit, or by a larger cause."""
-        return ErrorEstimate(factor * self.rms, factor * self.at_peak)
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Error budget of an inversion: standard errors of the displacement, in px.
-
-    It does not include the effects of a blurred image or of crossing rays.
-
-    Attributes
-    ----------
-    peak, rms : float
-        Largest displacement inside the mask and its root mean square, px, for comparison.
-    discretisation : ErrorEstimate
-        Change by more sites; NaN if there was no coarser level to compare with.
-    noise : ErrorEstimate
-        Scatter by the noise of image and source.
-    effects : dict of str to ErrorEstimate
-        Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`, and of the
-        instrument's imperfections.
-    edge : ErrorEstimate
-        Effect of what may lie beyond the image's edge, with what the other errors add to it.
-    sides : tuple of str
-        Sides of the image near which the edge matters most: 'top', 'bottom', 'left', 'right'.
-    beam : ErrorEstimate or None
-        Effect of a beam that differs from the source by `beam_variation`; None if the source is
-        exact: stated so, or uniform and given, and no difference was seen.
-    beam_sensitivity : ErrorEstimate
-        Effect of a beam that differs from the source by 1 %.
-    sensitivities : dict of str to ErrorEstimate
-        Effects of imperfections of the instrument, by their names with a size, such as
-        "background, 5 %".
-    sizes : dict of str to float
-        Standard deviations of the instrument that `effects` stand for, by their names.
-    beam_variation : float
-        Relative r.m.s. difference of beam and source that `beam` stands for.
-    beam_scale : float
-        Length over which they differ, as a share of the image's shorter side.
-    beam_basis : str
-        Origin of that number: 'assumed' for an estimated source, 'reference' if it is assumed of a
-        recorded source, which is of another exposure, 'stated' by the user, 'seen' as a
-        difference of image and source outside the object, 'references' for a prior from them,
-        'outside' for a source estimated from the image outside the object, with its variance.
-    noise_correlation : float
-        Standard deviation of the Gaussian blur with the measured correlation of the noise, px; 0
-        for white noise.
-    noise_is_bound : bool
-        Whether structure hides the noise: its error is then the largest that the image allows.
-    """
-
-    peak: float
-    rms: float
-    discretisation: ErrorEstimate
-    noise: ErrorEstimate
-    effects: dict[str, ErrorEstimate]
-    edge: ErrorEstimate
-    sides: tuple[str, ...]
-    beam: ErrorEstimate | None
-    beam_sensitivity: ErrorEstimate
-    sensitivities: dict[str, ErrorEstimate]
-    sizes: dict[str, float]
-    beam_variation: float
-    beam_scale: float
-    beam_basis: str
-    noise_correlation: float
-    noise_is_bound: bool = False
-
-    @property
-    def total(self) -> ErrorEstimate:
-        """Sum of all contributions in squares."""
-        parts = np.array(list(self.parts.values()))
-        return _roots(*(parts**2).sum(axis=0))
-
-    @property
-    def of_peak(self) -> PeakError | None:
-        """Total at the peak as a share of it, and its largest contribution; None without a peak.
-
-        This is the error in every headline.
-        """
-        if not self.peak > 0:
-            return None
-        parts = self.parts
-        cause = max(parts, key=lambda name: parts[name].at_peak)
-        return PeakError(self.total.at_peak / self.peak, cause)
-
-    @property
-    def parts(self) -> dict[str, ErrorEstimate]:
-        """Known errors by their causes, the largest first."""
-        noise = "noise"
-        if self.noise_correlation:
-            limit = "at most, hidden by structure, " if self.noise_is_bound else ""
-            noise = f"noise, {limit}correlated over {to_figures(self.noise_correlation)} px"
-        parts = {noise: self.noise, "discretisation": self.discretisation, **self.effects}
-        if self.beam is not None:
-            parts[self._beam_name] = self.beam
-        known = {name: error for name, error in parts.items() if not math.isnan(error.rms)}
-        # Other errors move the field at the edge, too: only what exceeds them is the object's.
-        excess = np.array(self.edge) ** 2 - (np.array(list(known.values())) ** 2).sum(axis=0)
-        if excess[0] > 0:
-            known["edge"] = _roots(*np.maximum(excess, 0.0))
-        return dict(sorted(known.items(), key=lambda part: -part[1].rms))
-
-    @property
-    def _beam_name(self) -> str:
-        return _BEAM_BASES[self.beam_basis][0].format(percent(self.beam_variation))
-
-    @property
-    def limited_by(self) -> str:
-        """Largest part with its share of the displacement (r.m.s.), such as "beam 23 %"."""
-        name, error = next(iter(self.parts.items()))
-        return f"{self._title(name)} {_share_text(error.rms, self.rms)}"
-
-    def _title(self, name: str) -> str:
-        is_filtered = self.beam_basis == "filtered"
-        return "beam" if name == self._beam_name and not is_filtered else name.partition(",")[0]
-
-    @property
-    def share(self) -> float:
-        """Total as a share of the displacement (r.m.s.); infinite without a displacement."""
-        return self.total.rms / self.rms if self.rms > 0 else math.inf
-
-    @property
-    def share_text(self) -> str:
-        """Total as a share of the displacement (r.m.s.), such as "23 %"; else in px."""
-        return _share_text(self.total.rms, self.rms)
-
-    @property
-    def largest_part(self) -> str:
-        """Largest part with its share, such as "beam 23 % (5 % rms over a quarter, assumed)"."""
-        return self._part_text(next(iter(self.parts)))
-
-    @property
-    def ranking(self) -> str:
-        """The parts as shares of the displacement (r.m.s.), the largest first."""
-        return ", ".join(map(self._part_text, self.parts))
-
-    def _part_text(self, name: str) -> str:
-        """Describe a part by its title, its share, and the deviation that it stands for."""
-        share = _share_text(self.parts[name].rms, self.rms)
-        if name == self._beam_name:
-            size = f"{percent(self.beam_variation)} rms over {self._beam_length}"
-            return f"{self._title(name)} {share} ({size}, {_BEAM_BASES[self.beam_basis][1]})"
-        title, _, size = name.partition(", ")
-        return f"{title} {share} ({size})" if size else f"{title} {share}"
-
-    @property
-    def _beam_length(self) -> str:
-        lengths = {0.25: "a quarter", 0.5: "half"}
-        return lengths.get(self.beam_scale, to_figures(self.beam_scale))
-
-    def beam_condition(self, share: float) -> BeamCondition | None:
-        """Return the condition on a beam that was assumed; None if that is not all that it takes.
-
-        Parameters
-        ----------
-        share : float
-            Largest total of the displacement (r.m.s.).
-        """
-        if self.beam is None or self.beam_basis not in _UNMEASURED or not self.rms > 0:
-            return None
-        rest = replace(self, beam=None).total
-        field = rest.rms / self.rms, self.beam.rms / self.rms
-        peak = rest.at_peak / self.peak, self.beam.at_peak / self.peak
-        recorded = self.beam_basis == "reference"
-        return BeamCondition.within(share, self.beam_variation, field, peak, recorded=recorded)
-
-    def measure_next(self, share: float) -> str:
-        """Return what has to be known better for a total of at most `share`, and that total.
-
-        Parameters
-        ----------
-        share : float
-            Of the displacement (r.m.s.).
-
-        Returns
-        -------
-        str
-            Such as "with the beam known to 0.5 %: 12 %"; empty if the total is no larger.
-        """
-        if not self.rms > 0:
-            return ""
-        squares = {name: error.rms**2 for name, error in self.parts.items()}
-        wanted, rest = (share * self.rms) ** 2, self.total.rms**2
-        large: list[str] = []
-        for name, square in squares.items():
-            if rest <= wanted * (1 - _REDUCED_SHARE if large else 1):
-                break
-            large.append(name)
-            rest -= square
-        if not large:
-            return ""
-        statements = []
-        for name in large:
-            allowed = math.sqrt(max(wanted - rest, 0) / len(large) / squares[name])
-            statement, reached = self._statement(name, min(allowed, 1.0))
-            statements.append(statement)
-            squares[name] *= reached**2
-        total = math.sqrt(sum(squares.values()))
-        *others, last = statements
-        listed = f"{', '.join(others)} and {last}" if others else last
-        return f"with {listed}: {_share_text(total, self.rms)}"
-
-    def _statement(self, name: str, factor: float) -> tuple[str, float]:
-        """Return what reduces a part by a factor, in round numbers, and their factor."""
-        title = self._title(name)
-        if title == "noise":
-            shots = math.ceil(factor**-2)
-            return f"{shots:,} shots averaged", shots**-0.5
-        if title in _REMEDIES:
-            return _REMEDIES[title], factor
-        is_beam = title == "beam" and self.beam_variation
-        if not is_beam and name not in self.sizes:
-            return f"{factor:.1g} times the {title} error", factor
-        size = self.beam_variation if is_beam else self.sizes[name]
-        known = {each.title: each for each in IMPERFECTIONS}.get(title)
-        unit, scale, power = "%", 100.0, 1.0
-        if known is not None:
-            unit, scale, power = known.unit, known.factor, 2.0 if known.is_even else 1.0
-        rounded = round_down(scale * size * factor ** (1 / power))
-        text = f"the {title} known to {to_figures(rounded)} {unit}".rstrip()
-        return text, (rounded / scale / size) ** power
-
-    def accuracy_caution(self, accuracy: float, why: str) -> Caution | None:
-        """Warn if the discretisation error exceeds the accuracy and is not hidden by noise."""
-        error = self.discretisation.rms
-        if not self.rms > 0 or not error > max(
-            accuracy * self.rms, _SHARE_OF_NOISE * self.noise.rms
-        ):
-            return None
-        return Caution(
-            "accuracy",
-            f"the accuracy of {percent(accuracy)} is not reached: {why}, the discretisation "
-            f"error is about {_share_text(error, self.rms)} of the displacement; give a larger "
-            "number of sites",
-        )
-
-    def times(self, factor: float) -> Errors:
-        """Return the budget in another unit; 1 px of displacement is `factor` of it."""
-        lengths: dict[str, Any] = {"peak": factor * self.peak, "rms": factor * self.rms}
-        for name, value in vars(self).items():
-            if isinstance(value, ErrorEstimate):
-                lengths[name] = value.times(factor)
-            elif name in ("effects", "sensitivities"):
-                lengths[name] = {cause: error.times(factor) for cause, error in value.items()}
-        return replace(self, **lengths)
-
-    def with_scale(self, cause: str, size: float, share: float) -> Errors:
-        """Return the budget of a quantity whose scale has a relative error `share` by a cause.
-
-        The cause, such as "energy, 5 %", is known to `size`.
-        """
-        effects = {**self.effects, cause: ErrorEstimate(self.rms, self.peak).times(share)}
-        return replace(self, effects=effects, sizes={**self.sizes, cause: size})
-
-    def rows(self, subject: str = "displacement") -> list[tuple[str, str]]:
-        """Describe the budget of a subject in words: names and texts."""
-        of_subject = f" of the {subject}" if self.rms > 0 else ""
-        text = (
-            f"{self.share_text}{of_subject} (r.m.s.): {self.ranking}; crossing rays are not in it"
-        )
-        if math.isnan(self.discretisation.rms):
-            text += "; discretisation was not estimated, as only one level was solved"
-        rows = [("errors", text)]
-        if next_step := self.measure_next(self.share / 2):
-            rows.append(("measure next", next_step))
-        basis = "exact" if self.beam is None else self._beam_name.removeprefix("beam ")
-        by_beam = (
-            f"{basis}; a source that differs from it by 1 % (r.m.s.) over {self._beam_length} of "
-            "the image's shorter side moves the displacement by "
-            f"{_share_text(self.beam_sensitivity.rms, self.rms)} (r.m.s.), its peak by "
-            f"{_share_text(self.beam_sensitivity.at_peak, self.peak)}"
-        )
-        effects = ", ".join(
-            f"{_share_text(error.rms, self.rms)} ({name})"
-            for name, error in self.sensitivities.items()
-        )
-        by_instrument = f"the displacement would move by (r.m.s.): {effects}"
-        return [*rows, ("beam", by_beam), ("instrument", by_instrument)]
-
-    def edge_caution(self, max_error: float) -> Caution | None:
-        """Warn if what lies beyond the edge moves the displacement by more than `max_error` of it.
-
-        Not where other errors are half as large, which move it at the edge by chance.
-        """
-        edge = self.parts.get("edge")
-        if edge is None or not self.rms > 0:
-            return None
-        others = math.sqrt(max(self.total.rms**2 - edge.rms**2, 0.0))
-        if edge.rms < max(max_error * self.rms, 2 * others):
-            return None
-        return Caution("edge", edge_text(edge.rms / self.rms, self.sides))
-
-    def beam_caution(self) -> Caution | None:
-        """Warn if image and source differ outside the object so that the peak is uncertain."""
-        if self.beam is None or self.beam_basis != "seen" or not self.peak > 0:
-            return None
-        at_peak, everywhere = self.beam.at_peak / self.peak, self.beam.rms / self.rms
-        if not (at_peak > _MAX_BEAM_AT_PEAK or everywhere > _MAX_BEAM_RMS):
-            return None
-        return Caution(
-            "beam",
-            f"image and source differ by {percent(self.beam_variation)} (r.m.s.) where there is "
-            f"no object: the field may be off by {_share_text(self.beam.rms, self.rms)}, its peak "
-            f"by {_share_text(self.beam.at_peak, self.peak)}; use a source of the same exposure, "
-            "or fit the beam",
-        )
 
 
 def discretisation_share(times: float, rate: float = _USUAL_RATE) -> float:
@@ -471,7 +136,7 @@ class Budget:
         rms = float(np.sqrt(np.mean(np.sum(self._move(solved[-1]) ** 2, axis=0))))
         squares, power = self._change(solved)
         error = float(np.sqrt(squares.mean()))
-        share = _share_text(error, rms)
+        share = share_of(error, rms)
         text = f"their discretisation error is about {share}{' of the displacement' * (rms > 0)}"
         allowed = self.options.accuracy * rms
         if error <= allowed:
@@ -485,12 +150,10 @@ class Budget:
             moves, finer = self._noisy_moves(response, solved[-1].level.spacing)
             by_noise = _with_finer(_mean_square(moves), finer)
             noise = math.sqrt(float((by_noise * response.shares).sum()))
-        if error < _SHARE_OF_NOISE * noise:
-            self.reason = (
-                f"{text}, below a fifth of what the noise does ({_share_text(noise, rms)})"
-            )
+        if error < SHARE_OF_NOISE * noise:
+            self.reason = f"{text}, below a fifth of what the noise does ({share_of(noise, rms)})"
             return 0.0
-        excess = error / max(allowed, _SHARE_OF_NOISE * noise)
+        excess = error / max(allowed, SHARE_OF_NOISE * noise)
         return float(_SAFETY * excess ** (1 / power))
 
     def errors(
@@ -521,14 +184,14 @@ class Budget:
             squares = _with_finer(_mean_square(moves), finer)
             at_peak = ((moves[close] @ along) ** 2).mean(axis=1)
             at_peak = _with_finer(at_peak, finer[close] / 2)
-            return _roots((squares * shares).sum(), (at_peak * near[close]).sum())
+            return root_of((squares * shares).sum(), (at_peak * near[close]).sum())
 
         discretisation = ErrorEstimate(math.nan, math.nan)
         if len(solved) > 1:
             squares, _ = self._change(solved)
             spacing = max(solved[-2].level.spacing, _stride(mask.shape))
             weights = _near(peak, self._places.T, spacing)
-            discretisation = _roots(squares.mean(), (squares * weights).sum() / 2)
+            discretisation = root_of(squares.mean(), (squares * weights).sum() / 2)
         lengths = ErrorEstimate(float(np.sqrt(np.mean(length[lit] ** 2))), float(length.max()))
         shot = SolvedShot(self._prepared.in_units(), displacement, response, self.options.seed)
         effects: dict[str, ErrorEstimate] = {}
@@ -759,7 +422,7 @@ def _error_by_edge(
     row, column = peak // step
     along = displacement[:, *peak] / max(float(np.hypot(*displacement[:, *peak])), 1e-300)
     at_peak = ((changes[:, :, row, column] @ along) ** 2).sum()
-    return _roots(squares.mean() / used.mean(), at_peak), edge_sides(squares)
+    return root_of(squares.mean() / used.mean(), at_peak), edge_sides(squares)
 
 
 FluxErrors = Callable[[LinearResponse, LevelSolution, InversionOptions], FloatArray | None]
@@ -822,12 +485,3 @@ def _near(peak: FloatArray, places: FloatArray, spacing: float) -> FloatArray:
     distance = np.hypot(*(places - peak).T)
     close = distance <= max(_NEAR * spacing, float(distance.min()))
     return np.asarray(close / close.sum())
-
-
-def _roots(square: float, square_at_peak: float) -> ErrorEstimate:
-    return ErrorEstimate(math.sqrt(square), math.sqrt(square_at_peak))
-
-
-def _share_text(error: float, total: float) -> str:
-    """Write an error of a displacement in per cent of it; without a displacement, in px."""
-    return percent(error / total) if total > 0 else f"{to_figures(error)} px"

@@ -32,7 +32,7 @@ from napari_shadowinv.facts import (
     to_figures,
     verdict_fact,
 )
-from napari_shadowinv.inversion.budget import Errors
+from napari_shadowinv.inversion.error_budget import Errors
 from napari_shadowinv.inversion.normalise import lit_pixels
 from napari_shadowinv.inversion.solution_checks import DECISIVE
 from napari_shadowinv.inversion.variables import (

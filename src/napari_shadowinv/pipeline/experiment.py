@@ -29,8 +29,8 @@ from napari_shadowinv.fitting import Fit, FitShot, fit
 from napari_shadowinv.fitting.compilation import ensure_compiled as ensure_fit_compiled
 from napari_shadowinv.fitting.shots import NearField
 from napari_shadowinv.inversion import invert
-from napari_shadowinv.inversion.budget import Errors
 from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inversion_compiled
+from napari_shadowinv.inversion.error_budget import Errors
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
 from napari_shadowinv.physics.beam import BeamSetup, unit_in_title
 from napari_shadowinv.physics.phantom_models import PhantomRecipe

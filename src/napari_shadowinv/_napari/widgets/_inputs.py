@@ -46,6 +46,7 @@ _KINDS: Mapping[Any, Mapping[str, float]] = {**DETECTORS, **BEAM_SOURCES}
 _UNSTATED = {
     "beam_rms": f"{ASSUMED_BEAM.rms:g}, or {REFERENCE_BEAM.rms:g} if recorded",
     "noise_correlation": "measured in the image",
+    "registration": "measured in the images",
 }
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
