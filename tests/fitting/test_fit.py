@@ -339,7 +339,8 @@ def test_a_field_that_is_not_there_does_not_make_the_images_likelier() -> None:
     weaker = [setups[0].momentum / setup.momentum for setup in setups]
     images = [counted(lambda y, x: s * WEAK(y, x), SIZE) for s in weaker]  # noqa: B023
     options = FitOptions(samples=0, spacing=0.25)
-    fits = compare(noisy(images, NOISE), setups=setups, noise=NOISE, options=options)
+    known = {"setups": setups, "noise": NOISE, "source": np.ones(SIZE)}
+    fits = compare(noisy(images, NOISE), options=options, **known)
     assert [len(each.fields) for each in fits] == [1, 2, 1]
     assert fits[0].fields[0].name == "B"
     evidence = [each.report.log_evidence for each in fits]

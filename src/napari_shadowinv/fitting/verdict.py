@@ -69,6 +69,7 @@ MISFIT_CHI2 = 1.3
 # 0.93: where rays meet or cross, one image can be explained by fields of other folds.
 _MEETING, _FEW = 0.2, 0.02  # Jacobian, and share of the object
 _OBJECT = 0.1  # of the largest displacement
+_NEARLY = 5.0  # χ² of a misfit by an edge alone
 _TOO_QUIET = 0.4  # χ²; an estimated noise may be too large by a third
 _AS_GOOD = 0.03  # of the objective
 _OTHER_FIELD = 0.05  # of the displacement, r.m.s.
@@ -144,8 +145,9 @@ def assess_verdict(
         if len(chi2) > 1:
             causes = f"the object may have changed between images, or energies, {causes}"
         causes = _cause_text(pattern) or causes
-        # An object that the edge cuts is explained by nothing within it.
-        verdict = Verdict.EDGE if at_edge and not pattern.cause else Verdict.MISFIT
+        # An object that the edge cuts is explained by nothing within it, but nearly.
+        is_near = chi2.max() < _NEARLY and not pattern.cause
+        verdict = Verdict.EDGE if at_edge and is_near else Verdict.MISFIT
         misfit = f"the forward model does not explain {worst}, where 1 is expected"
         return verdict, f"{misfit}: {causes if verdict is Verdict.MISFIT else at_edge}"
     if single and beam_unknown:

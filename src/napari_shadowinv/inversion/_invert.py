@@ -265,12 +265,14 @@ def invert(
         prepared = prepare(image, source, options, mask)
         moved: Caution | None = None
         if measured:
-            recorded = prepared.image, prepared.source, prepared.mask
-            source, error, moved = register_source(*recorded, instrument)
+            recorded = prepared.source
+            source, error, moved = register_source(
+                prepared.image, recorded, prepared.mask, instrument
+            )
             instrument = instrument.with_registration(error)
-        if moved is not None:
-            plan = start = None
-            prepared = prepare(image, source, options, mask)
+            if source is not recorded:
+                plan = start = None
+                prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
     with measure_time("sites", seconds):
         if plan is None:

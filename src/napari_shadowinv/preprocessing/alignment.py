@@ -100,7 +100,7 @@ class RegisteredSource(NamedTuple):
     error : float
         Standard deviation of the shift that is left, px.
     caution : Caution or None
-        If the source was moved.
+        If the source was moved further than was expected.
     """
 
     source: FloatArray
@@ -123,11 +123,13 @@ def register_source(
     error = shift.left(expected)
     if not shift.is_significant.any():
         return RegisteredSource(source, error, None)
+    moved = np.where(usable, move(source, shift.significant), 0.0)
+    if np.abs(shift.significant).max() < _SIGNIFICANT_ERRORS * expected:
+        return RegisteredSource(moved, error, None)
     text = (
         f"register: the source was moved by {shift.text} to fit the image; what is left of the "
         "shift is in the error. State a registration of 0 if both are on the same pixels"
     )
-    moved = np.where(usable, move(source, shift.significant), 0.0)
     return RegisteredSource(moved, error, Caution("register", text))
 
 
