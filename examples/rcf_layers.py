@@ -68,7 +68,12 @@ for layer, (energy, top, left) in LAYERS.items():
 blur = 30 / factor  # 30 px of the film, 2.5 mm
 sources = {layer: low_pass_source(image, blur) for layer, image in doses.items()}
 inversions = {
-    layer: invert(image, source=sources[layer], options=InversionOptions(floor=1e-2))
+    layer: invert(
+        image,
+        source=sources[layer],
+        options=InversionOptions(floor=1e-2),
+        measured=False,  # a guess
+    )
     for layer, image in doses.items()
 }
 strengths = {
