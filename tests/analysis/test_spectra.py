@@ -22,6 +22,7 @@ from napari_shadowinv.analysis.power_spectra import (
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
+from napari_shadowinv.options import Instrument
 
 SIDE = 64
 ENDS = 3.0, 28.0
@@ -151,7 +152,8 @@ def turbulent_image(side: int, contrast: float, seed: int, slope: float = -5 / 3
 @pytest.fixture(scope="module")
 def shot():
     counts, potential = turbulent_image(96, 0.6, 3)
-    return invert(counts, source=np.full(counts.shape, 250.0)), potential
+    white = Instrument(noise_correlation=0)
+    return invert(counts, source=np.full(counts.shape, 250.0), instrument=white), potential
 
 
 def test_response_corrects_what_the_inversion_loses(shot):
