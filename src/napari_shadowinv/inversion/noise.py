@@ -415,7 +415,7 @@ class _CalmDifferences:
         return max(math.ceil(share * len(self.blocks)), 1) * _BLOCK_PX**2
 
     def variance(self, lag: int, share: float) -> float:
-        """Return V at a lag over the brightness, in the calmest blocks; NaN in too few pixels."""
+        """Return V at a lag over the brightness, in the calmest blocks; NaN in few or dark pixels."""
         blocks = self.blocks[: max(math.ceil(share * len(self.blocks)), 1)]
         blocks = blocks[:: -(-len(blocks) // _MAX_BLOCKS)]
         inside = np.indices((_BLOCK_PX, _BLOCK_PX)).reshape(2, -1)
@@ -428,11 +428,12 @@ class _CalmDifferences:
             total += (-2.0) ** ((down == 0) + (right == 0)) * self.excess[at]
             is_used &= self.mask[at]
         squares = (total[is_used] / 6) ** 2
-        if len(squares) < _MIN_PIXELS:
+        brightness = self.brightness[rows, columns][is_used]
+        if len(squares) < _MIN_PIXELS or not brightness.any():
             return math.nan
         limit = (_CLIP_DEVIATIONS * NORMAL_MAD) ** 2 * float(np.median(squares))
-        brightness = float(self.brightness[rows, columns][is_used].mean())
-        return float(np.minimum(squares, limit).mean()) / (_CLIPPED_VARIANCE * brightness)
+        clipped = float(np.minimum(squares, limit).mean())
+        return clipped / (_CLIPPED_VARIANCE * float(brightness.mean()))
 
     def curve(self, share: float) -> tuple[FloatArray, FloatArray]:
         """Return the lags at which V can be measured, and V."""
