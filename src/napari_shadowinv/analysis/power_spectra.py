@@ -11,7 +11,7 @@ a factor 2πk, and their exponents by one: the *ring-summed* P(k), with ∫P dk 
 *ring-averaged* density P(k)/2πk, with ∫∫ P/2πk dk_x dk_y = ⟨|d|²⟩. Here P is ring-summed unless it
 is called a density.
 
-The spectrum is that of the Laplacian of the potential, divided by that of the operator. The
+The spectrum of the Laplacian of the potential is divided by the operator's spectrum. The
 Laplacian is nearly white where the displacement has a steep spectrum, so that less power leaks from
 large structures to small ones at the edge of the window.
 """

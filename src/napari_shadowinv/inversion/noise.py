@@ -7,8 +7,8 @@
 Structures from the beam's path are smooth over a few pixels, noise is not: in
 (a - b - c + d) / 2 over four neighbours a smooth image cancels, and white noise keeps its
 variance. A filter, a scintillator, an image plate or resampling correlates the noise of
-neighbouring pixels; then differences over more pixels are larger. `measure_correlation` tells how
-much more noise there is in the mean of many pixels than in white noise.
+neighbouring pixels; then differences over more pixels are larger. `measure_correlation` shows
+how much more noise there is in the mean of many pixels than in white noise.
 
 A reference of another exposure, or a beam that is less flat than assumed, differs from the beam of
 the shot on large scales. An object has finer structure. The frame along the image's edge is divided
@@ -333,9 +333,9 @@ def measure_correlation(
     """Return the noise of the calm parts of an image, or the most that structure there allows.
 
     Second differences over d pixels along both axes have a variance V(d) that is constant for white
-    noise. That of noise blurred by a Gaussian is smaller up to about twice its width, that of
-    structure up to the structure's size: V(1) to V(6) are compared with those of blurs, and no V
-    may be exceeded. Of the widths that fit alike, the one with most noise on long waves is used.
+    noise. If a Gaussian blurred the noise, V is smaller up to about twice its width, and in
+    structure up to the structure's size: V(1) to V(6) are compared with V of blurred noise, and no
+    V may be exceeded. Of the widths that fit alike, the one with most noise on long waves is used.
 
     Parameters
     ----------

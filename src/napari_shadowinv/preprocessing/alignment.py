@@ -10,8 +10,8 @@ error, and neither by much where an object is:
 - *everywhere*, by the finest structure: each part of the image counts by what the shift leaves of
   it, and the error is the scatter of the parts.
 
-Noise has gradients, too, which share nothing with the shift. Those of the source are therefore
-compared with those of the image, not with themselves (instrumental variables).
+Noise has gradients, too, which share nothing with the shift. The source's are therefore
+compared with the image's, not with themselves (instrumental variables).
 
 References
 ----------
