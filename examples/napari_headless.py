@@ -32,7 +32,7 @@ add_inversion(viewer, inversion, setup, name="shot 1")
 for layer in viewer.layers:
     print(f"{layer.name:48s} {type(layer).__name__:8s} {'shown' if layer.visible else 'hidden'}")
 
-field = viewer.layers.selection.active  # its name ends with the verdict, unless it is determined
+field = viewer.layers.selection.active  # its name begins with the mark of the verdict
 row, column = np.unravel_index(np.argmax(field.data), field.data.shape)
 place = field.data_to_world((row, column))
 print(f"strongest {field.data.max():.3g} mT·m at y, x = {place[0]:.4g}, {place[1]:.4g} µm")
