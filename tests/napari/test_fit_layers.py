@@ -56,9 +56,7 @@ def found(fields: tuple[str, ...]) -> Fit:
     images = [image(setup, electric=len(fields) > 1) for setup in SETUPS]
     options = FitOptions(max_iterations=3, samples=2)
     even = Instrument(beam_rms=0)
-    best = fit(
-        images, setups=SETUPS, fields=fields, noise=0.01, options=options, instrument=even
-    )
+    best = fit(images, setups=SETUPS, fields=fields, noise=0.01, options=options, instrument=even)
     (first, *_) = best.basins
     alternative = replace(
         first, start="from near", distance=0.5, displacement=first.displacement / 2

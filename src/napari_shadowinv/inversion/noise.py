@@ -415,7 +415,7 @@ class _CalmDifferences:
         return max(math.ceil(share * len(self.blocks)), 1) * _BLOCK_PX**2
 
     def variance(self, lag: int, share: float) -> float:
-        """Return V at a lag over the brightness, in the calmest blocks; NaN in few or dark pixels."""
+        """Return V at a lag over the brightness, in calm blocks; NaN in few or dark pixels."""
         blocks = self.blocks[: max(math.ceil(share * len(self.blocks)), 1)]
         blocks = blocks[:: -(-len(blocks) // _MAX_BLOCKS)]
         inside = np.indices((_BLOCK_PX, _BLOCK_PX)).reshape(2, -1)
