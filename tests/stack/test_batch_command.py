@@ -60,7 +60,7 @@ def folder(night, tmp_path, monkeypatch) -> Path:
 def batch(*more: object) -> Result:
     return shadowinv(
         "batch", "shots/shot_*.npy", "--source", "reference.npy", "--out", "n.shadowinv.zarr",
-        "--n-sites", 100, "--scheduler", "threads", *more,
+        "--n-sites", 100, "--scheduler", "threads", "--beam-rms", 0, *more,
     )  # fmt: skip
 
 
@@ -72,7 +72,7 @@ def finished(any_night, tmp_path_factory) -> Path:
     (place / "setup.toml").write_text(OPTICAL)
     result = shadowinv(
         "batch", any_night.glob, "--source", place / "reference.npy", "--n-sites", 100,
-        "--setup", place / "setup.toml", "--scheduler", "threads",
+        "--setup", place / "setup.toml", "--scheduler", "threads", "--beam-rms", 0,
         "--out", place / "n.shadowinv.zarr",
     )  # fmt: skip
     assert result.exit_code == 0, result.output

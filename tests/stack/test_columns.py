@@ -29,7 +29,10 @@ def site_column(monkeypatch) -> Column:
     return column
 
 
-def test_added_column_is_stored_and_listed_everywhere(site_column, make_night, out, tmp_path):
+def test_added_column_is_stored_and_listed_everywhere(
+    site_column, make_night, out, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "200")  # so that no heading is folded
     night = make_night(2)
     np.save(night.path(1), 0 * night.images[1])
     written = night.run(out, scheduler="synchronous")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from napari_shadowinv import InversionOptions
+from napari_shadowinv import Instrument, InversionOptions
 from napari_shadowinv.io.store import StackStore
 from napari_shadowinv.stack import RunStatus
 
@@ -34,15 +34,16 @@ def test_status_counts_shots_of_earlier_runs(make_night, out):
     night = make_night(4)
     np.save(night.path(1), 0 * night.images[1])
     few = InversionOptions(n_sites=30)  # too few sites for the image: a warning
+    exact = Instrument(beam_rms=0)  # so that the warnings are about the field
     events: list[RunStatus] = []
-    night.run(out, options=few, on_progress=events.append)
+    night.run(out, options=few, instrument=exact, on_progress=events.append)
     last = [event for event in events if not event.stage][-1]
     warned = sum(bool(report.get("warnings")) for report in StackStore(out).reports())
     assert (last.total, last.done, last.failed, last.waiting, last.ended) == (4, 3, 1, 0, 4)
     assert last.doubtful == warned > 0
     assert [name for name, _ in last.failures] == ["shot_1.npy"]
     events.clear()
-    night.run(out, options=few, on_progress=events.append)
+    night.run(out, options=few, instrument=exact, on_progress=events.append)
     again = events[-1]
     assert (again.done, again.failed, again.doubtful, again.ended) == (3, 1, warned, 0)
     assert again.failures == last.failures

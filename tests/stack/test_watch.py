@@ -367,7 +367,7 @@ def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkey
     (folder / "shot_2.npy").write_bytes(b"")
     command = [
         "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
-        "--n-sites", 100, "--out", out, "--idle", 0.2, "--settle", SETTLE,
+        "--n-sites", 100, "--out", out, "--idle", 0.2, "--settle", SETTLE, "--beam-rms", 0,
     ]  # fmt: skip
     result = shadowinv(*command)
     assert result.exit_code == 1
@@ -379,7 +379,8 @@ def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkey
     assert "2 waiting" in shot_lines[0]
     # Each kind of doubt about a shot is reported once, whatever its numbers.
     warning, failure = result.stderr.splitlines()
-    assert warning.startswith("warning: shot_0.npy: the field reaches the image's edge")
+    assert warning.startswith("warning: shot_0.npy: ")
+    assert "of the displacement (r.m.s.) rests on what lies beyond the image" in warning
     assert all("  reaches the edge  " in line for line in shot_lines)
     assert failure.startswith("failed: shot_2.npy: ")
     assert lines[-1].startswith("Stopped: 2 done, 1 failed; repeat the command to continue")
