@@ -200,9 +200,12 @@ def assess_verdict(
     numbers = {key for key, share in parts.items() if share} - {"noise", "edge"}
     is_fitted = fit.instrument.has_numbers or report.beam is None
     is_unsure = bool(numbers) and is_fitted and (is_small or _UNDERESTIMATED & numbers)
-    safety = _SAFETY if is_unsure or beam_unknown else 1.0
+    safety = _SAFETY if beam_unknown else 1.0
     if fit.instrument.beam_between and not single:
         safety = _SAFETY_BETWEEN
+    elif is_unsure and not beam_unknown:
+        share = sum(parts[key] ** 2 for key in numbers) / total**2
+        safety = float(np.sqrt(1 + (_SAFETY**2 - 1) * min(share, 1.0)))
     condition = None if beam_unknown else fit.beam_condition(max_error / safety)
     if not condition and safety * total > max_error:
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
@@ -210,7 +213,7 @@ def assess_verdict(
         if total <= max_error:
             small = f"with fewer than {SMALL_PX} px along a side"
             where = small if is_small else "where these are fitted"
-            text += f"{where}, errors can be {safety:g} times as large; "
+            text += f"{where}, errors can be {safety:.2g} times as large; "
         return Verdict.UNCERTAIN, (
             f"{text}{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
         )

@@ -117,7 +117,8 @@ def test_an_instrument_shows_its_defaults_in_grey(qtbot: Any) -> None:
     qtbot.addWidget(form)
     exact = placeholders(form)
     assert exact.keys() == Instrument.model_fields.keys() - {"detector", "beam_source"}
-    assert exact["beam_rms"] == "0.05, or 0 if recorded"
+    assert exact["beam_rms"] == "0.05, or 0.005 if recorded"
+    assert exact["registration"] == "measured in the images"
     assert exact["noise_correlation"] == "measured in the image"
     assert (exact["blur"], exact["beam_length"]) == ("0 px", "0.25")
     assert form.values() == {}
