@@ -204,8 +204,8 @@ def assess_verdict(
     if fit.instrument.beam_between and not single:
         safety = _SAFETY_BETWEEN
     elif is_unsure and not beam_unknown:
-        share = sum(parts[key] ** 2 for key in numbers) / total**2
-        safety = float(np.sqrt(1 + (_SAFETY**2 - 1) * min(share, 1.0)))
+        fitted = sum(parts[key] ** 2 for key in numbers) / total**2
+        safety = float(np.sqrt(1 + (_SAFETY**2 - 1) * min(fitted, 1.0)))
     condition = None if beam_unknown else fit.beam_condition(max_error / safety)
     if not condition and safety * total > max_error:
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
