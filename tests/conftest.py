@@ -207,7 +207,9 @@ def fit_exactly(
         "folded": 0.1,
         "verdict": Verdict.DETERMINED,
         "explanation": "all starts lead to one field, which explains 2 images to the noise",
-        "report": FitReport(100 / 3, 12, True, {"starts": 0.5, "full size": 1.5}, 0.02),
+        "report": FitReport(
+            100 / 3, 12, True, {"starts": 0.5, "full size": 1.5}, 0.02, parts={"noise": 0.02}
+        ),
         "options": FitOptions(align="shift", threads=2),
     }
     return Fit(**{**keywords, **changes})  # type: ignore[arg-type]
