@@ -85,7 +85,9 @@ def assess(
         folded=0.0,
         verdict=Verdict.UNCERTAIN,
         explanation="",
-        report=FitReport(0.0, 1, ended, {}, total, beam=beam, parts=parts, sides=SIDES),
+        report=FitReport(
+            0.0, 1, ended, {}, total, beam=beam, parts=parts, sides=SIDES, beam_rms=0.05
+        ),
         options=options,
         instrument=instrument,
     )

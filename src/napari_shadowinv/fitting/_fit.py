@@ -641,7 +641,15 @@ def _result(
     shares = {key: largest_share(each, displacements) for key, each in by_part.items()}
     parts = dict(sorted(shares.items(), key=lambda part: -part[1]))
     sides = edge_sides((by_edge**2).sum(axis=(0, 1)))
-    report = replace(report, total=total, parts=parts, sides=sides, beam=beam)
+    report = replace(
+        report,
+        total=total,
+        parts=parts,
+        sides=sides,
+        beam=beam,
+        beam_rms=data.beam.rms,
+        recorded=not data.assumed,
+    )
     jacobians = [
         jacobian_determinant(moved)
         for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)

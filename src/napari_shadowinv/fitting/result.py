@@ -36,7 +36,7 @@ from napari_shadowinv.fitting.instrument import TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.variables import FIT_VARIABLES, belongs, dataset_from_field
-from napari_shadowinv.options import ASSUMED_BEAM, FitOptions, Instrument
+from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.physics.significance import (
     PixelErrors,
@@ -196,6 +196,10 @@ class FitReport:
         beam, by each stated imperfection and by the edge, as shares of the displacement.
     sides : tuple of str
         Sides of the image from which the part by the edge comes.
+    beam_rms : float
+        Relative r.m.s. difference of beam and source in the error bars.
+    recorded : bool
+        Whether the source was recorded.
     numbers : dict of str to list
         Numbers of the instrument as fitted, by their names in `Instrument`, each with its standard
         deviation, for all images or for each; see `numbers_in_units`.
@@ -221,6 +225,8 @@ class FitReport:
     added: dict[str, list[list[list[float]]]] = dataclasses.field(default_factory=dict)
     parts: dict[str, float] = dataclasses.field(default_factory=dict)
     sides: tuple[str, ...] = ()
+    beam_rms: float = 0.0
+    recorded: bool = False
     numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
     sensitivities: dict[str, float] = dataclasses.field(default_factory=dict)
     sampling: str = "linear"
@@ -491,7 +497,7 @@ class Fit(Summarised):
             variation, left_open = beam.variation, beam.share
             by_beam = 100 * beam.sensitivity * variation  # the images exclude part of it
         elif "beam" in report.parts and self.instrument.beam_rms is None:
-            variation, by_beam = ASSUMED_BEAM.rms, report.parts["beam"]
+            variation, by_beam = report.beam_rms, report.parts["beam"]
             left_open = by_beam
         else:
             return None
@@ -500,7 +506,7 @@ class Fit(Summarised):
         at_peak = field.error_at(*shown.peak)
         scale = at_peak / report.total
         peak = scale * rest, scale * by_beam
-        recorded = beam is not None and beam.recorded
+        recorded = report.recorded if beam is None else beam.recorded
         condition = BeamCondition.within(share, variation, (rest, by_beam), peak, recorded=recorded)
         return condition and condition._replace(
             peak_if_uneven=at_peak, field_if_uneven=report.total
