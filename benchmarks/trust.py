@@ -381,7 +381,7 @@ def right(seed: int, count: int) -> Iterator[Answer]:
             yield answer("right", f"{kind}, {boundary}", result, truth)
 
 
-def right_lines(answers: Sequence[Answer]) -> Iterator[Line]:
+def doubted_lines(answers: Sequence[Answer]) -> Iterator[Line]:
     doubted = [each for each in answers if each.is_refused or each.cries]
     yield of("refused or doubted", doubted, len(answers))
     yield silent_line(answers)
@@ -652,12 +652,6 @@ def unknown_beams(seed: int, count: int) -> Iterator[Answer]:
         result = fit(images, setups=setups, source="unknown", noise="poisson")
         case = f"{'folded ' * is_folded}{name}, {len(images)} energies, beam {flaw.beam:.1%}"
         yield answer("unknown beams", case, result, truth)
-
-
-def refused_lines(answers: Sequence[Answer]) -> Iterator[Line]:
-    doubted = [each for each in answers if each.is_refused or each.cries]
-    yield of("refused or doubted", doubted, len(answers))
-    yield silent_line(answers)
 
 
 def between(seed: int, count: int) -> Iterator[Answer]:
@@ -1009,11 +1003,11 @@ ROWS = {
     "turbulence": Row(turbulence, 12, 12, silent_lines),
     "noise": Row(noise, 24, 60, silent_lines),
     "single fits": Row(single_fits, 6, 6, silent_lines),
-    "right": Row(right, 30, 60, right_lines),
+    "right": Row(right, 30, 60, doubted_lines),
     "inputs": Row(inputs, 1, 4, input_lines),
     "flaws": Row(flaws, 34, 106, flaw_lines),
     "right fits": Row(right_fits, 24, 64, right_fit_lines),
-    "unknown beams": Row(unknown_beams, 8, 20, refused_lines),
+    "unknown beams": Row(unknown_beams, 8, 20, doubted_lines),
     "between": Row(between, 15, 30, between_lines),
     "coverage": Row(coverage, 3, 20, coverage_lines),
     "samples": Row(samples, 1, 1, sample_lines),

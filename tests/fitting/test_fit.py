@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -148,12 +149,13 @@ def test_the_drawn_residual_is_as_even_as_the_noise(noise: str) -> None:
             assert half.var() == pytest.approx(1, abs=4 * np.sqrt(2 / half.size))
 
 
-def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
-    def beam(y: FloatArray, x: FloatArray) -> FloatArray:
-        return np.asarray(1 + 0.2 * np.cos(y / 15) * np.sin(x / 18))
+def uneven_beam(y: FloatArray, x: FloatArray, share: float = 0.2) -> FloatArray:
+    return np.asarray(1 + share * np.cos(y / 15) * np.sin(x / 18))
 
+
+def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
     result = fit(
-        noisy(shots_of(RING_AND_SPOT, beam=beam), NOISE),
+        noisy(shots_of(RING_AND_SPOT, beam=uneven_beam), NOISE),
         strengths=STRENGTHS,
         source="unknown",
         noise=NOISE,
@@ -161,14 +163,12 @@ def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
     )
     assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
     assert result.verdict is Verdict.DETERMINED
-    error = result.source / beam(*np.indices(SIZE).astype(float)) - 1
+    error = result.source / uneven_beam(*np.indices(SIZE).astype(float)) - 1
     assert np.sqrt((error**2).mean()) < 0.02
 
 
 def test_two_energies_correct_an_assumed_beam() -> None:
-    def beam(y: FloatArray, x: FloatArray) -> FloatArray:
-        return np.asarray(1 + 0.1 * np.cos(y / 15) * np.sin(x / 18))
-
+    beam = partial(uneven_beam, share=0.1)
     result = fit(
         noisy(shots_of(RING_AND_SPOT, beam=beam), NOISE),
         strengths=STRENGTHS,

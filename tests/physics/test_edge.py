@@ -7,7 +7,7 @@ import pytest
 from scipy.fft import dstn, idstn
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv.physics.edge import edge_changes, edge_sides, edge_text
+from napari_shadowinv.physics.edge import edge_changes, edge_doubt, edge_sides
 from napari_shadowinv.physics.poisson import poisson_invert
 
 SIDE = 48
@@ -111,4 +111,4 @@ def test_flux_that_leaves_on_all_sides_is_another_exposure():
 def test_the_sides_are_those_that_cut_an_object(places, sides):
     changes = changes_of(sum(blob(*place) for place in places))
     assert edge_sides((changes[:, 1:] ** 2).sum(axis=(0, 1))) == sides
-    assert ("all sides" in edge_text(0.3, sides)) == (len(sides) == 4)
+    assert ("all sides" in edge_doubt(0.3, 0.0, 0.1, sides)) == (len(sides) == 4)

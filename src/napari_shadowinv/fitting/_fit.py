@@ -288,8 +288,7 @@ def fit(
             )
             potentials *= np.float32(np.sqrt(ratio))
             by_part = dict(openness.by_part)
-            if by_part:
-                by_part["noise"] = amplification * by_part["noise"]
+            by_part["noise"] = amplification * by_part["noise"]
             openness = replace(openness, errors=amplified, by_part=by_part)
     found_by = FitReport(
         objective=value,
@@ -412,7 +411,10 @@ def _find_openness(
     pairs = compare_samples(posterior.scene, checked, solved) if solved else None
     samples = solved if is_solved else samples
     changes = [sample.change for sample in samples]
+    errors = displacement_errors(scene, changes, data.size) if changes else None
     by_part = errors_by_part(scene, posterior, samples, data.size)
+    if errors is not None and not by_part:
+        by_part = {"noise": errors}
     by_beam = shifts_by_beam(data, scene, posterior, samples, options)
     sensitivities = {}
     if samples:
@@ -424,7 +426,7 @@ def _find_openness(
         posterior if data.counted else None,  # its Jacobians are large
         samples,
         pairs,
-        errors=displacement_errors(scene, changes, data.size) if changes else None,
+        errors=errors,
         by_part=by_part,
         by_beam=by_beam,
         sensitivities=sensitivities,
@@ -505,8 +507,6 @@ def _amplify_noise(
     errors: FloatArray, by_part: Mapping[str, FloatArray], amplification: float
 ) -> FloatArray:
     """Return errors with those by correlated noise, which alone it makes larger."""
-    if not by_part:
-        return errors * amplification
     more = (amplification**2 - 1) * by_part["noise"] ** 2
     return np.asarray(np.sqrt(errors**2 + more))
 
@@ -576,6 +576,24 @@ def _changes_by_edge(
     return np.asarray(np.sqrt(excess)[:, None, None, None, None] * changes)
 
 
+def _with_edge(samples: FloatArray, changes: FloatArray, seed: int) -> FloatArray:
+    """Add what lies beyond the edge, (M, k, H, W), to samples of potentials, (M, n, H, W)."""
+    rng = np.random.default_rng([seed, *b"edge"])
+    draws = rng.normal(size=(samples.shape[1], changes.shape[1]))
+    beyond = np.einsum("sk,mkyx->msyx", draws, changes).astype(np.float32)
+    return np.asarray(samples + beyond)
+
+
+def _beam_error(data: FitData, by_beam: BeamShifts, displacements: FloatArray) -> BeamError:
+    return BeamError(
+        sensitivity=largest_share(by_beam.by_percent, displacements),
+        variation=data.beam.rms,
+        share=largest_share(by_beam.errors, displacements),
+        scale=data.beam.length,
+        assumed=data.assumed or (data.beam.rms > 0 and data.instrument.beam_rms is None),
+    )
+
+
 def _result(
     data: FitData,
     scene: Scene,
@@ -591,12 +609,7 @@ def _result(
     height, width = data.size
     errors, by_beam, by_part = openness.errors, openness.by_beam, openness.by_part
     if errors is not None and by_beam is not None:
-        by_part, errors = (
-            {"noise": errors, "beam": by_beam.errors},
-            np.hypot(errors, by_beam.errors),
-        )
-    elif errors is not None:
-        by_part = by_part or {"noise": errors}
+        by_part, errors = {**by_part, "beam": by_beam.errors}, np.hypot(errors, by_beam.errors)
     counts = scene.ray_counts(unknowns)
     units = data.units[:, None, None]
     used = scene.weights[:, :height, :width] > 0
@@ -611,11 +624,7 @@ def _result(
     if by_edge.any():
         by_part = {**by_part, "edge": by_edge}
         errors = None if errors is None else np.hypot(errors, by_edge)
-        if samples is not None:
-            rng = np.random.default_rng([options.seed, *b"edge"])
-            draws = rng.normal(size=(samples.shape[1], changes.shape[1]))
-            moves = np.einsum("sk,mkyx->msyx", draws, changes[:, :, 0])
-            samples = samples + moves.astype(np.float32)
+        samples = None if samples is None else _with_edge(samples, changes[:, :, 0], options.seed)
     fields = [
         FittedField(
             name,
@@ -628,16 +637,6 @@ def _result(
         for m, name in enumerate(names)
     ]
     total = float("nan") if errors is None else largest_share(errors, displacements)
-    beam = None
-    if by_beam is not None:
-        beam = BeamError(
-            sensitivity=largest_share(by_beam.by_percent, displacements),
-            variation=data.beam.rms,
-            share=largest_share(by_beam.errors, displacements),
-            scale=data.beam.length,
-            assumed=data.assumed or (data.beam.rms > 0 and data.instrument.beam_rms is None),
-            recorded=not data.assumed,
-        )
     shares = {key: largest_share(each, displacements) for key, each in by_part.items()}
     parts = dict(sorted(shares.items(), key=lambda part: -part[1]))
     sides = edge_sides((by_edge**2).sum(axis=(0, 1)))
@@ -646,7 +645,7 @@ def _result(
         total=total,
         parts=parts,
         sides=sides,
-        beam=beam,
+        beam=None if by_beam is None else _beam_error(data, by_beam, displacements),
         beam_rms=data.beam.rms,
         recorded=not data.assumed,
     )

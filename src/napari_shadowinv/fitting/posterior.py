@@ -445,8 +445,6 @@ class BeamError:
         Distance over which the beam varies, in shorter sides of the image.
     assumed : bool
         Whether nobody measured how far the beam may differ from its source.
-    recorded : bool
-        Whether the source was recorded.
     """
 
     sensitivity: float
@@ -454,7 +452,6 @@ class BeamError:
     share: float
     scale: float
     assumed: bool
-    recorded: bool = False
 
     @property
     def name(self) -> str:
@@ -465,10 +462,8 @@ class BeamError:
     @property
     def text(self) -> str:
         """The response in a sentence."""
-        unmeasured = self.assumed and not self.recorded
-        beam = "the beam was assumed to be the source or uniform: " if unmeasured else ""
         sentence = (
-            f"{beam}a beam that differs by 1 % (r.m.s.) over {to_figures(self.scale)} of the "
+            f"a beam that differs by 1 % (r.m.s.) over {to_figures(self.scale)} of the "
             f"image's shorter side would move the displacement by {self.sensitivity:.1%} (r.m.s.)"
         )
         if self.variation:

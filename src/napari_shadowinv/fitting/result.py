@@ -377,7 +377,9 @@ class Fit(Summarised):
             numbers = "; ".join(number_text(*each) for each in report.numbers.items())
             yield error_fact("instrument", numbers)
         if report.beam is not None:
-            yield error_fact("beam", report.beam.text)
+            unmeasured = report.beam.assumed and not report.recorded
+            origin = "the beam was assumed to be the source or uniform: " if unmeasured else ""
+            yield error_fact("beam", f"{origin}{report.beam.text}")
         names = {each.key: each.name(each.tested) for each in IMPERFECTIONS}
         effects = ", ".join(
             f"{to_figures(share)} ({names[key]})" if share > 1 else f"{share:.2%} ({names[key]})"
@@ -506,8 +508,9 @@ class Fit(Summarised):
         at_peak = field.error_at(*shown.peak)
         scale = at_peak / report.total
         peak = scale * rest, scale * by_beam
-        recorded = report.recorded if beam is None else beam.recorded
-        condition = BeamCondition.within(share, variation, (rest, by_beam), peak, recorded=recorded)
+        condition = BeamCondition.within(
+            share, variation, (rest, by_beam), peak, recorded=report.recorded
+        )
         return condition and condition._replace(
             peak_if_uneven=at_peak, field_if_uneven=report.total
         )

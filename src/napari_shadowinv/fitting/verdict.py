@@ -19,7 +19,7 @@ from napari_shadowinv.fitting.measurements import NoiseMatch
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
-from napari_shadowinv.physics.edge import edge_text
+from napari_shadowinv.physics.edge import edge_doubt
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import shown_fields
 
@@ -137,9 +137,7 @@ def assess_verdict(
         names = [f"{name} ({setup.probe})" for name, setup in pairs]
     by_edge = parts.get("edge", 0.0)
     others = float(np.sqrt(max(report.total**2 - by_edge**2, 0.0)))
-    # Errors half as large move the field at the edge by chance.
-    is_cut = by_edge > max_error and not by_edge < 2 * others
-    at_edge = edge_text(by_edge, report.sides) if is_cut else ""
+    at_edge = edge_doubt(by_edge, others, max_error, report.sides)
     if worst := _those(names, chi2, chi2 > MISFIT_CHI2):
         causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
         if len(chi2) > 1:
@@ -200,10 +198,12 @@ def assess_verdict(
     numbers = {key for key, share in parts.items() if share} - {"noise", "edge"}
     is_fitted = fit.instrument.has_numbers or report.beam is None
     is_unsure = bool(numbers) and is_fitted and (is_small or _UNDERESTIMATED & numbers)
-    safety = _SAFETY if beam_unknown else 1.0
+    safety = 1.0
     if fit.instrument.beam_between and not single:
         safety = _SAFETY_BETWEEN
-    elif is_unsure and not beam_unknown:
+    elif beam_unknown:
+        safety = _SAFETY
+    elif is_unsure:
         fitted = sum(parts[key] ** 2 for key in numbers) / total**2
         safety = float(np.sqrt(1 + (_SAFETY**2 - 1) * min(fitted, 1.0)))
     condition = None if beam_unknown else fit.beam_condition(max_error / safety)

@@ -43,7 +43,7 @@ from napari_shadowinv.inversion.imperfections import (
     random_waves,
 )
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
-from napari_shadowinv.inversion.normalise import Prepared
+from napari_shadowinv.inversion.normalise import Prepared, lit_pixels
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument, InversionOptions
 from napari_shadowinv.physics.edge import edge_changes, edge_sides
@@ -163,7 +163,7 @@ class Budget:
         solved = _usable_levels(solutions)
         mask = self._prepared.mask
         variation, basis = self._beam_variation
-        lit = self._prepared.lit(self.options)
+        lit = lit_pixels(self._prepared.source, mask, self.options)
         length = np.where(lit, np.hypot(*displacement), 0.0)
         row, column = np.unravel_index(length.argmax(), length.shape)
         peak = np.array([row, column], dtype=np.float64)

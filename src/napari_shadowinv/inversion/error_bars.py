@@ -145,7 +145,7 @@ class Quantity:
 
         Samples stray from the inversion as the inversion does from the truth, so the samples'
         interval is mirrored at the value (the basic bootstrap). It corrects a bias, such
-        as that of a maximum, which noise raises. Of fewer than 40 samples, as of a fit,
+        as that of a maximum, which noise raises. With fewer than 40 samples, as in a fit,
         it is Student's interval for the next sample, which takes their spread as normal.
 
         Raises

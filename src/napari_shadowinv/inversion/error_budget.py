@@ -11,7 +11,7 @@ import numpy as np
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent, round_down, to_figures
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
-from napari_shadowinv.physics.edge import edge_text
+from napari_shadowinv.physics.edge import edge_doubt
 from napari_shadowinv.physics.units import BeamCondition, PeakError
 
 SHARE_OF_NOISE = 0.2
@@ -90,7 +90,8 @@ class Errors:
         Origin of that number: 'assumed' for an estimated source, 'reference' if it is assumed of a
         recorded source, which is of another exposure, 'stated' by the user, 'seen' as a
         difference of image and source outside the object, 'references' for a prior from them,
-        'outside' for a source estimated from the image outside the object, with its variance.
+        'outside' for a source estimated from the image outside the object, with its variance,
+        'filtered' for what filters take from an object in an exact beam.
     noise_correlation : float
         Standard deviation of the Gaussian blur with the measured correlation of the noise, px; 0
         for white noise.
@@ -328,17 +329,13 @@ class Errors:
         return [*rows, ("beam", by_beam), ("instrument", by_instrument)]
 
     def edge_caution(self, max_error: float) -> Caution | None:
-        """Warn if what lies beyond the edge moves the displacement by more than `max_error` of it.
-
-        Not where other errors are half as large, which move it at the edge by chance.
-        """
+        """Warn if what lies beyond the edge moves the field by more than `max_error` of it."""
         edge = self.parts.get("edge")
         if edge is None or not self.rms > 0:
             return None
-        others = math.sqrt(max(self.total.rms**2 - edge.rms**2, 0.0))
-        if edge.rms < max(max_error * self.rms, 2 * others):
-            return None
-        return Caution("edge", edge_text(edge.rms / self.rms, self.sides))
+        others = math.sqrt(max(self.total.rms**2 - edge.rms**2, 0.0)) / self.rms
+        text = edge_doubt(edge.rms / self.rms, others, max_error, self.sides)
+        return Caution("edge", text) if text else None
 
     def beam_caution(self) -> Caution | None:
         """Warn if image and source differ outside the object so that the peak is uncertain."""

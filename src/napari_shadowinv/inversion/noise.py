@@ -361,14 +361,14 @@ def measure_correlation(
         return CorrelatedNoise(white)
     near = lags <= _FIT_PX
     answers = []
-    for blur in widths:
+    for blur in widths.tolist():
         shares = _blurred_shares(lags, blur)
         columns = np.stack([np.full(len(lags), width is None), shares], axis=1)
         fitted, _ = nonnegative_fit((columns / variances[:, None])[near], np.ones(near.sum()))
         white = min(float(fitted[0]), float(variances.min()))
         blurred = min(float(fitted[1]), float(((variances - white) / shares).min()))
         most = max(_MAX_WHITE - white, 0.0) / max(4 * math.pi * blur**2, 1.0)
-        noise = CorrelatedNoise(white, min(blurred, most), float(blur), blurred >= most)
+        noise = CorrelatedNoise(white, min(blurred, most), blur, blurred >= most)
         rest = 1 - columns @ [white, noise.blurred] / variances
         answers.append((float((rest[near] ** 2).sum()) / _SCATTER**2, noise))
     least = min(misfit for misfit, _ in answers)

@@ -51,10 +51,6 @@ class Prepared:
     flux_scale: float  # divisor of the image
     warnings: tuple[Caution, ...]
 
-    def lit(self, options: InversionOptions) -> BoolArray:
-        """Return the used pixels from which rays start: not those behind an obstacle."""
-        return lit_pixels(self.source, self.mask, options)
-
     def in_units(self) -> Prepared:
         """Return the same with image and source also in units of `unit`."""
         return replace(self, image=self.image / self.unit, source=self.source / self.unit)
@@ -155,7 +151,7 @@ def mask_unlit(
 
 
 def lit_pixels(source: FloatArray, mask: BoolArray, options: InversionOptions) -> BoolArray:
-    """Return the used pixels of a source that is brighter than the floor."""
+    """Return the used pixels from which rays start: a source behind an obstacle is dark there."""
     return np.asarray(mask & (source > options.floor * source[mask].mean()))
 
 

@@ -105,9 +105,7 @@ class ShotWriter:
                     array[index : index + 1] = np.broadcast_to(values, (1, *array.shape[1:]))
                 else:  # without its chunk, it is read as the fill value
                     chunk_file(self.path, array, index).unlink(missing_ok=True)
-            group["report"][index : index + 1] = np.array(
-                [json.dumps(report, default=np.generic.item)], dtype=object
-            )
+            group["report"][index : index + 1] = np.array([json.dumps(report)], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
 
     def skip(self, index: int) -> None:

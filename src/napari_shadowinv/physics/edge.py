@@ -1,7 +1,7 @@
 """Errors of a field by the unseen: objects beyond the edge of its image.
 
 - changes of a field by what may lie there: `edge_changes`
-- the sides of the image that they come from: `edge_sides`, in words `edge_text`
+- the sides of the image that they come from: `edge_sides`, in words `edge_doubt`
 
 An image fixes the divergence of the displacement inside it, but not the flux that crosses its edge.
 To first order, the potential of sources beyond the edge, which is harmonic inside, may be added to
@@ -122,14 +122,30 @@ def edge_sides(squares: FloatArray, strip: float = 0.1, share: float = 0.25) -> 
     )
 
 
-def edge_text(error: float, sides: Sequence[str]) -> str:
-    """Return in words how much of a field, as a share of it, rests on what lies beyond its sides.
+def edge_doubt(error: float, others: float, largest: float, sides: Sequence[str]) -> str:
+    """Return in words how much of a field rests on what lies beyond its sides; "" if it is little.
 
-    >>> edge_text(0.4, ["left", "right"])[:80]
+    Parameters
+    ----------
+    error, others : float
+        Errors of the field by the edge, and by all else, as shares of it. Errors that are half as
+        large move a field at the edge by chance.
+    largest : float
+        Largest error by the edge that needs no words.
+    sides : sequence of str
+        Where it comes from, of `SIDES`.
+
+    Examples
+    --------
+    >>> edge_doubt(0.4, 0.1, 0.05, ["left", "right"])[:80]
     '40 % of the displacement (r.m.s.) rests on what lies beyond the left and right e'
+    >>> edge_doubt(0.4, 0.3, 0.05, ["left"])
+    ''
     """
-    *others, last = sides
-    listed = f"{', '.join(others)} and {last} edges" if others else f"{last} edge"
+    if error <= max(largest, 2 * others):
+        return ""
+    *first, last = sides
+    listed = f"{', '.join(first)} and {last} edges" if first else f"{last} edge"
     where = f"beyond the {listed}" if len(sides) < len(SIDES) else "beyond the image, on all sides"
     return (
         f"{percent(error)} of the displacement (r.m.s.) rests on what lies {where}: record a "

@@ -176,9 +176,7 @@ def test_a_corrupt_file_is_listed_and_the_others_are_done(
     assert reason == StackStore(out).report(1)["reason"]
     assert further == []
     assert tool.failures.isVisible()
-    assert tool.panel.status.text() == (
-        "3 of 4 done, 1 failed, in run.shadowinv.zarr"
-    )
+    assert tool.panel.status.text() == ("3 of 4 done, 1 failed, in run.shadowinv.zarr")
     assert np.isnan(np.asarray(layer_of(window, "field").data[1])).all()
 
     # It stays so until it is to be tried again, which takes a box.
@@ -219,9 +217,7 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     tool.panel.button.click()
     assert tool.panel.button.text() == "Cancelling…"
     qtbot.waitUntil(lambda: at_rest(tool), timeout=PATIENCE)
-    assert (
-        tool.panel.status.text() == "Cancelled: 2 of 4 done. Press Run to resume."
-    )
+    assert tool.panel.status.text() == "Cancelled: 2 of 4 done. Press Run to resume."
     assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]
     before = written(out)
     assert len(before) == 2
