@@ -493,3 +493,40 @@ def test_images_of_an_hdf5_file_are_layers(viewer: ViewerModel, tmp_path: Path) 
     ((data, _, kind),) = read_layers(f"{path}::/entry/beam")
     assert kind == "image"
     np.testing.assert_array_equal(data, frames[0] + 1)
+
+
+def test_an_array_opens_by_the_address_of_its_file(viewer: ViewerModel, tmp_path: Path) -> None:
+    path = tmp_path / "run 1.nxs"
+    frames = np.arange(60.0).reshape(3, 4, 5)
+    with h5py.File(path, "w") as file:
+        file["entry/data"] = frames
+        file.attrs["default"], file["entry/beam"] = "entry", frames[0] + 1
+        file["entry"].attrs["signal"] = "data"
+    place = path.as_uri().replace("file://", "file://localhost")
+    (beam,) = viewer.open(f"{place}::/entry/beam", plugin=PLUGIN)
+    (frame,) = viewer.open(f"{place}::/entry/data[2]", plugin=PLUGIN)
+    np.testing.assert_array_equal(beam.data, frames[0] + 1)
+    np.testing.assert_array_equal(frame.data, frames[2])
+    assert (beam.name, frame.name) == ("entry/beam", "entry/data[2]")
+
+
+def test_images_of_a_matlab_file_are_layers(viewer: ViewerModel, tmp_path: Path) -> None:
+    beam, shots = np.arange(20.0).reshape(4, 5), np.arange(60.0).reshape(4, 5, 3)
+    savemat(tmp_path / "run.mat", {"beam": beam, "shots": shots, "time": 3.0})
+    layers = {layer.name: layer.data for layer in viewer.open(tmp_path / "run.mat", plugin=PLUGIN)}
+    np.testing.assert_array_equal(layers["beam"], beam)
+    np.testing.assert_array_equal(layers["shots"], np.moveaxis(shots, -1, 0))
+    assert len(layers) == 2
+
+
+def test_images_that_are_not_opened_are_counted(tmp_path: Path) -> None:
+    path = tmp_path / "many.h5"
+    with h5py.File(path, "w") as file:
+        for number in range(10):
+            file[f"frame_{number}"] = np.full((4, 5), number)
+    assert len(read_paths(str(path))) == 8
+    (text,) = [
+        record.message for record in notification_manager.records if path.name in record.message
+    ]
+    assert "8 of 10 images are open" in text
+    assert "many.h5::frame_8" in text

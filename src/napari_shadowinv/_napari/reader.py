@@ -26,11 +26,12 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], lis
     """Return the reader of a file, folder, pattern with ``*`` or list of files, or None."""
     if not isinstance(path, str):
         return read_paths if path and all(_is_image_name(Path(item)) for item in path) else None
-    if path.endswith(STORE.suffix) or Path(path).suffix.lower() in RESULT.suffixes:
+    file, _ = split_address(path)
+    if file.name.endswith((STORE.suffix, *RESULT.suffixes)):
         return read_paths
-    if is_pattern(path):
-        return read_paths if any(map(_is_image_name, matching_files(path))) else None
-    return read_paths if _can_read(split_address(path)[0]) else None
+    if is_pattern(file):
+        return read_paths if any(map(_is_image_name, matching_files(file))) else None
+    return read_paths if _can_read(file) else None
 
 
 def _can_read(path: Path) -> bool:
@@ -38,10 +39,8 @@ def _can_read(path: Path) -> bool:
         return bool(images_in(path))
     # Other programs use the endings of HDF5, too.
     if path.suffix.lower() in HDF5.suffixes:
-        from napari_shadowinv.io.hdf5_arrays import image_names
-
         try:
-            return bool(image_names(path))
+            return bool(HDF5.image_names(path))
         except FileFormatError:
             return False
     return _is_image_name(path)
@@ -58,38 +57,44 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
 
     if not isinstance(path, str):
         return stack_layers([Path(item) for item in path])
-    if path.rstrip("/").endswith(STORE.suffix):
+    file, variable = split_address(path)
+    if file.name.endswith(STORE.suffix):
         from napari_shadowinv._napari.stores import follow_once_added, store_layers
 
-        layers = main_layers(store_layers(Path(path)))
+        layers = main_layers(store_layers(file))
         follow_once_added(layers)
         _show_in_window(layers)
         return layers
-    if is_pattern(path):
-        return stack_layers(matching_files(path))
-    if Path(path).is_dir():
-        folder = Path(path)
-        images = images_in(folder)
+    if variable is None and is_pattern(file):
+        return stack_layers(matching_files(file))
+    if variable is None and file.is_dir():
+        images = images_in(file)
         if not images:  # they may be gone since napari asked for a reader
-            raise FileFormatError(f"{folder} contains no image: expected a folder of radiographs")
-        if others := left_out_of(folder):
-            show_caution(f"{folder.name}: left out: {others}; open them as a pattern or a list")
-        return stack_layers(images, folder.name)
-    return _read_file(Path(path))
+            raise FileFormatError(f"{file} contains no image: expected a folder of radiographs")
+        if others := left_out_of(file):
+            show_caution(f"{file.name}: left out: {others}; open them as a pattern or a list")
+        return stack_layers(images, file.name)
+    return _read_file(file, variable)
 
 
 @as_file_errors
-def _read_file(path: Path) -> list[Any]:
+def _read_file(file: Path, variable: str | None) -> list[Any]:
     from napari_shadowinv.io.field_grids import is_field_grid
-    from napari_shadowinv.io.hdf5_arrays import image_names
 
-    file, variable = split_address(path)
-    if variable is None and format_of(file) is HDF5 and not is_field_grid(file):
-        names = image_names(file)
+    if variable is None and not is_field_grid(file):
+        names = format_of(file).image_names(file)
+        if len(names) > _MAX_IMAGES:
+            # napari asks whether a path exists unless it names a host.
+            place = file.absolute().as_uri().replace("file://", "file://localhost", 1)
+            address = f"{place}::{names[_MAX_IMAGES]}"
+            show_caution(
+                f"{file.name}: {_MAX_IMAGES} of {len(names)} images are open: open another in "
+                f"napari's console, viewer.open({address!r}, plugin='napari-shadowinv')"
+            )
         if len(names) > 1:
             arrays = [(join_address(file, name), name) for name in names[:_MAX_IMAGES]]
             return [layer for address, name in arrays for layer in _read_content(address, name)]
-    return _read_content(path, "")
+    return _read_content(join_address(file, variable), (variable or "").strip("/"))
 
 
 def _read_content(path: Path, array: str) -> list[Any]:

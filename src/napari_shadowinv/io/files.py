@@ -27,6 +27,7 @@ DEFLATE_RATIO = 1040  # the most that zlib can pack into one byte, a little roun
 _ADDRESS = "::"  # between a file and the name of an array in it
 # A path joins its slashes; a scheme of one letter is a drive.
 _LOCATION = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+-]+):/+(?P<place>.+)")
+_LOCAL = re.compile(r"file:/+(?:localhost(?=/))?", re.IGNORECASE)
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")  # numpy's words where there is no room
 
@@ -34,7 +35,8 @@ _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")  # numpy's words where
 def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, str | None]:
     """Return the file of an image, and the name of the array that its path ends with.
 
-    Every path of an image that is opened, compared or checked goes through here.
+    Every path of an image that is opened, compared or checked goes through here, also one that is
+    written as ``file://localhost/data/run.h5``.
 
     Examples
     --------
@@ -46,6 +48,10 @@ def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, 
         raise InputError("received an empty text: expected the path of a file")
     if os.path.exists(path):
         return Path(path), variable
+    if local := _LOCAL.match(text):
+        from urllib.request import url2pathname
+
+        return split_address(url2pathname("/" + text[local.end() :].lstrip("/")), variable)
     if location := _LOCATION.match(text):
         raise InputError(
             f"{location['scheme']}://{location['place']} is a location on the network: expected a "

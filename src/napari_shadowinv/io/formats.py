@@ -44,6 +44,7 @@ class Format:
     # The readers then take the number of a frame.
     counter: str = ""
     default: str = ""  # of a path: the name of the array that is read without one
+    lister: str = ""  # of a path: the names of all images that it may hold
     image_writer: str = ""  # of a path, an image and its pixel size (m) or None
     result_writer: str = ""  # of a path and a dataset
     results: tuple[ResultKind, ...] = ()  # kinds of the results that it writes
@@ -58,6 +59,10 @@ class Format:
         """Return the name of the array that is read, if arrays have names."""
         named = variable is not None or not self.default
         return variable if named else function(self.default)(path)
+
+    def image_names(self, path: Path) -> list[str]:
+        """Return the names of the images in a file; none where they have no names."""
+        return function(self.lister)(path) if self.lister else []
 
     def read(self, path: Path, variable: str | None = None, number: int | None = None) -> Any:
         """Return the content of a file, one of its arrays, or one of the frames; see `reader`."""
@@ -113,6 +118,7 @@ NPY = Format(
 MATLAB = Format(
     "mat", (".mat",), "MATLAB", _HDF5, test="matlab:is_matlab",
     reader="matlab:read_mat", named_reader="matlab:read_mat", counter="matlab:count_mat",
+    lister="matlab:image_names",
 )
 PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader="cameras:read_b16")
 RESULT = Format(
@@ -130,7 +136,7 @@ PRADFORMAT = Format(
 )
 HDF5 = Format(
     "hdf5", (*PRADFORMAT.suffixes, ".hdf", ".nxs", ".nx5", ".cxi", ".nc"), "HDF5 (NeXus, NetCDF 4)",
-    _HDF5, default="hdf5_arrays:default_array",
+    _HDF5, default="hdf5_arrays:default_array", lister="hdf5_arrays:image_names",
     named_reader="hdf5_arrays:read_plane", counter="hdf5_arrays:count_frames",
 )
 CPSA = Format(

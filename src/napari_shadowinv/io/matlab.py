@@ -1,7 +1,8 @@
 """MATLAB's MAT-files, version 5 to 7 (its own layout) and 7.3 (HDF5).
 
 - the one image of a file, or the variable that the user names: `read_mat`; its frames: `count_mat`
-- the variables of a file: `mat_variables`; MATLAB 7.3 or other HDF5: `is_matlab`
+- the variables of a file: `mat_variables`; the names of its images: `image_names`
+- MATLAB 7.3 or other HDF5: `is_matlab`
 
 scipy's reader of MATLAB's own layout asks for the memory that a damaged length names, and a damaged
 type crashes it together with the whole program; so planes of numbers, all that is needed, are read
@@ -129,6 +130,11 @@ def mat_variables(path: Path) -> list[Variable]:
         # Names that begin with # are MATLAB's own.
         names = [name for name in content if not name.startswith("#")]
         return [_describe_variable(path, name, member(path, content, name)) for name in names]
+
+
+def image_names(path: Path) -> list[str]:
+    """Return the names of all images in a MAT-file."""
+    return [variable.name for variable in mat_variables(path) if variable.is_image]
 
 
 def _choose_image(path: Path, name: str | None) -> tuple[Variable, tuple[int, ...] | None]:
