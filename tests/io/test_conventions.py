@@ -112,6 +112,23 @@ def test_pixel_size_of_a_nexus_detector_is_in_metres(file: Any, unit: str, size:
     assert geometry == {"detector_pixel_size": pytest.approx(75e-6)}
 
 
+@pytest.mark.parametrize("place", ["entry/data", "entry/instrument/detector"])
+def test_flat_and_dark_frames_are_no_shots(file: Any, place: str) -> None:
+    frames = np.stack([COUNTS + frame for frame in range(4)])
+    file["entry/data/image"], file[f"{place}/image_key"] = frames, [2, 1, 0, 0]
+    file.require_group(place).attrs["NX_class"] = "NXdetector"
+    path = Path(file.filename)
+    file.close()
+    with pytest.raises(FileFormatError, match="1 flat, 1 dark among the 4 frames") as error:
+        read(f"{path}::entry/data/image")
+    assert "'/entry/data/image[2]'" in str(error.value)
+    shot = read_radiograph(f"{path}::entry/data/image[2]")
+    np.testing.assert_array_equal(shot.image, frames[2])
+    with h5py.File(path, "a") as content:
+        content[f"{place}/image_key"][:] = 0
+    assert len(read(f"{path}::entry/data/image").name) == 4
+
+
 def test_white_as_zero_is_inverted(file: Any) -> None:
     file["data"] = COUNTS.astype(np.uint8)
     file["data"].attrs.update(CLASS=np.bytes_("IMAGE"), IMAGE_WHITE_IS_ZERO=np.uint8(1))

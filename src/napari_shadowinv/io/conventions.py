@@ -2,7 +2,7 @@
 
 - values without packing: `decode_values`; an image with its mask, notes and pixel size:
   `read_meaning`
-- refuse pictures in colour: `check_grey`
+- refuse pictures in colour: `check_grey`; frames of which some are no shots: `check_shots`
 
 Each convention is applied where a file uses it: packed and missing values of CF (NetCDF); factors,
 pixel masks, limits and pixel sizes of NeXus; white as zero and the origin of HDF5 Image.
@@ -11,7 +11,7 @@ References
 ----------
 NetCDF Climate and Forecast Metadata Conventions, section 8.1 and 2.5.1, https://cfconventions.org
 
-NeXus definitions of NXdata, NXdetector and NXmx, https://manual.nexusformat.org
+NeXus definitions of NXdata, NXdetector, NXmx and NXtomo, https://manual.nexusformat.org
 
 HDF5 Image and Palette Specification 1.2, https://support.hdfgroup.org
 """
@@ -34,6 +34,7 @@ from napari_shadowinv.io.hdf5 import load_dataset, member
 _PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned")
 _LIMITS = ("valid_range", "valid_min", "valid_max")
 _BAD_PIXEL = 0xFFFF  # bits of a NeXus pixel mask that reject a pixel; higher ones only describe it
+_FRAME_KINDS = {1: "flat", 2: "dark", 3: "invalid"}  # by the image_key of NXtomo; 0 is a shot
 _FLIPS = {"LL": (0,), "UR": (1,), "LR": (0, 1)}  # axes to reverse, by the corner of the first pixel
 
 
@@ -66,6 +67,23 @@ def check_grey(path: Path, dataset: Any) -> None:
             f"{path} holds {dataset.name!r} as a picture in colour ({kind}): expected numbers "
             "proportional to the fluence; save one plane of it"
         )
+
+
+def check_shots(path: Path, dataset: Any) -> None:
+    """Refuse frames among which NXtomo lists some without the object."""
+    for group in _detectors(path, dataset):
+        item = member(path, group, "image_key")
+        if item is None or item.size != math.prod(dataset.shape[:-2]):
+            continue
+        keys = np.ravel(load_dataset(path, item))
+        counts = {kind: int((keys == key).sum()) for key, kind in _FRAME_KINDS.items()}
+        if keys.size > 1 and any(counts.values()):
+            others = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+            raise FileFormatError(
+                f"{path} has {others} among the {keys.size} frames of {dataset.name!r} "
+                f"(image_key): expected shots only; name one, '{dataset.name}[{keys.argmin()}]', "
+                "or list the shots in a table, each with a flat frame as its source"
+            )
 
 
 def _unpack(values: AnyArray, attributes: dict[str, Any]) -> AnyArray:

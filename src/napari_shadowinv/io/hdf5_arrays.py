@@ -22,7 +22,12 @@ from napari_shadowinv._system.safety import as_file_errors, check_regular, check
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.arrays import FRAME_INDEX, check_one_frame, frame_axes
-from napari_shadowinv.io.conventions import check_grey, decode_values, read_meaning
+from napari_shadowinv.io.conventions import (
+    check_grey,
+    check_shots,
+    decode_values,
+    read_meaning,
+)
 from napari_shadowinv.io.field_grids import is_field_grid
 from napari_shadowinv.io.hdf5 import (
     MAX_LINKS,
@@ -73,7 +78,10 @@ def count_frames(path: Path, name: str | None = None) -> tuple[int, ...]:
     with open_hdf5(path) as file:
         dataset, number = _find_array(path, file, name)
         axes = frame_axes(path, repr(name), dataset.shape)
-        return axes if number is None else ()
+        if number is not None:
+            return ()
+        check_shots(path, dataset)
+        return axes
 
 
 @as_file_errors
