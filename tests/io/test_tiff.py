@@ -344,7 +344,37 @@ def test_colour_profile_is_a_caution_unless_it_is_linear(path: Path) -> None:
         assert [caution.code for caution in read(path).warnings] == codes
 
 
+def test_grey_jpeg_in_a_tiff_is_not_linear(path: Path) -> None:
+    image = np.full((16, 16), 80, np.uint8)
+    tifffile.imwrite(path, image, compression="jpeg", photometric="minisblack")
+    assert [caution.code for caution in read(path).warnings] == ["gamma"]
+    tifffile.imwrite(path, image, compression="jpeg2000", photometric="minisblack")
+    assert read(path).warnings == ()
+
+
 # Size of the pixels
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"resolution": (1000, 2000), "resolutionunit": "CENTIMETER"}, "10 µm wide and 5 µm high"),
+        (
+            {
+                "ome": True,
+                "metadata": {"PhysicalSizeX": 5.0, "PhysicalSizeY": 5.0, "PhysicalSizeYUnit": "nm"},
+            },
+            "5 µm wide and 0.005 µm high",
+        ),
+    ],
+)
+def test_pixels_that_are_not_square_are_a_caution(
+    path: Path, options: dict[str, Any], words: str
+) -> None:
+    tifffile.imwrite(path, SHOT, **options)
+    (caution,) = read(path).warnings
+    assert words in caution.text
+    assert size_in(path) is None
 
 
 def size_in(path: Path) -> float | None:
@@ -368,6 +398,11 @@ def size_in(path: Path) -> float | None:
         ({"resolution": (72, 72), "imagej": True, "metadata": {"unit": "inch"}}, None),
         ({"resolution": (5, 5), "imagej": True, "metadata": {"unit": "pixel"}}, None),
         ({"ome": True, "metadata": {"PhysicalSizeX": 6.5, "PhysicalSizeY": 6.5}}, 6.5e-6),
+        (
+            {"ome": True, "metadata": {"PhysicalSizeX": 6.5, "PhysicalSizeY": 0.0065,
+             "PhysicalSizeYUnit": "mm"}},
+            6.5e-6,
+        ),
         (
             {
                 "ome": True,

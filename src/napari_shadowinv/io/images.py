@@ -2,7 +2,7 @@
 
 - PNG, BMP and JPEG: `read_picture`
 - what every format of pictures has in common: `check_picture`, `without_pixels`, `geometry_of`,
-  `gamma_warning`
+  `square_warnings`, `gamma_warning`
 - colour images: reduction to one plane (`to_grey`), signs of a film scan (`film_warnings`)
 - scans of film in colour: `read_scan`
 """
@@ -139,18 +139,32 @@ def gaps_in(array: AnyArray) -> dict[str, Any]:
     return {"mask": ~missing, "notes": (note,)}
 
 
-def geometry_of(size: tuple[float, bool] | None, is_drawn: bool = False) -> dict[str, Any]:
+def geometry_of(
+    sides: tuple[float, ...], is_length: bool, is_drawn: bool = False
+) -> dict[str, Any]:
     """Return a file's size of a pixel (m) as metadata, and as geometry unless it may be a default.
 
-    `size` says also whether the file means a length and no resolution of printing. `is_drawn` is
+    `is_length` says whether the file means a length and no resolution of printing. `is_drawn` is
     true of this package's own images, whose pixels are those at the object.
     """
-    if size is None:
+    if not sides or square_warnings(sides):
         return {}
-    metres, is_length = size
+    metres = sides[0]
     name = "pixel_size" if is_drawn else "detector_pixel_size"
     is_measured = is_length or is_drawn or metres < _LEAST_PRINTED_M
     return {"stated_pixel_size": metres, **({"geometry": {name: metres}} if is_measured else {})}
+
+
+def square_warnings(sides: tuple[float, ...]) -> tuple[Caution, ...]:
+    """Warn of pixels whose width and height (m) differ by their file."""
+    if not sides or max(sides) <= 1.01 * min(sides):
+        return ()
+    width, height = (f"{side / 1e-6:.4g}" for side in sides)
+    text = (
+        f"pixels are {width} µm wide and {height} µm high by the file: fields come out wrong "
+        "along one axis; resample the image to square pixels"
+    )
+    return (Caution("file", text),)
 
 
 def gamma_warning(kind: str) -> Caution:
@@ -213,13 +227,13 @@ def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
         is_turned = picture.getexif().get(_ORIENTATION, 1) in range(2, 9)
         array, missing = _pixels_and_gaps(ImageOps.exif_transpose(picture))
         array = without_pixels(array, missing)
-        gaps = gaps_in(array)
+        gaps, sides = gaps_in(array), _printed_sides(picture.info)
         metadata = {
             **gaps,
             "notes": ((TURNED_NOTE,) * is_turned) + gaps.get("notes", ()),
             "bits": 8 * max(1, array.dtype.itemsize),
-            "warnings": _light_warnings(picture.format, picture.info),
-            **geometry_of(_printed_size(picture.info)),
+            "warnings": _light_warnings(picture.format, picture.info) + square_warnings(sides),
+            **geometry_of(sides, is_length=False),
         }
     check_picture(path, "picture's", array)
     return array, metadata
@@ -252,11 +266,10 @@ def _light_warnings(form: str, info: dict[str, Any]) -> tuple[Caution, ...]:
     return (gamma_warning(kind),)
 
 
-def _printed_size(info: dict[str, Any]) -> tuple[float, bool] | None:
-    """Return the size of a pixel (m) by the dots per inch of a picture."""
-    across, down = map(float, info.get("dpi", (0, 0)))
-    is_square = min(across, down) > 1 and max(across, down) <= 1.01 * min(across, down)
-    return (INCH_M / across, False) if is_square else None
+def _printed_sides(info: dict[str, Any]) -> tuple[float, ...]:
+    """Return width and height of a pixel (m) by the dots per inch of a picture, if it has them."""
+    dots = tuple(map(float, info.get("dpi", (0, 0))))
+    return tuple(INCH_M / each for each in dots) if min(dots) > 1 else ()
 
 
 def write_png(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:

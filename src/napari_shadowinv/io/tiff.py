@@ -37,6 +37,7 @@ from napari_shadowinv.io.images import (
     gaps_in,
     geometry_of,
     is_linear_profile,
+    square_warnings,
     without_pixels,
 )
 from napari_shadowinv.io.text import LENGTHS
@@ -49,6 +50,7 @@ _UNPACKERS: dict[int, Callable[[], Any]] = {
 }
 _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
 
+_JPEG = {6, 7}
 _WHITE_IS_ZERO, _RGB, _PALETTE, _MASK, _YCBCR = 0, 2, 3, 4, 6
 _GREY_OR_RGB = {_WHITE_IS_ZERO, 1, _RGB, _PALETTE}
 _ALPHA = {1, 2}  # of the tag ExtraSamples
@@ -191,13 +193,13 @@ def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str
         array, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
         check_picture(path, "TIFF", array)
         array, turned = _turn_upright(without_pixels(array, missing), _tag(tiff, page, 274))
-        size, gaps = _pixel_size(tiff, page), gaps_in(array)
+        (sides, is_length), gaps = _pixel_sides(tiff, page), gaps_in(array)
         metadata = {
             **gaps,
             "bits": int(np.max(page.bitspersample)),
             "notes": (*notes, *turned, *gaps.get("notes", ())),
-            "warnings": _warnings(page, layout),
-            **geometry_of(size, is_drawn=page.software.startswith("shadowinv")),
+            "warnings": _warnings(page, layout) + square_warnings(sides),
+            **geometry_of(sides, is_length, is_drawn=page.software.startswith("shadowinv")),
         }
     return array, metadata
 
@@ -389,7 +391,7 @@ def _warnings(page: Any, layout: _Layout) -> tuple[Caution, ...]:
         cautions.append(gamma_warning("a TIFF with a colour profile"))
     elif curve is not None and not _is_straight(np.asarray(curve, dtype=np.float64)):
         cautions.append(gamma_warning("a TIFF with a transfer function"))
-    elif page.photometric == _YCBCR:
+    elif page.photometric == _YCBCR or (page.compression in _JPEG and page.dtype == np.uint8):
         cautions.append(gamma_warning("a JPEG in a TIFF"))
     if layout.left_out:
         text = (
@@ -405,24 +407,28 @@ def _is_straight(curve: AnyArray) -> bool:
     return bool(np.abs(curve - line).max() <= 0.01 * max(np.ptp(curve), 1.0))
 
 
-def _pixel_size(tiff: Any, page: Any) -> tuple[float, bool] | None:
-    """Return the size of a pixel (m), and whether its unit is one of measurements."""
+def _pixel_sides(tiff: Any, page: Any) -> tuple[tuple[float, ...], bool]:
+    """Return width and height of a pixel (m) if stated, and whether their unit is a length's."""
     first = tiff.pages.first
     if first.is_ome:
         root = ElementTree.fromstring(first.description)
         stated = next((part.attrib for part in root.iter() if part.tag.endswith("Pixels")), {})
-        sizes = [float(stated.get(f"PhysicalSize{axis}", 0)) for axis in "XY"]
-        unit: Any = stated.get("PhysicalSizeXUnit", "µm")
+        sides = [float(stated.get(f"PhysicalSize{axis}", 0)) for axis in "XY"]
+        units: list[Any] = [stated.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XY"]
     else:
         ratios = [page.tags.valueof(number) for number in (282, 283)]
         is_stated = all(isinstance(ratio, tuple) and all(ratio) for ratio in ratios)
-        sizes = [per / count for count, per in ratios] if is_stated else [0.0]
-        unit = (tiff.imagej_metadata or {}).get("unit", page.tags.valueof(296, default=2))
-    unit_m = _UNITS_M.get(unit.replace("\\u00B5", "µ") if isinstance(unit, str) else unit)
+        sides = [per / count for count, per in ratios] if is_stated else [0.0, 0.0]
+        units = [(tiff.imagej_metadata or {}).get("unit", page.tags.valueof(296, default=2))] * 2
+    lengths = [
+        _UNITS_M.get(unit.replace("\\u00B5", "µ") if isinstance(unit, str) else unit, 0.0)
+        for unit in units
+    ]
     # Programs that do not know it write 1.
-    if unit_m is None or sizes[0] in (0.0, 1.0) or max(sizes) > 1.01 * min(sizes):
-        return None
-    return unit_m * sizes[0], unit_m <= 1e-3
+    if not all(lengths) or not all(sides) or sides == [1.0, 1.0]:
+        return (), False
+    metres = tuple(side * length for side, length in zip(sides, lengths, strict=True))
+    return metres, max(lengths) <= 1e-3
 
 
 def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
