@@ -23,14 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv import read, synthetic_image
+from napari_shadowinv import Instrument, InversionOptions, read, synthetic_image
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.normalise import mask_unlit
+from napari_shadowinv.inversion.normalise import mask_unlit, prepare
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.beam import setup_warnings
 from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
 from napari_shadowinv.preprocessing import image_warnings
+from napari_shadowinv.preprocessing.alignment import register_source
 from reference import DATA, donut_case, toroid_case
 
 FloatArray = NDArray[np.float64]
@@ -146,7 +147,12 @@ def cautions_of(image: FloatArray, source: FloatArray | None) -> list[Caution]:
     """Return all cautions about an image, those of pixels without light among them."""
     mask, cautions = mask_unlit(image, source, None)
     usable = None if mask is None else np.asarray(mask)
-    return [*cautions, *image_warnings(image, source, usable)]
+    cautions = [*cautions, *image_warnings(image, source, usable)]
+    if source is not None:
+        shot = prepare(image, source, InversionOptions(negative="clip"), usable)
+        moved = register_source(shot.image, shot.source, shot.mask, Instrument()).caution
+        cautions += [moved] if moved else []
+    return cautions
 
 
 def noticed_shots(seeds: int) -> dict[str, list[bool]]:
