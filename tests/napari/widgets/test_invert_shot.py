@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import dask.array
+import h5py
 import numpy as np
 import pytest
 from napari.utils import progress
@@ -199,12 +200,13 @@ def test_crop_mask_and_source_are_used(
     tool.masks.layer = None
 
     beam = 300 * (1 + np.linspace(0, 0.2, shot.shape[1]) + np.zeros(shot.shape))
-    np.save(tmp_path / "beam.npy", beam)
+    with h5py.File(tmp_path / "run.nxs", "w") as file:
+        file["entry/beam"], file["entry/dark"] = beam, 0 * beam
     window.add_image(beam, name="beam")
     metadata = metadata_for("shot", "", proton_setup, source=beam)
     window.add_image(shot, name="measured", metadata=metadata)
     tool.source.layers.layer = window.layers["beam"]
-    tool.source.file.edit.setText(str(tmp_path / "beam.npy"))
+    tool.source.file.edit.setText(f"{tmp_path / 'run.nxs'}::/entry/beam")
     tool.image.layer = window.layers["measured"]
     assert tool.setup.setup() == proton_setup
     assert tool.source.kind == "own"
