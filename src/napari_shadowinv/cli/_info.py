@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io.formats import Format
-    from napari_shadowinv.io.matlab import Variable
     from napari_shadowinv.provenance import Provenance
 
 PACKAGES = (
@@ -43,37 +42,25 @@ def file_table(path: Path, variable: str | None = None) -> Table:
 def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.cli._batch import store_rows
     from napari_shadowinv.io import is_stack, read
-    from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.field_grids import describe_field_grid, is_field_grid
-    from napari_shadowinv.io.formats import MATLAB, format_of
+    from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.frames import find_frames
     from napari_shadowinv.io.hdf5_arrays import read_hdf5
-    from napari_shadowinv.io.matlab import mat_variables, read_mat
     from napari_shadowinv.io.store import StackStore
 
     if is_stack(path):
         return store_rows(StackStore(path))
     if variable is None and is_field_grid(path):
         return describe_field_grid(path)
-    if variable is None and path.is_file() and format_of(path) is MATLAB:
-        variables = mat_variables(path)
-        if sum(each.is_image for each in variables) != 1:
-            return _matlab_rows(variables)
     frames = find_frames(path, variable)
     if len(frames) > 1:
         return _frame_rows(read(path, variable=variable), frames[0].variable)
     path, variable = frames[0].path, frames[0].variable
     form = format_of(path)
-    if form is MATLAB:
-        array, metadata = read_mat(path, variable)
-        chosen = ("image", metadata["variable"])
-        return [*_matlab_rows(mat_variables(path))[:2], chosen, *_array_rows(array)]
     if variable is not None and form.name in ("pradformat", "shadowinv"):
         array = read_hdf5(path, variable)
         return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
-    if variable is None and form.name == "npy":
-        return [("kind", "NPY array"), *_array_rows(read_npy(path))]
-    if form.name not in ("cpsa", "text", "hdf5") and "result" not in form.holds:
+    if form.name not in ("npy", "mat", "cpsa", "text", "hdf5") and "result" not in form.holds:
         return _picture_rows(path, form)
     content = read(path, variable=variable)
     return _radiograph_rows(content) if isinstance(content, Radiograph) else _result_rows(content)
@@ -88,17 +75,6 @@ def _frame_rows(frames: Radiograph | xarray.Dataset, array: str | None) -> _summ
         *([] if array is None else [("array", array)]),
         ("shape", f"{images.shape}, [shot, y, x]"),
         *((f"first: {name}", text) for name, text in _array_rows(images[0].values)[2:]),
-    ]
-
-
-def _matlab_rows(variables: Sequence[Variable]) -> _summary.Rows:
-    """List the variables of a MATLAB file, and say how to choose of its images."""
-    images = sum(each.is_image for each in variables)
-    advice = "choose one with --variable" if images else "no variable is an image"
-    return [
-        ("kind", "MATLAB file"),
-        ("variables", ", ".join(map(str, variables)) or "none"),
-        ("images", f"{images}: {advice}"),
     ]
 
 
@@ -122,10 +98,13 @@ def _radiograph_rows(shot: Radiograph) -> _summary.Rows:
         "text": "numbers as text",
         "pradformat": "pradformat radiograph",
         "cpsa": "CR-39 tracks",
+        "npy": "NPY array",
     }
     kind = str(shot.metadata["kind"])
-    names["hdf5"] = f"array {shot.metadata.get('variable')!r} of an HDF5 file"
-    rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image)]
+    for name, title in (("hdf5", "an HDF5"), ("mat", "a MATLAB")):
+        names[name] = f"array {shot.metadata.get('variable')!r} of {title} file"
+    dtype = shot.metadata["dtype"]
+    rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image, dtype)]
     if shot.source is not None:
         rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
@@ -147,13 +126,13 @@ def _geometry_rows(metadata: Mapping[str, Any]) -> _summary.Rows:
     ]
 
 
-def _array_rows(array: AnyArray) -> _summary.Rows:
+def _array_rows(array: AnyArray, dtype: str = "") -> _summary.Rows:
     import numpy as np
 
     values = array.astype(np.float64)
     finite = values[np.isfinite(values)]
     shape = f"{array.shape}, [y, x]" if array.ndim == 2 else str(array.shape)
-    rows = [("shape", shape), ("dtype", str(array.dtype))]
+    rows = [("shape", shape), ("dtype", dtype or str(array.dtype))]
     if finite.size:
         rows.append(("min, mean, max", f"{finite.min():g}, {finite.mean():g}, {finite.max():g}"))
     rows.append(("negative", f"{np.count_nonzero(finite < 0)} values"))

@@ -154,8 +154,8 @@ def _choose_image(path: Path, name: str | None) -> tuple[Variable, tuple[int, ..
         )
     if len(images) > 1:
         raise InputError(
-            f"{path} holds {len(images)} images: choose one with variable, of "
-            f"{', '.join(map(str, images))}"
+            f"{path} holds {len(images)} images: expected one, or the name of one, as "
+            f"{path.name}::{images[0].name}; it holds {', '.join(map(str, images))}"
         )
     axes = images[0].shape[2:]
     if index is not None and (len(index) != len(axes) or any(map(int.__ge__, index, axes))):
