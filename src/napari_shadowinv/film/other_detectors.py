@@ -8,8 +8,8 @@
 
 Etching widens the trail of a charged particle to a pit, whose diameter depends on the particle and
 its energy; pits of high contrast or eccentricity are often noise. Which ranges count has to be
-found for each etching. `napari_shadowinv.io.read_tracks` reads a scan,
-`napari_shadowinv.io.read_cpsa` makes an image of it at once.
+found for each etching. `napari_shadowinv.io.read_tracks` reads a scan, and
+`napari_shadowinv.read` makes an image of it at once.
 
 Photostimulated luminescence (PSL) is proportional to the energy deposited in the plate. An
 inversion needs it up to a factor only, so fading, which is the same for all of a plate, matters

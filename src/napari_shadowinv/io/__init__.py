@@ -1,7 +1,7 @@
 """Files: radiographs in, results out, a module for each family of formats.
 
 - read an image or a result: `read`; only one of them: `read_radiograph`, `read_dataset`
-- a scan of CR-39: its tracks, `read_tracks`, or an image of those within ranges, `read_cpsa`
+- the tracks of a scan of CR-39: `read_tracks`
 - an image with its metadata: `Radiograph`; sum its pixels: `Radiograph.bin_pixels`
 - write a result or an image: `write`; check the path beforehand: `check_output`
 - results of many shots in one store: `read_stack`; recognise its folder: `is_stack`

@@ -1,7 +1,7 @@
 from .cpsa import read_tracks
 from .field_grids import is_field_grid, read_field_grid
 from .files import check_output, replacing
-from .read_write import read, read_cpsa, read_dataset, read_radiograph, read_toml, write
+from .read_write import read, read_dataset, read_radiograph, read_toml, write
 from .store import is_stack, read_stack
 
 __all__ = [
@@ -9,7 +9,6 @@ __all__ = [
     "is_field_grid",
     "is_stack",
     "read",
-    "read_cpsa",
     "read_dataset",
     "read_field_grid",
     "read_radiograph",

@@ -1,7 +1,7 @@
 """Scans of etched CR-39, ``.cpsa``: tracks found frame by frame by a microscope.
 
 - all tracks of a scan: `read_tracks`
-- an image of the tracks within ranges, written as text: `read_image`, `as_text`
+- an image of the tracks within ranges, written as text: `read_image`
 
 All numbers are little-endian. A header of 48 bytes holds 4 int32, 2 float32, 6 int32: the
 version (negative), the numbers of frames along x and y, a number of bins (unused), the width of
@@ -75,7 +75,7 @@ def read_tracks(path: Path) -> Tracks:
 def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
     """Count the tracks of a scan in bins, uint32, shape (H, W), with its ``geometry``.
 
-    `variable` is the ranges and the bin as `as_text` writes them: ``"diameter=4:12 bin=300"``.
+    `variable` is the ranges and the bin: ``"diameter=4:12 contrast=:40 bin=300"``.
     """
     chosen = {} if variable is None else _parse_ranges(variable)
     tracks, warnings = _read_scan(path)
@@ -96,39 +96,6 @@ def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[
         "warnings": warnings,
     }
     return counts, metadata if variable is None else {**metadata, "variable": variable}
-
-
-def as_text(
-    diameter: tuple[float | None, float | None] | None = None,
-    contrast: tuple[float | None, float | None] | None = None,
-    eccentricity: tuple[float | None, float | None] | None = None,
-    bin: float | None = None,
-) -> str | None:
-    """Write ranges and the bin as text, or None if there are none.
-
-    Examples
-    --------
-    >>> as_text(diameter=(4, 12), contrast=(None, 40), bin=300)
-    'diameter=4:12 contrast=:40 bin=300'
-    """
-    words = []
-    for name, ends in zip(_RANGES, (diameter, contrast, eccentricity), strict=True):
-        if ends is not None:
-            try:
-                low, high = ("" if end is None else _format_number(end) for end in ends)
-            except (TypeError, ValueError):
-                raise InputError(
-                    f"{name} is {ends!r}: expected its smallest and its largest value, such as "
-                    "(4, 12), with None for no limit"
-                ) from None
-            words.append(f"{name}={low}:{high}")
-    if bin is not None:
-        words.append(f"bin={_format_number(bin)}")
-    return " ".join(words) or None
-
-
-def _format_number(value: float) -> str:
-    return repr(float(value)).removesuffix(".0")
 
 
 def _parse_ranges(text: str) -> dict[str, Any]:

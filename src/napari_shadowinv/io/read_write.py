@@ -3,7 +3,6 @@
 - any file: `read`, whose content decides on the format, not its name; where only one kind makes
   sense: `read_radiograph`, `read_dataset`
 - one frame of many: `read_frame`
-- a scan of CR-39, with the ranges of the tracks to count: `read_cpsa`
 - a file with options or a setup: `read_toml`
 - a result or an image, whole or not at all: `write`; a result becomes one NetCDF4 file,
   ``.shadowinv``, or a table of its sites
@@ -26,7 +25,6 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.files import check_output, replacing, sha256, split_address
 from napari_shadowinv.io.formats import (
-    CPSA,
     IMAGE_WRITERS,
     format_of,
     formats_for,
@@ -78,8 +76,8 @@ def read(
     variable : str, optional
         Name of the array to take from a MATLAB file that holds several, or from any HDF5 file,
         with its groups: ``"shots/3/image"``; ``"entry/data/data[3]"`` is one frame of many. For
-        CR-39 the tracks to count: ``"diameter=4:12 contrast=:40 eccentricity=:15 bin=300"``; see
-        `read_cpsa`.
+        CR-39 the tracks to count: ``"diameter=4:12 contrast=:40 eccentricity=:15 bin=300"``, in µm
+        and %; without a bin about 50 tracks are in each.
 
     Returns
     -------
@@ -206,47 +204,6 @@ def read_radiograph(
             f"{path} is the result of an inversion: expected an image; give the original image"
         )
     return content
-
-
-def read_cpsa(
-    path: str | Path,
-    *,
-    diameter: tuple[float | None, float | None] | None = None,
-    contrast: tuple[float | None, float | None] | None = None,
-    eccentricity: tuple[float | None, float | None] | None = None,
-    bin: float | None = None,
-) -> Radiograph:
-    """Read a scan of etched CR-39 and count its tracks in bins.
-
-    Parameters
-    ----------
-    path : str or Path
-        ``.cpsa`` file.
-    diameter, contrast, eccentricity : tuple of float or None, optional
-        Smallest and largest value of the tracks that count, the diameter in µm; None for no
-        limit.
-    bin : float, optional
-        Side of a bin in µm of the detector. Default: about 50 tracks in each on average, but at
-        most 300 along the longer side.
-
-    Returns
-    -------
-    Radiograph
-        Counts, whose standard deviation is their root, with the bin as the detector's pixel in
-        ``metadata["geometry"]``, and the ranges as ``metadata["variable"]``.
-
-    Raises
-    ------
-    FileFormatError
-        As `read`, and if the file is no such scan.
-    InputError
-        If a range or the bin is impossible, or no track is within the ranges.
-    """
-    from napari_shadowinv.io.cpsa import as_text  # the reader of tracks imports much more
-
-    if format_of(path) is not CPSA:
-        raise FileFormatError(f"{path} is no CR-39 scan: expected {CPSA.title}; read it with read")
-    return read_radiograph(path, variable=as_text(diameter, contrast, eccentricity, bin))
 
 
 def read_dataset(path: str | Path) -> xarray.Dataset:
