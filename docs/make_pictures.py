@@ -16,7 +16,15 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
-from napari_shadowinv import InversionOptions, fit, invert, poisson_invert, read, synthetic_image
+from napari_shadowinv import (
+    FitOptions,
+    InversionOptions,
+    fit,
+    invert,
+    poisson_invert,
+    read,
+    synthetic_image,
+)
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.plotting import (
     comparison_figure,
@@ -74,7 +82,8 @@ def fit_picture() -> None:
         synthetic_image(strength * truth, beam) + 0.05 * rng.normal(size=beam.shape)
         for strength in (1, low.momentum / high.momentum)
     ]
-    found = fit(images, setups=[low, high], source="unknown", noise=0.05)
+    options = FitOptions(sampling="resolve")
+    found = fit(images, setups=[low, high], source="unknown", noise=0.05, options=options)
     save_small(fit_figure(found, title="Two energies, beam unknown"), HERE / "fit.png", 1300)
 
 

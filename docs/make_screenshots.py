@@ -31,8 +31,8 @@ from qtpy.QtGui import QImage
 from qtpy.QtWidgets import QApplication
 
 import napari
-from napari_shadowinv import InversionOptions, add_inversion, invert, run_stack, synthetic_image
-from napari_shadowinv._napari.layer_metadata import metadata_for, setup_of
+from napari_shadowinv import run_stack, synthetic_image
+from napari_shadowinv._napari.layer_metadata import metadata_for
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.physics.projection import project
@@ -143,20 +143,22 @@ def toroid_window() -> None:
     viewer = new_window("toroid with caustics")
     *_, shot = viewer.open_sample(PLUGIN, "toroid_with_caustics")
     shot.name = "toroid"
-    open_widget(viewer, "Invert shot")
-    options = InversionOptions(n_sites=10_000)
-    inversion = invert(shot.data, source=np.ones(shot.data.shape), options=options)
-    add_inversion(viewer, inversion, setup_of(shot), name="toroid")
+    press_run(open_widget(viewer, "Invert shot"))
     photograph(viewer, "napari-toroid.png")
 
 
 def stack_window(folder: Path) -> None:
-    """A run over real shadowgrams without a reference: the widget, and a shot's field."""
+    """A run over real shadowgrams with their reference: the widget, and a shot's field."""
     viewer = new_window("alcohol burner", height=840)
-    shots = [read_radiograph(path, channel="mean").bin_pixels(4).image for path in frames(folder)]
+    reference, *shots = (
+        read_radiograph(path, channel="mean").bin_pixels(4).image
+        for path in (folder / "Image_00000.bmp", *frames(folder))
+    )
+    viewer.add_image(reference, name="reference", visible=False)
     viewer.add_image(np.stack(shots), name="burner", axis_labels=("shot", "y", "x"))
     widget = open_widget(viewer, "Invert stack")
-    widget.source.set_kind("polynomial")
+    widget.source.set_kind("layer")
+    widget.source.layers.layer = viewer.layers["reference"]
     widget.steps.add("hot-pixels")
     widget.steps.folded.expand()
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
