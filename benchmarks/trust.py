@@ -615,7 +615,7 @@ def flaw_lines(answers: Sequence[Answer]) -> Iterator[Line]:
 
 
 def right_fits(seed: int, count: int) -> Iterator[Answer]:
-    """Right fits without a flaw, with a given beam."""
+    """Right fits without a flaw, with a beam that is known exactly, or from its own counts."""
     for number in range(count):
         rng = random_number(seed, "right fits", number)
         name = list(inside(rng))[number % 5]
@@ -625,11 +625,11 @@ def right_fits(seed: int, count: int) -> Iterator[Answer]:
         displacement, _, truth = made(inside, name, slope, seed)
         setups = setups_of(energies)
         images = flawed_images(Flaw("none"), displacement, [each.energy for each in setups], rng)
-        result = fit(images, setups=setups, source=FLAT, noise="poisson")
+        beam, text = (rng.poisson(FLAT), ", recorded") if number // 6 % 2 else (FLAT, "")
+        result = fit(images, setups=setups, source=beam, noise="poisson")
         kind = "folded single" if is_folded and energies == 1 else "others"
-        yield answer(
-            "right fits", f"{kind}, {name} at {slope:g}, {energies} energies", result, truth
-        )
+        case = f"{kind}, {name} at {slope:g}, {energies} energies{text}"
+        yield answer("right fits", case, result, truth)
 
 
 def right_fit_lines(answers: Sequence[Answer]) -> Iterator[Line]:

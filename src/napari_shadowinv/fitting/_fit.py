@@ -85,7 +85,6 @@ _ROUNDED = 8.0  # px
 _TRANSPORT_SITES = 10_000
 _DECIDES = 10.0  # in log evidence
 _MIN_BLUR_SCORE = 4.0  # standard deviations
-_NOISY_REFERENCE, _REFERENCE_BLUR_PX = 0.02, 1.5  # share of the variance; standard deviation
 _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 25.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
@@ -260,14 +259,8 @@ def fit(
         # Blur leaves little of a pattern, and one image none.
         is_blurred = data.single or pattern.blur_score > _MIN_BLUR_SCORE
         if (is_off or is_blurred) and pattern.chi2 < _MAX_RIVAL_CHI2:
-            sharp, smooth = scene, best
-            if data.reference_share > _NOISY_REFERENCE:
-                # A blur takes the noise of a reference away, too.
-                widths = 0, _REFERENCE_BLUR_PX, _REFERENCE_BLUR_PX
-                sharp = replace(scene, beams=gaussian_filter(scene.beams, widths))
-                smooth = settle_minimum(sharp, best, on_step, "point spread")
             only = "" if is_off else "blur"
-            rivals = compare_rivals(data, sharp, smooth, fields, on_step, only=only)
+            rivals = compare_rivals(data, scene, best, fields, on_step, only=only)
             pattern = replace(pattern, cause=rivals.cause(), tried=rivals.tried)
     with measure_time("samples", seconds):
         samples, pairs, errors = openness.samples, openness.pairs, openness.errors

@@ -254,7 +254,9 @@ def find_pattern(
     missing, deviation = 0.0, np.inf
     if is_counted and not correlation:
         # The weight of a pixel is one over the variance of its counts in units of the beam.
-        missing, deviation = lack_of_noise(residuals, roots * models > np.sqrt(_MIN_COUNTS))
+        expected = 1.0 if noise is None else np.sqrt(noise.expected_chi2)[:, None, None]
+        is_bright = roots * models > np.sqrt(_MIN_COUNTS)
+        missing, deviation = lack_of_noise(residuals / expected, is_bright)
     return Pattern(
         strengths=np.array(strengths),
         correlation=correlation,
