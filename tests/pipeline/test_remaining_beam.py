@@ -54,7 +54,11 @@ def test_what_is_taken_from_an_object_in_an_exact_beam_is_in_the_total(recipe: A
 
 def test_a_flat_reference_does_not_excuse_a_filter() -> None:
     recorded = Radiograph(shot(np.ones((SIDE, SIDE))), source=np.ones((SIDE, SIDE)))
-    assert 0.6 < told_over_true(run(Recipe(**HIGH_PASS), recorded)) < 1.7
+    found = run(Recipe(**HIGH_PASS), recorded)
+    assert 0.6 < told_over_true(found) < 1.7
+    assert found.errors is not None
+    assert found.errors.beam_basis == "filtered"  # it is the beam itself
+    assert "weaker filters" in found.errors.measure_next(0.01)
 
 
 def test_a_stated_error_of_an_estimated_source_stays_as_stated() -> None:

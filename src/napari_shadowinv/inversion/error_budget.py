@@ -37,6 +37,7 @@ _REMEDIES = {
     "discretisation": "more sites",
     "solver": "a smaller tolerance",
     "edge": "a larger field",
+    "filters": "weaker filters",
 }
 
 

@@ -56,7 +56,7 @@ def after_steps(
     says, or as r shows if that is more. Then the object has lost r L² / (L² + b²), with a variance
     of L² b² / (L² + b²). An exact beam has b = 0, so that r is the loss.
     """
-    beam = instrument.beam_of(measured=measured)
+    beam = instrument.beam_of(measured=measured, source=recorded.source)
     flattening, moving = (
         recipe.model_copy(
             update={"steps": tuple(step for step in recipe.steps if step.flattens is flattens)}
