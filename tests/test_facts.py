@@ -25,8 +25,9 @@ from napari_shadowinv import (
 from napari_shadowinv._napari.widgets._panels import fact_rows as window_rows
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._summary import fact_rows as table_rows
-from napari_shadowinv.facts import Level, percent, to_figures, with_error
+from napari_shadowinv.facts import Headline, Level, Verdict, percent, to_figures, with_error
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.preprocessing import Radiograph
 
 
@@ -100,7 +101,7 @@ def test_a_result_prints_a_few_lines_and_no_array(image, inversion):
         assert max(map(len, lines)) <= 160
         assert "array" not in repr(result)
         if hasattr(result, "headline"):
-            assert lines[1] == textwrap.shorten(result.headline.text, 160, placeholder=" …")
+            assert lines[1] == textwrap.shorten(str(result.headline), 160, placeholder=" …")
     assert "9 more" not in repr(inversion)
     assert repr(results_of(image, inversion)[1]).endswith("and 6 more")
 
@@ -171,7 +172,7 @@ def test_a_caution_is_a_doubtful_fact_and_lack_of_convergence_a_failed_one(image
 
 def test_every_face_shows_the_same_texts(inversion):
     table = dict(table_rows(inversion.facts))
-    assert table.pop("verdict") == inversion.verdict  # above the report in a window
+    assert inversion.verdict not in table.values()  # it is in the line above
     window = window_rows(inversion.facts) + window_rows(inversion.facts, details=True)
     assert {name.lower(): text for name, text in window} == table
 
@@ -185,11 +186,31 @@ def test_facts_of_a_fit_name_images_fields_and_the_verdict(image):
     assert "strength 0.8" in texts["image_2"]
     largest = np.hypot(*result.fields[0].displacement).max()
     assert f"{largest:.3g} px" in texts["field_B"]
-    assert [fact.text for fact in facts if fact.key == "verdict"] == [
-        str(result.verdict),
-        result.explanation,
-    ]
+    assert texts["verdict"] == result.verdict
     assert {fact.level for fact in facts if fact.key == "verdict"} == {Level.DOUBTFUL}
+
+
+def test_the_title_of_a_headline_is_one_word_for_trust():
+    titles = {
+        (Verdict.DETERMINED, Level.SOUND): "determined",
+        (Verdict.DETERMINED, Level.DOUBTFUL): "determined, with warnings",
+        (Verdict.CONDITIONAL, Level.CONDITIONAL): "depends on the beam",
+        (Verdict.EDGE, Level.DOUBTFUL): "reaches the edge",
+        (Verdict.UNCERTAIN, Level.FAILED): "failed",
+        (None, Level.SOUND): "sound",
+    }
+    for (verdict, level), title in titles.items():
+        assert Headline(level, "9 T", verdict).title == title
+    doubted = Headline(Level.DOUBTFUL, "9 T", Verdict.DETERMINED)
+    assert str(doubted) == "Determined, with warnings: 9 T"
+
+
+def test_the_headline_of_a_fit_begins_with_its_peaks(image):
+    options = FitOptions(samples=0, max_iterations=2, spacing=0.25)
+    result = fit([image], noise=0.01, options=options)
+    (shown,) = shown_fields([result.fields[0].displacement], None, mask=result.used)
+    assert result.headline.text.startswith(f"peak |d| {shown.largest:.3g} px; ")
+    assert result.explanation in result.headline.text
 
 
 def test_each_fitted_field_has_its_significance(image):

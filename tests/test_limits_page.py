@@ -41,8 +41,7 @@ def test_the_blocks_print_what_the_page_shows(names):
 
 def test_the_first_line_of_the_page_is_that_of_its_shot(names):
     (line,) = re.findall(r"^> (.*)$", PAGE, re.MULTILINE)
-    headline = names["result"].headline
-    assert line == f"{headline.level.value.capitalize()}: {headline.text}"
+    assert line == str(names["result"].headline)
 
 
 def test_the_commands_of_the_page_run(names):

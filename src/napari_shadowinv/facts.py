@@ -31,6 +31,9 @@ from napari_shadowinv.cautions import Caution
 _MIN_PLAIN, _MAX_PLAIN = 1e-3, 1e5  # other numbers have a power of ten
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
+WITH_WARNINGS = ", with warnings"
+"""Behind a verdict in the title of a headline, whose level is then that of its warnings."""
+
 _MAX_LINES, _LINE_LETTERS = 5, 160  # of a summary, below its title
 _PICTURE_PX = 256
 _SHOWN_PERCENTILES = 0.5, 99.5
@@ -96,7 +99,7 @@ class Summarised:
     def _summary(self) -> list[str]:
         """Return the lines below the title, the most important first."""
         result: Any = self
-        lines = [result.headline.text] if hasattr(result, "headline") else []
+        lines = [str(result.headline)] if hasattr(result, "headline") else []
         if not hasattr(result, "cautions"):
             return [*lines, *(f"{fact.title}: {fact.text}" for fact in result.facts)]
         return lines + [each.text for each in result.cautions if each.code != "verdict"]
@@ -205,26 +208,35 @@ class Verdict(StrEnum):
         levels = {Verdict.DETERMINED: Level.SOUND, Verdict.CONDITIONAL: Level.CONDITIONAL}
         return levels.get(self, Level.DOUBTFUL)
 
-    def explain(self, reason: str) -> str:
-        """Return a reason after the verdict; a condition begins with its number instead."""
-        return reason if self is Verdict.CONDITIONAL else f"{self.upper()}: {reason}"
-
 
 @dataclass(frozen=True)
 class Headline:
-    """A result in one line.
+    """A result in one line, which begins with its title.
 
     Attributes
     ----------
     level : Level
         Failed if the solver did not converge, doubtful with a warning, else that of the verdict.
     text : str
-        The verdict and its reason, the warnings in a few words, the peak of the main field with
-        its error.
+        The peak of the main field with its error, the reason of the verdict, and the warnings in
+        a few words.
+    verdict : Verdict, optional
+        None for results without one.
     """
 
     level: Level
     text: str
+    verdict: Verdict | None = None
+
+    @property
+    def title(self) -> str:
+        """The one word for trust: the verdict, or else the level."""
+        if self.verdict is None or self.level is Level.FAILED:
+            return self.level.value
+        return self.verdict + WITH_WARNINGS * (self.level is not self.verdict.level)
+
+    def __str__(self) -> str:
+        return f"{self.title.capitalize()}: {self.text}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,7 +108,7 @@ def analyse(
     if missing:
         missing[0].check(fields[0].frame)
     names = _names([product for task in tasks for product in task.products])
-    headline = Fact("result", "Field", content.headline.text, content.headline.level)
+    headline = Fact("result", "Field", str(content.headline), content.headline.level)
     results: list[ProductResult] = []
     for task in tasks:
         if not task.products:

@@ -6,7 +6,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from napari_shadowinv.cli._summary import Rows, fact_rows, options_text, setup_text, size_text
+from napari_shadowinv.cli._summary import (
+    Rows,
+    fact_rows,
+    headline_row,
+    options_text,
+    setup_text,
+    size_text,
+)
 from napari_shadowinv.cli._terminal import say, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import RESULT
@@ -98,8 +105,9 @@ def _provenance_rows(provenance: Provenance) -> Rows:
 
 
 def fit_rows(fit: Fit, names: Sequence[str] = (), printed: tuple[str, ...] = ()) -> Rows:
-    """Return the size and setup of the images, and the facts; `names` are of the images."""
+    """Return the headline and facts of a fit, and the size and setup of its images, by `names`."""
     return [
+        headline_row(fit.headline),
         *fact_rows(fit.facts_with_names(names) if names else fit.facts, printed),
         ("size", size_text(fit.images[0])),
         ("setup", setup_text(fit.setup, shape=fit.images[0].shape)),

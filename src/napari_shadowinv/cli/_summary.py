@@ -36,17 +36,21 @@ def two_columns(title: str, rows: Rows) -> Table:
     from rich import box
     from rich.table import Table
 
+    from napari_shadowinv.facts import WITH_WARNINGS, Verdict
+
+    levels = {verdict.value: verdict.level.value for verdict in Verdict}
     table = Table(title=plain(title), title_justify="left", box=box.SIMPLE, show_header=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in rows:
-        table.add_row(plain(name), plain(value, _STYLES.get(name, "")))
+        level = levels.get(name, "doubtful" if name.endswith(WITH_WARNINGS) else name)
+        table.add_row(plain(name), plain(value, _STYLES.get(level, "")))
     return table
 
 
 def headline_row(headline: Headline) -> tuple[str, str]:
-    """Return the headline of a result; the name of the row is the level of trust."""
-    return (headline.level.value, headline.text)
+    """Return the headline of a result; the name of the row is its title."""
+    return (headline.title, headline.text)
 
 
 def provenance_rows(provenance: Provenance | None) -> Rows:
@@ -69,11 +73,12 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
 
 
 def fact_rows(facts: Iterable[Fact], printed: tuple[str, ...] = ()) -> Rows:
-    """Return facts as rows of a table, without cautions that are already printed."""
+    """Return facts as rows of a table, without the verdict and cautions that are printed."""
     return [
         (fact.title[:1].lower() + fact.title[1:], fact.text)
         for fact in facts
-        if not fact.text.endswith(printed)  # a fit puts the name of the image first
+        # A fit puts the name of the image first.
+        if fact.key != "verdict" and not fact.text.endswith(printed)
     ]
 
 

@@ -421,13 +421,18 @@ class Fit(Summarised):
 
     @property
     def headline(self) -> Headline:
-        """Verdict and its reason, warnings and convergence in one line."""
-        texts = [self.verdict.explain(self.explanation), *in_headline(self.warnings)]
-        level = Level.DOUBTFUL if self.cautions else self.verdict.level
+        """The peaks of the fields, the verdict and the warnings in one line."""
+        level, texts = Level.DOUBTFUL if self.cautions else self.verdict.level, []
+        if self.verdict is not Verdict.CONDITIONAL:  # whose explanation is the peak
+            deflectors = [deflector_titles()[field.name] for field in self.fields]
+            for field, deflector in zip(self.fields, deflectors, strict=True):
+                (shown,) = shown_fields([field.displacement], self.setup, deflector, mask=self.used)
+                texts.append(shown.short_peak_text(self.peak_error(field, shown)))
+        texts += [self.explanation, *in_headline(self.warnings)]
         if not self.report.converged:
             level = Level.FAILED
             texts.append(f"not converged in {self.report.iterations} steps")
-        return Headline(level, "; ".join(texts))
+        return Headline(level, "; ".join(texts), self.verdict)
 
     @property
     def facts(self) -> tuple[Fact, ...]:
@@ -442,10 +447,8 @@ class Fit(Summarised):
         names : sequence of str
             A name for each image, or none.
         """
-        level = self.verdict.level
         return (
             verdict_fact(self.verdict),
-            Fact("verdict", "Reason" if level.is_success else "Warning", self.explanation, level),
             *caution_facts(self.warnings),
             *self._image_facts(names),
             *(self._field_fact(field) for field in self.fields),

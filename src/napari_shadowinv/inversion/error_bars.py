@@ -244,7 +244,7 @@ class Uncertainty(Summarised):
 
     def _summary(self) -> list[str]:
         drawn = ", ".join((self.noise, *self.imperfections))
-        shown = self.inversion.headline.text, f"{self.n} samples, {self.method}: {drawn}"
+        shown = str(self.inversion.headline), f"{self.n} samples, {self.method}: {drawn}"
         return [*shown, *(caution.text for caution in self.warnings)]
 
     def _picture(self) -> FloatArray:

@@ -308,7 +308,7 @@ class Inversion(Summarised):
             return Assessment(Verdict.UNCERTAIN, "there is no displacement to compare errors with")
         text = f"errors of {errors.share_text} of the {self._subject(errors)} (r.m.s.)"
         if errors.share <= max_error:
-            return Assessment(Verdict.DETERMINED, f"{text}, the largest by {errors.limited_by}")
+            return Assessment(Verdict.DETERMINED, f"{text}, limited by {errors.limited_by}")
         if condition := errors.beam_condition(max_error):
             (field,) = shown_fields([self.displacement], setup, mask=self.lit)
             return Assessment(Verdict.CONDITIONAL, field.conditional_text(condition))
@@ -321,7 +321,7 @@ class Inversion(Summarised):
 
     @property
     def headline(self) -> Headline:
-        """Verdict, warnings and the peak of the main field in one line."""
+        """The peak of the main field, the verdict and the warnings in one line."""
         return self.headline_in(self.setup)
 
     def headline_in(self, setup: Setup | None) -> Headline:
@@ -335,15 +335,14 @@ class Inversion(Summarised):
         errors = self.errors_in(setup)
         error = None if errors is None else errors.of_peak
         (field,) = shown_fields([self.displacement], setup, mask=self.lit)
-        assessment, cautions = self.assess_in(setup), self.report.warnings
-        texts = [assessment.verdict.explain(assessment.reason)]
-        texts += in_headline(each for each in cautions if each is not assessment.caution)
-        level = Level.DOUBTFUL if cautions else assessment.verdict.level
+        (verdict, reason, caution), cautions = self.assess_in(setup), self.report.warnings
+        # The reason of a condition is the peak.
+        texts = [] if verdict is Verdict.CONDITIONAL else [field.short_peak_text(error)]
+        texts += [reason, *in_headline(each for each in cautions if each is not caution)]
+        level = Level.DOUBTFUL if cautions else verdict.level
         if not self.report.converged:
             level = Level.FAILED
-        if assessment.verdict is not Verdict.CONDITIONAL:
-            texts.append(field.peak_text(error))
-        return Headline(level, "; ".join(texts))
+        return Headline(level, "; ".join(texts), verdict)
 
     @property
     def facts(self) -> tuple[Fact, ...]:

@@ -194,9 +194,9 @@ def wrapped(sentences: Iterable[tuple[str, str]], letters: int) -> list[tuple[st
     return [(line, colour) for text, colour in sentences for line in textwrap.wrap(text, letters)]
 
 
-def headline_sentence(headline: Headline | Fact) -> tuple[str, str]:
-    """Return a headline, or a fact in its place, with the colour of its level."""
-    return headline.text, LEVEL_COLOURS[headline.level]
+def headline_sentence(headline: Headline) -> tuple[str, str]:
+    """Return a headline with the colour of its level."""
+    return str(headline), LEVEL_COLOURS[headline.level]
 
 
 _LEGENDS = {"masked": " (hatched)", "caustics": " (outlined)", "crossed_rays": " (outlined)"}

@@ -298,7 +298,7 @@ class InvertTask(Task):
             **dataclasses.asdict(result.report),
             "stages": result.report.seconds,
             "level": headline.level.value,
-            "headline": headline.text,
+            "headline": str(headline),
             **column_values(ROWS if self.by_row else INVERSIONS, result),
         }
         if self.by_row:

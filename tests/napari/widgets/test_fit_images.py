@@ -218,13 +218,13 @@ def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
     window: Any, tool: Any, show: Any, fitted: Fit, messages: list[str]
 ) -> None:
     show(tool, fitted)
-    assert "Verdict: determined" in tool.view.verdict.text()
+    assert "Determined" in tool.view.verdict.text()
     assert not tool.view.verdict.styleSheet()
     assert messages == []
     count = len(window.layers)
     explanation = "the forward model does not explain image 2"
     show(tool, replace(fitted, verdict=Verdict.MISFIT, explanation=explanation))
-    assert "Verdict: does not fit" in tool.view.verdict.text()
+    assert "Does not fit" in tool.view.verdict.text()
     assert explanation[1:] in tool.view.verdict.text()
     assert tool.view.verdict.styleSheet()
     assert messages == [f"The fit's verdict is 'does not fit': {explanation}"]

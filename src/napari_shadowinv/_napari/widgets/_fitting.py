@@ -15,7 +15,13 @@ from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
 from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
-from napari_shadowinv._napari.widgets._panels import ReportTable, Rows, RunPanel, fact_rows
+from napari_shadowinv._napari.widgets._panels import (
+    ReportTable,
+    Rows,
+    RunPanel,
+    VerdictLine,
+    fact_rows,
+)
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.facts import Fact
@@ -60,7 +66,7 @@ class FitView(QWidget):
         self._alternative = ResultLayers(viewer, self)
         self.results = ResultLayers(viewer, self)
         self.curve = ObjectiveCurve()
-        self.verdict = forms.WrappingLabel()
+        self.verdict = VerdictLine()
         self.solutions = SteadyComboBox(
             tip="Alternative solutions from other starting points. Select one to show it next to "
             "the best."
@@ -87,9 +93,8 @@ class FitView(QWidget):
         fit = finished.content
         moved = place_inputs(self._viewer, job)
         self._show_report(fit, fit.facts_with_names(job.names), job.inputs)
-        if not fit.verdict.level.is_success:
-            text = fit.cautions[0].text
-            show_warning(text[:1].upper() + text[1:])
+        if not fit.headline.level.is_success:
+            show_warning(str(fit.headline))
         self._alternative.show([])
         self._job, self._result = job, finished.result
         self._list_solutions(fit)
@@ -109,8 +114,7 @@ class FitView(QWidget):
         return True
 
     def _show_report(self, fit: Fit, facts: Iterable[Fact], inputs: Rows = ()) -> None:
-        style = "" if fit.verdict.level.is_success else forms.PROBLEM_STYLE
-        self.verdict.show_titled(f"Verdict: {fit.verdict.value}", f"{fit.explanation}.", style)
+        self.verdict.show_headline(fit.headline)
         warnings = [("Warning", caution.text) for caution in fit.warnings]
         rows = [row for row in warnings if row not in inputs]
         self.report.show_rows([*rows, *inputs, *fact_rows(facts, details=None)])

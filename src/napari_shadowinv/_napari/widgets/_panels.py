@@ -340,8 +340,9 @@ def fact_rows(facts: Iterable[Fact], *, details: bool | None = False) -> list[tu
 
 
 def warning_rows(facts: Iterable[Fact]) -> list[tuple[str, str]]:
-    """Return the warnings among facts as rows."""
-    return [(fact.title, fact.text) for fact in facts if fact.key in CAUTION_CODES]
+    """Return the warnings among facts as rows, without the verdict in the line above."""
+    codes = CAUTION_CODES.keys() - {"verdict"}
+    return [(fact.title, fact.text) for fact in facts if fact.key in codes]
 
 
 class ReportTable(QtWidgets.QTableWidget):
@@ -413,11 +414,11 @@ class FoldedReport(QtWidgets.QWidget):
 
 
 class VerdictLine(forms.WrappingLabel):
-    """A coloured line below Run with level of trust, warnings in a few words, and peak."""
+    """A coloured line below Run with verdict, peak, and warnings in a few words."""
 
     def show_headline(self, headline: Headline, prefix: str = "") -> None:
         """Show a headline after a prefix, such as ``"Preview: "``."""
-        title = f"{prefix}{headline.level.value.capitalize()}"
+        title = f"{prefix}{headline.title.capitalize()}"
         self.show_titled(title, headline.text, _LEVEL_STYLES[headline.level])
 
 

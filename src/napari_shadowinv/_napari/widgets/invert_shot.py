@@ -245,7 +245,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
         else:
             self._report(inversion, inversion.setup, job.inputs)
             if not headline.level.is_success:
-                show_caution(f"{headline.level.value.capitalize()}: {headline.text}")
+                show_caution(str(headline))
             self.reveal(self.verdict)
             self._learn_pace(inversion)
             # They refine an earlier result and would cover the new one.
