@@ -34,7 +34,7 @@ from napari_shadowinv.cli._terminal import (
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import Verdict, to_figures
+from napari_shadowinv.facts import Verdict, percent
 from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
@@ -247,14 +247,10 @@ def _site_rows(store: StackStore) -> Rows:
     reasons = dict.fromkeys(report.get("sites_reason") or "as requested" for report in reports)
     reason = next(iter(reasons)) if len(reasons) == 1 else "for different reasons"
     rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
-    errors = [report["errors"] for report in reports if report.get("errors")]
-    medians = [
-        f"{name} {to_figures(np.median(values))} px"
-        for name in ("noise", "discretisation")
-        if (values := [rms[name][0] for rms in errors if np.isfinite(rms[name][0])])
-    ]
-    if medians:
-        rows.append(("errors", f"{', '.join(medians)} (r.m.s., median of the shots)"))
+    totals = [report["total_error"] for report in reports if report.get("total_error")]
+    if totals:
+        median = percent(float(np.median(totals)))
+        rows.append(("errors", f"{median} of the displacement (r.m.s., median of the shots)"))
     return rows
 
 
@@ -350,8 +346,8 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
 
 
 def _column_table(store: StackStore, columns: Sequence[StoreColumn]) -> Table:
-    shots = Table(box=box.SIMPLE)
-    for heading in ("shot", "name", "status"):
+    shots = Table(box=box.SIMPLE, pad_edge=False)
+    for heading in ("shot", "name"):
         shots.add_column(heading, overflow="fold")
     for column in columns:
         shots.add_column(column.title, overflow="fold", min_width=column.width or None)
@@ -359,8 +355,12 @@ def _column_table(store: StackStore, columns: Sequence[StoreColumn]) -> Table:
         shots.add_row(
             str(index),
             plain(store.names[index]),
-            STATUS_NAMES[status],
-            *(plain(column.text(report)) for column in columns),
+            *(
+                STATUS_NAMES[status]
+                if column.key == "verdict" and status != DONE
+                else plain(column.text(report))
+                for column in columns
+            ),
             style="red" if status in (FAILED, DAMAGED) else "",
         )
     return shots

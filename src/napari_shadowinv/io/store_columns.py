@@ -87,7 +87,7 @@ def _error(part: str) -> Callable[[Any], float]:
 
 # In the order of all tables.
 COLUMNS: tuple[Column, ...] = (
-    Column("seconds", "Time its worker spent on the shot", unit="s", format=".1f"),
+    Column("seconds", "Time its worker spent on the shot", unit="s"),
     Column(
         "verdict",
         "Whether the field may be believed",
