@@ -693,7 +693,7 @@ def test_refine_starts_from_the_last_inversion(
     expected = fit([refined_shot])
     np.testing.assert_allclose(result.fields[0].potential, expected.fields[0].potential)
     assert any(basin.start == "given" for basin in result.basins)
-    qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.fit_view.verdict.text()), timeout=PATIENCE)
     names = [layer.name for layer in window.layers]
     qtbot.waitUntil(
         lambda: any(
@@ -711,6 +711,19 @@ def test_refine_starts_from_the_last_inversion(
     qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
     assert not refined.visible
     assert not tool.fit_view.verdict.isVisible()
+
+
+def test_the_button_refines_an_inversion_of_a_file(
+    window: Any, open_widget: Any, in_loop: Any, tmp_path: Any, messages: list[str]
+) -> None:
+    path = tmp_path / "shot.shadowinv"
+    inversion = invert(images()[0][MIDDLE], options=InversionOptions(n_sites=600))
+    write(path, inversion, setup=SETUPS[0])
+    tool = open_widget("Invert shot")
+    window.open(str(path), plugin="napari-shadowinv")
+    in_loop(tool.refine_section.button.click)
+    assert not any("no inversion" in text for text in messages)
+    assert tool.panel.runner.running
 
 
 def test_the_menu_refines_an_inversion_of_a_file(
@@ -733,7 +746,7 @@ def test_the_menu_refines_an_inversion_of_a_file(
     assert tool.panel.runner.running
     in_loop(refine)
     assert messages[-1].startswith("Invert shot is running")
-    qtbot.waitUntil(lambda: "Verdict" in tool.fit_view.verdict.text(), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.fit_view.verdict.text()), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.fit_view.results.busy, timeout=PATIENCE)
     assert layer_of(window, "field", "shot refined").visible
     assert texts_of(tool.fit_view.report)["Start"] == "the inversion of 'shot'"

@@ -167,11 +167,15 @@ class InvertShot(InversionInputs, panels.LivePanel):
 
     @qt.notify_errors
     def refine(self, psf: float) -> None:
-        """Fit the forward model to the last inversion's image, starting from its field."""
+        """Refine the last inversion of the image, or else that of the selected layer."""
         if self.panel.runner.running and not self._running_preview:
             return
         image: Any = self.image.layer
         fields = field_of(self._last.layers_of(image))
+        chosen = self.viewer.layers.selection.active
+        if not fields and chosen is not None and about.result_of(chosen) is not None:
+            self.refine_layer(chosen)
+            return
         if not fields:
             raise InputError(
                 "there is no inversion of this image to refine: press Run first, then Refine"
