@@ -273,24 +273,6 @@ def test_object_beyond_the_edge_and_lopsided_objects_are_warned_of():
     assert "halves of the object differ" in texts(profile)
 
 
-def test_object_that_leaves_the_image_along_its_axis_is_warned_of():
-    axis = {"axis": ((0.0, 59.5), (79.0, 59.5))}
-    for middle, sentences in ((39.5, 0), (72.0, 1)):
-        blob = gaussian_blob((80, 120), 60.0, 10.0, (middle, 59.5))
-        (profile,) = analyse(result_of(blob, LIGHT), AxisymmetricProfile(**axis))
-        assert texts(profile).count("leaves the image along its axis") == sentences
-        # The deflection falls off with the distance from the middle, as the potential does.
-        expected = np.exp(-((79 - middle) ** 2) / 200) if sentences else 0.0
-        assert float(profile["ends"].value) == pytest.approx(expected, abs=0.05)
-    # A column that does not change along its axis leaves it, too, and its edge distorts nothing.
-    x = np.arange(120) - 59.5
-    column = np.tile(60 * np.exp(-(x**2) / 200), (80, 1))
-    moved = np.stack([0 * column, column * x / 100])
-    field = RetrievedField(dataset_from_field(moved, column, LIGHT))
-    (profile,) = analyse(field, AxisymmetricProfile(**axis))
-    assert profile["ends"].value == 0
-
-
 def test_long_object_near_a_point_source_is_warned_of():
     near = ProtonSetup(
         energy=14.7, source_object_distance=2e-3, object_image_distance=0.1, pixel_size=2e-6

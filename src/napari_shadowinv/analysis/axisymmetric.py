@@ -15,7 +15,6 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 from scipy.constants import mu_0
-from scipy.ndimage import gaussian_filter1d, uniform_filter1d
 
 from napari_shadowinv._system.validation import CombinationError
 from napari_shadowinv._typing import FloatArray
@@ -52,11 +51,6 @@ _MIN_RADIUS_PX = 8
 _DEFAULT_SMOOTHING = 1.0
 _MIN_DENSITY_RATIO = 0.02  # below it a temperature is only noise
 _EDGE_SHARE = 0.06  # of the radius, in which the field should have ended
-_EDGE_PX = 6  # at least: nearer to it, a closed edge suppresses most of the deflection
-_EDGE_REACH = 0.25  # of the radius
-_NOTABLE_END = 0.15  # of the largest deflection
-_NOTABLE_CHANGE = 0.1  # of the deflection along the axis
-_END_PX, _AT_EDGE_PX = 3, 2.0
 _NOTABLE_EDGE = 0.05  # of the largest deflection
 _NOTABLE_ASYMMETRY = 0.1
 _NOTABLE_LENGTH = 0.02  # of the distance to the source
@@ -197,19 +191,7 @@ class AxisymmetricProfile(Product):
     def _sides(
         self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
     ) -> tuple[FloatArray, FloatArray]:
-        """Return both sides of the object, (slices, radius), averaged over each slice."""
-        right_rows, left_rows = self._rows(displacement, frame, shift)
-        return self._by_slice(right_rows), self._by_slice(left_rows)
-
-    def _by_slice(self, rows: FloatArray) -> FloatArray:
-        edges = self._slices
-        widths = np.diff([*edges, len(rows)])
-        return np.asarray(np.add.reduceat(rows, edges, axis=0) / widths[:, None])
-
-    def _rows(
-        self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return both sides of the object at each place along the axis, (places, radius).
+        """Return both sides of the object, (slices, radius), averaged over each slice.
 
         They are deflections across the axis in px, or the axial magnetic field in T m.
         """
@@ -223,24 +205,13 @@ class AxisymmetricProfile(Product):
         else:
             field = frame.field(displacement[0], displacement)
             component = np.asarray(np.tensordot(axis.direction, field, axes=1))
-        return sample_sides(component, axis, self._radius_px(frame), is_odd=is_odd)
-
-    def _end_share(self, rows: FloatArray, frame: FieldFrame) -> float:
-        """Return the deflection where the axis meets the edge of the image over the largest.
-
-        It is 0 for an object that does not change along its axis.
-        """
-        sizes = np.sqrt((uniform_filter1d(rows, _END_PX, axis=0) ** 2).mean(axis=1))
-        largest = float(sizes.max())
-        if sizes.min() >= (1 - _NOTABLE_CHANGE) * largest:
-            return 0.0
-        axis, last = self._axis, np.array(frame.shape) - 1.0
-        at_edge = [
-            float(size) / largest
-            for point, size in ((axis.start, sizes[0]), (axis.end, sizes[-1]))
-            if min(np.min(point), np.min(last - point)) < _AT_EDGE_PX
-        ]
-        return max(at_edge, default=0.0)
+        right_rows, left_rows = sample_sides(component, axis, self._radius_px(frame), is_odd=is_odd)
+        edges = self._slices
+        widths = np.diff([*edges, len(right_rows)])[:, None]
+        right_side, left_side = (
+            np.add.reduceat(rows, edges, axis=0) / widths for rows in (right_rows, left_rows)
+        )
+        return right_side, left_side
 
     @property
     def _slices(self) -> list[int]:
@@ -279,13 +250,11 @@ class AxisymmetricProfile(Product):
         first = next(iter(profiles.values()))
         difference = f"{first.long_name}, right half minus left half"
         halves = "Difference of the halves of the deflection, relative (r.m.s.)"
-        ends = "Deflection where the axis meets the edge of the image, relative (r.m.s.)"
         offset = "Symmetry axis of the field, offset from the axis"
         return profiles | {
             "half_difference": replace(first, long_name=difference),
             "asymmetry": Variable((), "1", halves),
             "edge": Variable((), "1", "Deflection at the edge, relative to the largest"),
-            "ends": Variable((), "1", ends),
             "axis_offset": Variable((), PIXEL, offset),
         }
 
@@ -333,8 +302,7 @@ class AxisymmetricProfile(Product):
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         _, displacement = frame.at_points(potential, displacement)
-        right_rows, left_rows = self._rows(displacement, frame)
-        right_side, left_side = (self._by_slice(rows) for rows in (right_rows, left_rows))
+        right_side, left_side = self._sides(displacement, frame)
         _, inverse = self._operators(frame)
         values = self._profiles((right_side + left_side) / 2 @ inverse.T, frame)
         scale = self._scale(frame)
@@ -346,23 +314,8 @@ class AxisymmetricProfile(Product):
         width = _end_width(mean.shape[1])
         edge = np.abs((right_side + left_side)[:, -width:].mean(axis=1) / 2).max()
         values["edge"] = np.asarray(edge / max(mean.max(), 1e-300))
-        values["ends"] = np.asarray(self._end_share((right_rows + left_rows) / 2, frame))
         values["axis_offset"] = np.asarray(_axis_offset(right_side, left_side))
         return values
-
-    def _deflection_of_edge(self, sides: FloatArray, frame: FieldFrame) -> FloatArray:
-        """Return the deflections that a closed edge suppresses if the object does not end there.
-
-        No light crosses that edge, so the whole image is compressed, or shifted if both sides are
-        displaced alike.
-        """
-        count, radius = sides.shape
-        width = max(_end_width(radius), min(_EDGE_PX, radius // 4))
-        ends = sides[:, -width:].mean(axis=1)
-        if count > 1:  # what changes along the edge is felt as far inside as it is long
-            ends = gaussian_filter1d(ends, _EDGE_REACH * radius / self.slice_width)
-        is_odd = frame.unit.field != _B
-        return np.asarray(ends[:, None] * (np.arange(1.0, radius + 1) / radius) ** is_odd)
 
     def _scale(self, frame: FieldFrame) -> float:
         """Return the first of the profiles for a profile of 1 px."""
@@ -399,17 +352,13 @@ class AxisymmetricProfile(Product):
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
     ) -> Values:
-        """Return the changes by one more smoothing, by the image's edge and by the axis' error."""
+        """Return the changes by one more smoothing and by the axis' error."""
         matrix, inverse = self._operators(frame)
         right_side, left_side = self._sides(displacement, frame)
-        sides = (right_side + left_side) / 2
-        profile = sides @ inverse.T
+        profile = (right_side + left_side) / 2 @ inverse.T
         values = self._profiles(profile, frame)
         again = self._profiles(profile @ matrix.T @ inverse.T, frame)
-        cut = self._profiles((sides + self._deflection_of_edge(sides, frame)) @ inverse.T, frame)
-        errors = {
-            name: np.hypot(again[name] - value, cut[name] - value) for name, value in values.items()
-        }
+        errors = {name: np.abs(again[name] - value) for name, value in values.items()}
         if self.axis_error:
             pairs = (self._sides(displacement, frame, sign * self.axis_error) for sign in (1, -1))
             moved = [self._profiles((a + b) / 2 @ inverse.T, frame) for a, b in pairs]
@@ -422,7 +371,7 @@ class AxisymmetricProfile(Product):
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
         # Noise raises both shares, which say how far the object is from the assumptions.
-        shares = {name: float(quantities[name].value) for name in ("asymmetry", "edge", "ends")}
+        shares = {name: float(quantities[name].value) for name in ("asymmetry", "edge")}
         return [
             replace(fact, text=percent(shares[fact.key]), short="") if fact.key in shares else fact
             for fact in super().facts(quantities, frame)
@@ -432,16 +381,7 @@ class AxisymmetricProfile(Product):
         axis, radius = self._axis, self._radius_px(frame)
         points = axis.points(axis.places(), np.arange(-radius + 1.0, radius)).reshape(-1, 2)
         yield from mask_cautions(points, frame, "the object")
-        edge, halves, ends = (
-            float(quantities[name].value) for name in ("edge", "asymmetry", "ends")
-        )
-        if ends > _NOTABLE_END:
-            yield Caution(
-                "edge",
-                f"the object leaves the image along its axis, where its deflection is {ends:.0%} "
-                "of the largest: the closed edge of an inversion distorts the profile near it; use "
-                "a larger image, or a free boundary",
-            )
+        edge, halves = (float(quantities[name].value) for name in ("edge", "asymmetry"))
         if edge > _NOTABLE_EDGE:
             yield Caution(
                 "edge",
