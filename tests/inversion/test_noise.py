@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, zoom
 
+from napari_shadowinv import invert
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.inversion.noise import CorrelatedNoise, measure_correlation
 
@@ -42,6 +43,35 @@ def test_correlated_noise_is_seen_between_structures(width: float) -> None:
         found.append(measure(image).white_variance ** 0.5)
     assert np.median(found) == pytest.approx(0.2, rel=0.35)
     assert min(found) > 0.07
+
+
+def waves(seed: int) -> FloatArray:
+    """Counts of waves of an eighth to a third of the frame, in all directions."""
+    rng = np.random.default_rng(seed)
+    y, x = np.indices((SIDE, SIDE))
+    total = np.zeros((SIDE, SIDE))
+    for _ in range(60):
+        length, angle, phase = SIDE * rng.uniform(0.12, 0.4), *rng.uniform(0, 2 * np.pi, 2)
+        along = np.cos(angle) * y + np.sin(angle) * x
+        total += np.cos(2 * np.pi * along / length + phase)
+    return rng.poisson(1000 * np.maximum(1 + 0.3 * total / total.std(), 0.1)) / 1000
+
+
+def test_structure_that_fills_the_frame_is_no_difference_of_beams() -> None:
+    """It grows with the distance, as blurred noise does not beyond its width."""
+    for seed in (0, 2, 3, 4):
+        image = waves(seed)
+        found = measure(image)
+        assert found.is_bound or found.clumping == 1
+        errors = invert(image, source=np.ones(image.shape), options={"n_sites": 900}).errors
+        assert errors is not None
+        assert errors.beam is None
+    quiet = [
+        measure(spots() + 0.2 * blurred(np.random.default_rng(seed), width))
+        for width in (1.0, 1.5, 2.0)
+        for seed in range(4)
+    ]
+    assert np.mean([found.is_bound for found in quiet]) < 0.3
 
 
 @pytest.mark.parametrize("factor", [1.4, 2.0])

@@ -64,11 +64,12 @@ def beam_difference(
     -------
     float
         0 where the difference is within the noise, or where too little of the frame along the
-        edge is free of the object for a comparison.
+        edge is free of the object for a comparison, as where even calm parts have structure that
+        hides the noise.
     """
     shape = prepared.mask.shape
     cell = min(shape) // (_TILES * _CELLS)
-    if cell < _MIN_CELL_PX:
+    if cell < _MIN_CELL_PX or noise.is_bound:
         return 0.0
     rows, columns = (length // (cell * _CELLS) for length in shape)
     ratio, variance = _cell_ratios(prepared, noise, cell, rows, columns)
@@ -170,6 +171,7 @@ _WIDTHS_PX = np.geomspace(0.3, 4.0, 24)
 _FIT_PX = 6  # lags up to which differences are compared with those of a blur
 _SCATTER = 0.25  # of V
 _MAX_MISFIT = 8.0  # χ², of noise that stands out of structure
+_MAX_FAR_EXCESS = 2.0  # of V at the largest lag, over that of noise that stands out of structure
 _MAX_STATED = 2.5  # variance, over the measured one
 _MAX_WHITE = 1.0  # variance before the blur: of one quantum a pixel
 _CLIP_DEVIATIONS, _CLIPPED_VARIANCE = 2.5, 0.973
@@ -374,7 +376,10 @@ def measure_correlation(
     least = min(misfit for misfit, _ in answers)
     alike = [noise for misfit, noise in answers if misfit <= least + 1]
     noise = max(alike, key=lambda noise: noise.white_variance)
-    return replace(noise, is_bound=noise.is_bound or least > _MAX_MISFIT)
+    # Beyond its width V of blurred noise is constant, and that of structure still rises.
+    far = noise.white + noise.blurred * float(_blurred_shares(lags[-1:], noise.width)[0])
+    is_bound = noise.is_bound or least > _MAX_MISFIT or variances[-1] > _MAX_FAR_EXCESS * far
+    return replace(noise, is_bound=is_bound)
 
 
 def _blurred_shares(lags: FloatArray, width: float) -> FloatArray:
