@@ -425,6 +425,17 @@ def test_a_pair_of_negatives_is_seen_by_its_noise_and_by_its_rim(seed):
     assert "negative" in named(*unexposed)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_noise_of_the_image_shows_negatives_of_an_even_beam(seed):
+    rng = np.random.default_rng(seed)
+    y, x = np.indices((96, 96)) / 96 - 0.5
+    beam = 1 + 0.05 * np.sin(5 * x + 2 * y)
+    shot = beam * (1 + 0.8 * np.exp(-25 * (y**2 + x**2)))
+    image, source = (rng.poisson(1000 * plane).astype(float) for plane in (shot, beam))
+    assert "negative" not in named(image, source)
+    assert "negative" in named(2200 - image, 2200 - source)
+
+
 def test_a_source_without_noise_makes_no_negative():
     rows, columns = np.indices(SHAPE) / SHAPE[0] - 0.5
     source = 400 * (0.25 + np.exp(-4 * ((rows - 0.05) ** 2 + (columns + 0.08) ** 2) / 1.4))

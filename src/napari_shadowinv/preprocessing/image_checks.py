@@ -403,8 +403,9 @@ def _sign_of_negative(image: CheckedImage, source: CheckedImage, pair: Reference
     if pair.is_negative:
         return "the image is dark where it should be bright"
     # A modelled or smoothed source has no noise, but bends, which are steepest beside its peak.
-    if source.noise_slope < -_FALLING_DEVIATIONS and image.noise_slope < 0:
-        return "the source is noisier where it is darker"
+    falling = -(image.noise_slope + source.noise_slope) / math.sqrt(2)
+    if falling > _FALLING_DEVIATIONS and image.noise_slope < 0:
+        return "image and source are noisier where they are darker"
     if is_lit_around(source.image) and is_lit_around(image.image):
         return "the rims of image and source are brighter than all the beam"
     return ""
