@@ -37,6 +37,11 @@ def test_the_beam_is_known_and_has_the_light_of_the_shot(viewer: ViewerModel, na
     assert 0.95 < share < 1.005
 
 
+def test_the_beams_of_single_toroids_are_flat_and_so_known() -> None:
+    for make in (samples.toroid, samples.toroid_with_caustics):
+        assert np.ptp(make()[0][0]) == 0
+
+
 def test_caustics_are_where_the_name_promises_them() -> None:
     *_, (image, _, _) = samples.toroid_with_caustics()
     below = samples.toroid()[-1][0]
