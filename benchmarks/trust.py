@@ -139,10 +139,10 @@ class Answer:
 def answer(
     row: str, case: str, result: Inversion | Fit, truth: FloatArray, **numbers: float
 ) -> Answer:
-    """Compare a result with the truth where pixels were used."""
+    """Compare a result with the truth where pixels were used and rays start."""
     is_fit = isinstance(result, Fit)
     found = result.fields[0].displacement if is_fit else result.displacement
-    used = result.used if is_fit else result.mask
+    used = result.used if is_fit else result.lit
 
     def length(planes: FloatArray) -> float:
         return float(np.sqrt((planes**2).sum(axis=0)[used].mean()))
@@ -869,23 +869,25 @@ def samples(seed: int, count: int) -> Iterator[Answer]:
         "coaxial_line": phantoms.coaxial_line((200, 200), setup)[0].displacement,
     }
     for name, truth in phantoms_of.items():
-        shot, source = shot_of(getattr(sample_data, name)())
-        yield answer("samples", f"sample {name}", invert(shot, source=source), truth)
+        shot, source, mask = shot_of(getattr(sample_data, name)())
+        result = invert(np.asarray(shot), source=source, mask=mask)
+        yield answer("samples", f"sample {name}", result, truth)
     yield from sampled_run(sample_data, phantoms)
     yield from tutorials()
 
 
-def shot_of(layers: Sequence[Any]) -> tuple[Any, FloatArray | None]:
-    """Return the image of a sample's layers, perhaps a lazy stack, and its source if it has one."""
+def shot_of(layers: Sequence[Any]) -> tuple[Any, FloatArray | None, FloatArray | None]:
+    """Return the image of a sample's layers, perhaps a lazy stack, its source and its mask."""
     images = {keywords["name"]: data for data, keywords, kind in layers if kind == "image"}
     sources = [np.asarray(data) for name, data in images.items() if name.endswith("source")]
     (shot,) = (data for name, data in images.items() if not name.endswith("source"))
-    return shot, sources[0] if sources else None
+    unusable = [np.asarray(data) for data, _, kind in layers if kind == "labels"]
+    return shot, sources[0] if sources else None, unusable[0] == 0 if unusable else None
 
 
 def sampled_run(sample_data: Any, phantoms: Any) -> Iterator[Answer]:
     """Three shots of the sample of twenty."""
-    stack, source = shot_of(sample_data.wakefield_run())
+    stack, source, _ = shot_of(sample_data.wakefield_run())
     for shot in (5, 10, 14):
         phase = shot / 19
         height, width = stack.shape[1:]
