@@ -140,3 +140,37 @@ def test_a_recorded_reference_may_differ_from_the_beam(image):
     stated = invert(recorded, **options, instrument={"beam_rms": 0.005})
     assert stated.verdict is Verdict.UNCERTAIN
     assert stated.errors.share == pytest.approx(inversion.errors.share)
+
+
+def test_a_registration_that_nobody_measured_is_a_condition(image):
+    """A beam that is smooth along one axis does not show how far its reference was shifted."""
+    step = 1 + 0.6 * np.tanh((np.arange(72.0) - 36) / 6) * np.ones((60, 1))
+    recorded = synthetic_image(gaussian_blob(step.shape, 12.0, 8.0).displacement, step)
+    options = {"source": step, "options": FEW}
+    inversion = invert(recorded, **options, instrument={"beam_rms": 0.0})
+    assert inversion.verdict is Verdict.CONDITIONAL
+    stated = re.fullmatch(
+        r"peak \|d\| [\d.]+ ± ([\d.]+) px if beam and reference agree to ([\d.]+) px; ± [\d.]+ "
+        r"\(field [\d.]+ %\) if they differ by 0.2 px \(assumed\); compare two references",
+        inversion.headline.text,
+    )
+    at_peak, agreement = map(float, stated.groups())
+    known = {"beam_rms": 0.0, "registration": agreement}
+    aligned = invert(recorded, **options, instrument=known)
+    assert aligned.verdict is Verdict.DETERMINED
+    assert at_peak == pytest.approx(aligned.errors.total.at_peak, rel=0.05)
+    stated = invert(recorded, **options, instrument=known | {"registration": 0.2})
+    assert stated.verdict is Verdict.UNCERTAIN
+    both = invert(recorded, **options).headline.text
+    assert "if they differ by 0.5 % and 0.2 px (assumed)" in both
+
+
+def test_measured_errors_come_before_those_of_an_assumed_beam(image):
+    noisy = image + np.random.default_rng(1).normal(0, 0.2, image.shape)
+    inversion = invert(noisy, options=FEW, instrument={"noise_correlation": 0.0})
+    known = invert(noisy, options=FEW, instrument={"noise_correlation": 0.0, "beam_rms": 0.0})
+    first = (
+        f"TOO UNCERTAIN: errors of {known.errors.share_text} of the displacement (r.m.s.): noise "
+    )
+    assert inversion.headline.text.startswith(first)
+    assert f", and {inversion.errors.largest_part}" in inversion.headline.text

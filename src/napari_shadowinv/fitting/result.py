@@ -510,9 +510,11 @@ class Fit(Summarised):
         (shown,) = shown_fields([field.displacement], None, mask=self.used)
         at_peak = field.error_at(*shown.peak)
         scale = at_peak / report.total
-        peak = scale * rest, scale * by_beam
         condition = BeamCondition.within(
-            share, variation, (rest, by_beam), peak, recorded=report.recorded
+            share,
+            (rest, scale * rest),
+            [("%", 100 * variation, by_beam, scale * by_beam)],
+            recorded=report.recorded,
         )
         return condition and condition._replace(
             peak_if_uneven=at_peak, field_if_uneven=report.total

@@ -41,7 +41,12 @@ from napari_shadowinv.inversion.solution_checks import (
     is_coarse,
     mark_caustics,
 )
-from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOptions
+from napari_shadowinv.options import (
+    DEFAULT_REGISTRATION,
+    MAX_DEFAULT_SITES,
+    Instrument,
+    InversionOptions,
+)
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.alignment import register_source
@@ -264,11 +269,13 @@ def invert(
             plan, start = _plan(plan.source, options, mask, plan.measured), None
         prepared = prepare(image, source, options, mask)
         moved: Caution | None = None
+        is_shift_assumed = False
         if measured:
             recorded = prepared.source
             source, error, moved = register_source(
                 prepared.image, recorded, prepared.mask, instrument
             )
+            is_shift_assumed = instrument.registration is None and error == DEFAULT_REGISTRATION
             instrument = instrument.with_registration(error)
             if source is not recorded:
                 plan = start = None
@@ -308,7 +315,9 @@ def invert(
             return factor
 
         noise = begin(estimate_noise, options.threads)
-        budget = Budget(plan, prepared, noise, options, instrument)
+        budget = Budget(
+            plan, prepared, noise, options, instrument, is_shift_assumed=is_shift_assumed
+        )
         if not options.is_adaptive and not levels.is_complete:
             levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
         if start is not None:
@@ -352,7 +361,8 @@ def invert(
         by_errors = [errors.beam_caution(), errors.edge_caution(options.max_error)]
     by_accuracy: list[Caution | None] = []
     is_asked = "accuracy" in options.model_fields_set
-    is_asked |= errors is not None and errors.share > options.max_error
+    if errors is not None and errors.beam_condition(options.max_error) is None:
+        is_asked |= errors.share > options.max_error
     if finest and is_asked and errors is not None and quality.warnings == prepared.warnings:
         why = "with the most sites placed unless more are given"
         by_accuracy = [errors.accuracy_caution(options.accuracy, why)]

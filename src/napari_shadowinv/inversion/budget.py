@@ -98,8 +98,11 @@ class Budget:
         noise: Callable[[], ImageNoise],
         options: InversionOptions,
         instrument: Instrument,
+        *,
+        is_shift_assumed: bool = False,
     ) -> None:
         self._plan, self._prepared = plan, prepared
+        self._is_shift_assumed = is_shift_assumed
         self._noise, self.options = noise, options
         self.instrument = instrument if plan.measured else instrument.without_reference()
         if self._beam.components is not None:
@@ -197,6 +200,7 @@ class Budget:
         effects: dict[str, ErrorEstimate] = {}
         sensitivities: dict[str, ErrorEstimate] = {}
         sizes: dict[str, float] = {}
+        assumed = ""
         tests: list[tuple[dict[str, ErrorEstimate], str, FloatArray]] = []
         for imperfection in IMPERFECTIONS:
             stated = imperfection.stated(self.instrument)
@@ -206,6 +210,8 @@ class Budget:
                     tests.append((errors, imperfection.name(size), pattern))
             if stated:
                 sizes[imperfection.name(stated)] = stated
+                if imperfection.key == "registration" and self._is_shift_assumed:
+                    assumed = imperfection.name(stated)
         # All at once, because the solver needs as long for one as for several.
         moves = response.to(np.concatenate([pattern for *_, pattern in tests]))
         ends = np.cumsum([len(pattern) for *_, pattern in tests])
@@ -248,6 +254,7 @@ class Budget:
             beam_basis=basis,
             noise_correlation=self._noise().correlation_length,
             noise_is_bound=self._noise().is_bound,
+            assumed=assumed,
         )
 
     @cached_property

@@ -98,6 +98,8 @@ class Errors:
         for white noise.
     noise_is_bound : bool
         Whether structure hides the noise: its error is then the largest that the image allows.
+    assumed : str
+        Name of the effect, such as "registration, 0.2 px", whose size nobody stated or measured.
     """
 
     peak: float
@@ -116,6 +118,7 @@ class Errors:
     beam_basis: str
     noise_correlation: float
     noise_is_bound: bool = False
+    assumed: str = ""
 
     @property
     def total(self) -> ErrorEstimate:
@@ -200,21 +203,41 @@ class Errors:
         lengths = {0.25: "a quarter", 0.5: "half"}
         return lengths.get(self.beam_scale, to_figures(self.beam_scale))
 
+    @property
+    def _measured(self) -> Errors:
+        """The budget without what was assumed of the beam."""
+        effects = {name: error for name, error in self.effects.items() if name != self.assumed}
+        beam = None if self.beam_basis in _UNMEASURED else self.beam
+        return replace(self, beam=beam, effects=effects, assumed="")
+
     def beam_condition(self, share: float) -> BeamCondition | None:
-        """Return the condition on a beam that was assumed; None if that is not all that it takes.
+        """Return the condition on what was assumed of the beam; None if it takes more than that.
 
         Parameters
         ----------
         share : float
             Largest total of the displacement (r.m.s.).
         """
-        if self.beam is None or self.beam_basis not in _UNMEASURED or not self.rms > 0:
+        if not self.rms > 0:
             return None
-        rest = replace(self, beam=None).total
-        field = rest.rms / self.rms, self.beam.rms / self.rms
-        peak = rest.at_peak / self.peak, self.beam.at_peak / self.peak
-        recorded = self.beam_basis == "reference"
-        return BeamCondition.within(share, self.beam_variation, field, peak, recorded=recorded)
+        sizes = []
+        if self.beam is not None and self.beam_basis in _UNMEASURED:
+            sizes.append(("%", 100 * self.beam_variation, self.beam))
+        if shift := self.effects.get(self.assumed):
+            sizes.append(("px", self.sizes[self.assumed], shift))
+        rest = self._measured.total
+        return BeamCondition.within(
+            share,
+            (rest.rms / self.rms, rest.at_peak / self.peak),
+            [(unit, n, e.rms / self.rms, e.at_peak / self.peak) for unit, n, e in sizes],
+            recorded=bool(shift) or self.beam_basis == "reference",
+        )
+
+    def measured_text(self, subject: str) -> str:
+        """Return the errors by what was measured, and the largest one if it was assumed."""
+        measured, largest = self._measured, self.largest_part
+        text = f"errors of {measured.share_text} of the {subject} (r.m.s.): {measured.largest_part}"
+        return text if largest == measured.largest_part else f"{text}, and {largest}"
 
     def measure_next(self, share: float) -> str:
         """Return what has to be known better for a total of at most `share`, and that total.

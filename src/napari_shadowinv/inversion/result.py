@@ -312,7 +312,7 @@ class Inversion(Summarised):
         if condition := errors.beam_condition(max_error):
             (field,) = shown_fields([self.displacement], setup, mask=self.lit)
             return Assessment(Verdict.CONDITIONAL, field.conditional_text(condition))
-        parts = [f"{text}: {errors.largest_part}", errors.measure_next(max_error)]
+        parts = [errors.measured_text(self._subject(errors)), errors.measure_next(max_error)]
         if errors.share > _MAX_LINEAR:
             parts.append(
                 "errors this large are not proportional to their causes, so they are rough"

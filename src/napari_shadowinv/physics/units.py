@@ -57,37 +57,43 @@ def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> t
 
 
 class BeamCondition(NamedTuple):
-    """Errors of a field whose beam nobody measured, as shares of it, at two unevennesses."""
+    """Errors of a field that depend on what nobody measured of its beam, as shares of the field."""
 
-    even: float  # relative r.m.s. of a beam that leaves the field determined
-    uneven: float  # of the beam that is assumed
+    agreement: str  # of beam and source, that leaves the field determined
+    difference: str  # that is assumed
     peak_if_even: float
     peak_if_uneven: float
     field_if_uneven: float  # r.m.s.
-    recorded: bool  # whether it is a reference of another exposure that is uneven so
+    recorded: bool  # whether the source is a reference of another exposure
 
     @classmethod
     def within(
         cls,
         largest: float,
-        uneven: float,
-        field: tuple[float, float],
-        peak: tuple[float, float],
+        rest: tuple[float, float],
+        assumed: Collection[tuple[str, float, float, float]],
         *,
         recorded: bool,
     ) -> BeamCondition | None:
         """Return the condition for a total error of the field (r.m.s.) of at most `largest`.
 
-        `field` and `peak` are errors by all but the beam, and by the beam that is assumed. None if
-        no beam makes the total as small.
+        `rest` are the errors of field and peak by all that was measured; `assumed` has the unit of
+        each number that was not, the number, and the errors that it makes. None if no smaller
+        numbers make the total as small.
         """
-        rest, by_beam = field
-        allowed = largest**2 - rest**2
-        if not (allowed > 0 and by_beam > 0):
+        allowed = largest**2 - rest[0] ** 2
+        by_assumed = math.hypot(*(field for _, _, field, _ in assumed))
+        if not (allowed > 0 and by_assumed > 0):
             return None
-        even = round_down(uneven * min(math.sqrt(allowed) / by_beam, 1.0))
-        at_peak = math.hypot(peak[0], peak[1] * even / uneven)
-        return cls(even, uneven, at_peak, math.hypot(*peak), math.hypot(*field), recorded)
+        units, sizes, _, peaks = zip(*assumed, strict=True)
+        known = [round_down(size * min(math.sqrt(allowed) / by_assumed, 1.0)) for size in sizes]
+        agreement, difference = (
+            " and ".join(f"{to_figures(n)} {unit}" for n, unit in zip(numbers, units, strict=True))
+            for numbers in (known, sizes)
+        )
+        reduced = np.multiply(peaks, known) / sizes
+        at_peak = math.hypot(rest[1], *reduced), math.hypot(rest[1], *peaks)
+        return cls(agreement, difference, *at_peak, math.hypot(rest[0], by_assumed), recorded)
 
 
 class PeakError(NamedTuple):
@@ -136,15 +142,14 @@ class ShownField:
             f"± {to_figures(condition.peak_if_uneven * self.largest)} "
             f"(field {percent(condition.field_if_uneven)})"
         )
-        even, uneven = percent(condition.even), percent(condition.uneven)
         if condition.recorded:
             return (
-                f"{peak} if beam and reference agree to {even}; {otherwise} if they differ by "
-                f"{uneven} (assumed); compare two references"
+                f"{peak} if beam and reference agree to {condition.agreement}; {otherwise} if they "
+                f"differ by {condition.difference} (assumed); compare two references"
             )
         return (
-            f"{peak} if the beam is even to {even}; {otherwise} if it is {uneven} uneven "
-            "(assumed); record a reference"
+            f"{peak} if the beam is even to {condition.agreement}; {otherwise} if it is "
+            f"{condition.difference} uneven (assumed); record a reference"
         )
 
     def peak_text(self, error: PeakError | None = None) -> str:
