@@ -236,6 +236,8 @@ class Errors:
     def measured_text(self, subject: str) -> str:
         """Return the errors by what was measured, and the largest one if it was assumed."""
         measured, largest = self._measured, self.largest_part
+        if measured.parts.keys() - self.parts.keys():  # an edge that the beam explains
+            measured = self
         text = f"errors of {measured.share_text} of the {subject} (r.m.s.): {measured.largest_part}"
         return text if largest == measured.largest_part else f"{text}, and {largest}"
 
