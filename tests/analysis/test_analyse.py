@@ -251,7 +251,7 @@ def test_small_numbers_have_a_power_of_ten(exact: RetrievedField):
     (frame,) = (each.frame for each in sampled_fields(exact, None, None, None))
     samples = -9.94e-5 + 4e-6 * np.linspace(-1, 1, 101)
     text = quantity_text(Quantity(np.asarray(-9.94e-5), samples), "1", frame)
-    assert text == "-0.994 × 10⁻⁴ (-1.021 to -0.967; 95 %: -1.032 to -0.956)"
+    assert text == "-0.994 × 10⁻⁴ (-1.022 to -0.966; 95 %: -1.033 to -0.955)"
     assert quantity_text(Quantity(np.asarray(0.3), np.zeros((0,))), "1", frame) == "0.3"
     rounded = quantity_text(Quantity(np.asarray(9.9999e-7), np.zeros((0,))), "1", frame)
     assert rounded == "1 × 10⁻⁶"
@@ -261,9 +261,9 @@ def test_the_power_of_ten_is_that_of_a_band_far_wider_than_its_number(exact: Ret
     (frame,) = (each.frame for each in sampled_fields(exact, None, None, None))
     samples = 9.6e-7 + 3.3e-4 * np.linspace(-1, 1, 101)
     text = quantity_text(Quantity(np.asarray(9.6e-7), samples), "1", frame)
-    assert text == "0.0 × 10⁻⁴ (-2.2 to 2.3; 95 %: -3.1 to 3.1)"
+    assert text == "0.0 × 10⁻⁴ (-2.3 to 2.3; 95 %: -3.2 to 3.2)"
     text = quantity_text(Quantity(np.asarray(9.6e-7), samples), "m", frame)
-    assert text == "1 µm (-223 to 225; 95 %: -313 to 314)"
+    assert text == "1 µm (-228 to 230; 95 %: -319 to 321)"
 
 
 @pytest.mark.parametrize("products", [7, [7], [["profile"]], None])

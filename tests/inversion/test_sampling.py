@@ -7,6 +7,7 @@ from operator import add
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from napari_shadowinv import InversionOptions, invert, plan_sites, synthetic_image, uncertainty
 from napari_shadowinv._system.progress import Reporter
@@ -21,7 +22,9 @@ from napari_shadowinv.inversion.samples import (
     LinearResampling,
     Pairs,
     Scatter,
+    correct,
     noise_of,
+    stratified_numbers,
 )
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.physics.poisson import border_mean
@@ -130,8 +133,27 @@ def test_samples_that_are_related_by_a_line_are_corrected_to_it():
     slope, level = np.array([0.5, 1.0, 2.0, 0.9, 1.2]), np.array([3.0, 0.0, -1.0, 2.0, 0.5])
     pairs = pairs_of(linear[:12], (slope * linear + level)[:12])
     np.testing.assert_allclose(pairs.factor, slope)
-    np.testing.assert_allclose(pairs.correct(linear), slope * linear + level)
+    solved = slope * linear + level
+    np.testing.assert_allclose(correct(linear, solved[:12]), solved)
     assert pairs_of(linear[:5], (slope * linear)[:5]).factor == pytest.approx(1)
+
+
+def test_skewed_samples_are_corrected_to_their_quantiles():
+    """One number that acts with its square, too; where the rest is noise, samples stay normal."""
+    numbers = stratified_numbers(np.random.default_rng(3), 200, 2)
+    noise = np.random.default_rng(4).normal(size=(24, 2))
+    solved = numbers[:24] + np.array([0.2, 0.0]) * numbers[:24] ** 2 + np.array([0, 0.3]) * noise
+    low, high = np.quantile(correct(numbers, solved), [0.025, 0.975], axis=0)
+    middle = (low + high) / 2
+    assert middle[0] == pytest.approx(0.2 * 1.96**2, rel=0.2)
+    assert abs(middle[1] - (solved - numbers[:24])[:, 1].mean()) < 0.2
+
+
+@pytest.mark.parametrize("n", [2, 60])
+def test_each_number_has_a_sample_in_each_part_of_its_values(n):
+    numbers = stratified_numbers(np.random.default_rng(0), n, 5)
+    parts = np.sort((ndtr(numbers) * n).astype(int), axis=0)
+    np.testing.assert_array_equal(parts, np.arange(n)[:, None] * np.ones(5, int))
 
 
 def test_chance_does_not_correct_a_deviation():
@@ -148,7 +170,7 @@ def test_chance_does_not_correct_a_deviation():
 def test_values_that_are_no_numbers_stay_as_they_are():
     linear = np.random.default_rng(2).normal(size=(30, 2))
     linear[3, 0] = np.nan
-    corrected = pairs_of(linear[:10], 2 * linear[:10]).correct(linear)
+    corrected = correct(linear, 2 * linear[:10])
     np.testing.assert_array_equal(corrected[:, 0], linear[:, 0])
     np.testing.assert_allclose(corrected[:, 1], 2 * linear[:, 1])
 

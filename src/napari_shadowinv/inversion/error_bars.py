@@ -3,19 +3,22 @@
 - error bars for the potential and the displacement at every pixel: `uncertainty`
 - result: `Uncertainty`, with a `Quantity` for each number that is derived from the field
 
-Each sample is the image with another draw of noise, and, where an instrument is stated, with its
-imperfections drawn and added to image and source; it is inverted on the same sites. The
-scatter of the samples is the scatter of repeated shots of the same object (the parametric
-bootstrap). The linear response of the solved transport to a small change of the image costs one
-linear system with a matrix that all samples share; to solve the transport again costs a few, each
-with its own. An instrument's imperfections are larger than noise, so with them the first 24 linear
-samples are solved as well, and correct the mean and the deviation of all (control variates).
+Each sample is the image with another draw of noise, inverted on the same sites. The scatter of the
+samples is the scatter of repeated shots of the same object (the parametric bootstrap). Where an
+instrument is stated, its imperfections are drawn and removed from image and source: that is where
+the truth may be, and the sample is its mirror image about the inversion. The linear response of the
+solved transport to a small change of the image costs one linear system with a matrix that all
+samples share; to solve the transport again costs a few, each with its own. An instrument's
+imperfections are larger than noise, so with them the first 24 linear samples are solved as well,
+and correct the mean, the deviation and the skewness of all (control variates). Each number of an
+imperfection is drawn once from each of as many equal parts of its distribution as there are
+samples.
 
 References
 ----------
 B. Efron and R. J. Tibshirani, *An Introduction to the Bootstrap* (Chapman & Hall, 1993),
 chapter 6; C. Lemieux, *Monte Carlo and Quasi-Monte Carlo Sampling* (Springer, 2009), chapter 4, for
-the correction of cheap samples by a few that are solved.
+the correction of cheap samples by a few that are solved, and chapter 5 for Latin hypercubes.
 """
 
 from __future__ import annotations
@@ -56,7 +59,9 @@ from napari_shadowinv.inversion.samples import (
     Pairs,
     Scatter,
     Seed,
+    correct,
     noise_of,
+    stratified_numbers,
 )
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.options import BeamPrior, Instrument, InversionOptions
@@ -160,7 +165,7 @@ class Quantity:
             width = stdtrit(count - 1, tails[0]) * np.sqrt(1 + 1 / count) * self.std
             return np.asarray(middle - width), np.asarray(middle + width)
         mirrored = self.mirrored()
-        low, high = np.quantile(mirrored, tails[::-1], axis=0)
+        low, high = np.quantile(mirrored, tails[::-1], axis=0, method="weibull")
         return np.asarray(low), np.asarray(high)
 
     def mirrored(self) -> FloatArray:
@@ -340,8 +345,9 @@ def uncertainty(
     Each sample is the image with fresh noise on top, inverted like the image. All share the image's
     own noise, so their scatter is the effect of one dose of noise: the standard deviation that
     shots of the same object would show. With an instrument, each sample also draws its
-    imperfections (beam, background, gamma, blur, absorption, registration, another field) and adds
-    them to image and source. Where the object goes on beyond the edge, what may lie there is added.
+    imperfections (beam, background, gamma, blur, absorption, registration, another field) and is
+    the mirror image, about the inversion, of the field without them. Where the object goes on
+    beyond the edge, what may lie there is added.
     Other errors are not included (folds behind caustics).
 
     Parameters
@@ -455,7 +461,9 @@ def uncertainty(
         plan, inversion.weights, lambda rng: draw_noise(rng, correlation), clipping
     ).to_tolerance_of_noise(seeds[0])
     draws = None if instrument is None else _draws(image, inversion, plan)
-    resampling = replace(resampling, instrument=draws)
+    if draws is not None:
+        numbers = stratified_numbers(np.random.default_rng(options.seed), int(n), draws.count)
+        resampling = replace(resampling, instrument=draws, numbers=numbers)
     report = Reporter(on_progress, should_stop)
     image_fields = np.stack([inversion.potential, *inversion.displacement])
     functions: dict[str, QuantityOf] = {}
@@ -467,13 +475,15 @@ def uncertainty(
         return _measure(functions, image_fields, change + beyond)
 
     asked = measure if quantities else None
+    # Without imperfections that it may have, the image shows where the truth may be.
+    sign = 1 if draws is None else -1
     outcomes: list[tuple[int, float, bool]] = []
 
     def solve_samples(seeds: list[Seed], report: Reporter) -> Iterator[FloatArray]:
         for sample in _in_order(resampling.sample, [[seed] for seed in seeds], workers, report):
             solution = sample.solution  # large, so not stored
             outcomes.append((solution.iterations, solution.residual, solution.converged))
-            yield sample.field - image_fields
+            yield sign * (sample.field - image_fields)
 
     pairs, of_solved = None, []
     if method == "resolve":
@@ -514,9 +524,7 @@ def uncertainty(
     if draws is not None and pairs is not None:
         mean, std = mean + pairs.shift, std * pairs.factor
         for name, exact in _joined(of_solved).items():
-            few = of_samples[name][: len(exact)].astype(np.float64)
-            both = reduce(add, map(Pairs.of, few, exact.astype(np.float64)))
-            of_samples[name] = both.correct(of_samples[name])
+            of_samples[name] = correct(of_samples[name], exact.astype(np.float64))
     mean = image_fields + mean
     std = np.sqrt(std**2 + (by_edge**2).sum(axis=0))
     warnings = inversion.report.warnings

@@ -2,8 +2,8 @@
 
 An imperfection changes the flux of the image, or of its source, by a pattern whose size is a
 standard deviation of the `Instrument`. The field follows by the linear response of the solved
-transport. For random samples (`InstrumentDraws`) each imperfection is made in the pixels of the
-image and of its source, by independent normal numbers; smooth fields by `SmoothField`.
+transport. For random samples (`InstrumentDraws`) each imperfection is removed from the pixels of
+the image and of its source, by independent normal numbers; smooth fields by `SmoothField`.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ class RecordedShot:
 # k independent changes of the cells' flux, (k, n), for a standard deviation, with the mean square
 # of the imperfection.
 Pattern = Callable[[SolvedShot, float], FloatArray]
-# The shot with the imperfection of a standard deviation, drawn by independent normal numbers.
+# The shot without the imperfection of a standard deviation, drawn by independent normal numbers.
 Change = Callable[[RecordedShot, float, FloatArray], RecordedShot]
 
 
@@ -278,19 +278,19 @@ def _object_region(
     return gaussian_filter(inside.astype(np.float64), radius / 4 / step), radius
 
 
-def _add_background(shot: RecordedShot, share: float, numbers: FloatArray) -> RecordedShot:
+def _remove_background(shot: RecordedShot, share: float, numbers: FloatArray) -> RecordedShot:
     means = shot.mean(shot.image), shot.mean(shot.source)
     image, source = (
-        values + share * numbers[0] * mean
+        values - share * numbers[0] * mean
         for values, mean in zip((shot.image, shot.source), means, strict=True)
     )
-    # A level below the darkest pixels leaves them dark; those of the image are floored with noise.
+    # A level above the darkest pixels leaves them dark; those of the image are floored with noise.
     source = np.where(shot.scene.mask, np.maximum(source, _LEAST_BRIGHTNESS * means[1]), source)
     return replace(shot, image=image, source=source)
 
 
-def _raise_to_power(shot: RecordedShot, gamma: float, numbers: FloatArray) -> RecordedShot:
-    exponent = max(1 + gamma * numbers[0], _LEAST_EXPONENT)
+def _linearise(shot: RecordedShot, gamma: float, numbers: FloatArray) -> RecordedShot:
+    exponent = 1 / max(1 + gamma * numbers[0], _LEAST_EXPONENT)
 
     def respond(values: FloatArray) -> FloatArray:
         # In the units of before, so that noise can be added.
@@ -300,24 +300,26 @@ def _raise_to_power(shot: RecordedShot, gamma: float, numbers: FloatArray) -> Re
     return replace(shot, image=respond(shot.image), source=respond(shot.source))
 
 
-def _spread(shot: RecordedShot, width: float, numbers: FloatArray) -> RecordedShot:
+def _sharpen(shot: RecordedShot, width: float, numbers: FloatArray) -> RecordedShot:
     mask = shot.scene.mask
-    image, used = (
-        gaussian_filter(np.where(mask, values, 0.0), width * abs(numbers[0]), mode="nearest")
-        for values in (shot.image, np.ones(mask.shape))
-    )
-    return replace(shot, image=image / np.maximum(used, _LEAST_BRIGHTNESS))
+
+    def blurred(values: FloatArray) -> FloatArray:
+        return gaussian_filter(np.where(mask, values, 0.0), width * abs(numbers[0]), mode="nearest")
+
+    # 1 / g of a wave that a blur leaves a share g of is 1 + (1 - g) + (1 - g)² + …
+    used = np.maximum(blurred(mask.astype(np.float64)), _LEAST_BRIGHTNESS)
+    once = shot.image - blurred(shot.image) / used
+    return replace(shot, image=shot.image + 2 * once - blurred(once) / used)
 
 
-def _absorb(shot: RecordedShot, rms: float, numbers: FloatArray) -> RecordedShot:
+def _restore_absorbed(shot: RecordedShot, rms: float, numbers: FloatArray) -> RecordedShot:
     envelope, _ = shot.scene.object_region
-    return _brighten(shot, rms * envelope * shot.scene.transmission.of(numbers))
+    return _with_excess(shot, rms * envelope * shot.scene.transmission.of(numbers))
 
 
-def _brighten(shot: RecordedShot, excess: FloatArray) -> RecordedShot:
-    """Give the image a relative excess of light that its source does not have."""
-    # The map is that of the same image with less of a source, which need not be moved to it.
-    return replace(shot, source=shot.source / np.maximum(1 + excess, _LEAST_TRANSMISSION))
+def _with_excess(shot: RecordedShot, excess: FloatArray) -> RecordedShot:
+    """Give the source the relative excess of light that the image has."""
+    return replace(shot, source=shot.source * np.maximum(1 + excess, _LEAST_TRANSMISSION))
 
 
 def _move(shot: RecordedShot, shift: float, numbers: FloatArray) -> RecordedShot:
@@ -329,7 +331,7 @@ def _move(shot: RecordedShot, shift: float, numbers: FloatArray) -> RecordedShot
         (along - (side - 1) / 2) / (np.hypot(*source.shape) / 2)
         for along, side in zip(indices, source.shape, strict=True)
     )
-    down, right, turn, scale = shift * numbers
+    down, right, turn, scale = -shift * numbers
     indices[0] += down + turn * x + scale * y
     indices[1] += right - turn * y + scale * x
     moved = map_coordinates(source, indices, order=3, mode="nearest")
@@ -337,16 +339,16 @@ def _move(shot: RecordedShot, shift: float, numbers: FloatArray) -> RecordedShot
 
 
 IMPERFECTIONS: tuple[Imperfection, ...] = (
-    Imperfection("background", "background", "%", 0.05, _background, _add_background),
-    Imperfection("gamma", "gamma", "", 0.05, _response, _raise_to_power),
-    Imperfection("blur", "blur", "px", 1.0, _blur, _spread, is_even=True),
+    Imperfection("background", "background", "%", 0.05, _background, _remove_background),
+    Imperfection("gamma", "gamma", "", 0.05, _response, _linearise),
+    Imperfection("blur", "blur", "px", 1.0, _blur, _sharpen, is_even=True),
     Imperfection(
         "absorption",
         "absorption",
         "%",
         0.01,
         _absorption,
-        _absorb,
+        _restore_absorbed,
         count=lambda scene: scene.transmission.count,
     ),
     Imperfection("registration", "registration", "px", 0.0, _registration, _move, lambda scene: 4),
@@ -389,8 +391,8 @@ class BeamExcess:
         return np.asarray(excess + np.tensordot(of_shapes, self.shapes, 1))
 
     def change(self, shot: RecordedShot, rms: float, numbers: FloatArray) -> RecordedShot:
-        """Return the shot with a beam of an r.m.s. difference."""
-        return _brighten(shot, rms * self.of(numbers))
+        """Return the shot with the source that a beam of an r.m.s. difference is."""
+        return _with_excess(shot, rms * self.of(numbers))
 
 
 class InstrumentDraws:
@@ -431,18 +433,18 @@ class InstrumentDraws:
         self.names, self.count, self.is_even = tuple(names), len(even), np.array(even)
 
     def shot(self, numbers: FloatArray) -> RecordedShot:
-        """Return the shot with the imperfections of `count` numbers."""
+        """Return the shot without the imperfections of `count` numbers, the last of them first."""
         shot = self.recorded
-        for change, size, places in self._parts:
+        for change, size, places in reversed(self._parts):
             shot = change(shot, size, numbers[places])
         return shot
 
     def scale(self, numbers: FloatArray) -> FloatArray:
-        """Return the field's relative change by the other field, for numbers (..., count)."""
-        return np.asarray(self._other_field * numbers[..., 0])
+        """Return the field's relative change without the other one, for numbers (..., count)."""
+        return np.asarray(-self._other_field * numbers[..., 0])
 
     def steps(self) -> Iterator[tuple[int, float, RecordedShot]]:
-        """Yield place and size of a step for each number, with the shot that it changes.
+        """Yield place and size of a step for each number, with the shot without it.
 
         Numbers whose square acts make a step of 1, others a small one.
         """

@@ -12,14 +12,15 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cached_property, reduce
 from operator import add
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
+from scipy.special import ndtri
 
 from napari_shadowinv._system.arrays import plain_array, unpack_array
 from napari_shadowinv._system.machine import physical_memory
@@ -155,6 +156,7 @@ class FullResampling:
     draw: Callable[[np.random.Generator], FloatArray]
     options: InversionOptions
     instrument: InstrumentDraws | None = None
+    numbers: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # of all samples
 
     def sample(self, seeds: list[Seed], report: Reporter) -> Sample:
         """Invert the noisy image of one seed, without caustics and other results."""
@@ -176,7 +178,7 @@ class FullResampling:
         noisy, numbers = self.random(seed)
         shot = self.instrument.shot(numbers)
         plan = _with_source(self.plan, shot.source, self.options)
-        # Light is counted after it is changed, so the noise stays as it is.
+        # Light is counted after it was changed, so the noise stays as it is.
         image = shot.image + (noisy - self.instrument.recorded.image)
         image = flooring_for(plan.source, self.options, plan.mask)(image)
         return plan, image, 1 + float(self.instrument.scale(numbers))
@@ -200,10 +202,9 @@ class FullResampling:
         return self.apply_floor(noisy)
 
     def random(self, seed: Seed) -> tuple[FloatArray, FloatArray]:
-        """Draw a noisy image, as recorded, and the numbers of the instrument."""
-        rng = np.random.default_rng(seed)
-        noisy = self.draw(rng)
-        return noisy, rng.normal(size=0 if self.instrument is None else self.instrument.count)
+        """Draw a noisy image, as recorded, and return the numbers of the instrument."""
+        noisy = self.draw(np.random.default_rng(seed))
+        return noisy, self.numbers[seed.spawn_key[-1]] if self.numbers.size else np.empty(0)
 
     @cached_property
     def apply_floor(self) -> Callable[[FloatArray], FloatArray]:
@@ -311,18 +312,6 @@ class Pairs:
         kept = 1 - np.minimum(1.0, chance / np.maximum(logarithm**2, 1e-300))
         return np.asarray(np.exp(logarithm * np.where(usable, kept, 0.0)))
 
-    def correct(self, samples: FloatArray) -> FloatArray:
-        """Return linear samples, (n, ...), with the mean and the deviation that solved ones have.
-
-        Values that are not numbers in a pair stay as they are.
-        """
-        shift, factor = self.shift, self.factor
-        known = np.isfinite(shift) & np.isfinite(factor)
-        middle = np.where(known, self.linear / self.count, 0.0)
-        factor = np.where(known, factor, 1.0)
-        moved = middle + np.where(known, shift, 0.0) + factor * (samples - middle)
-        return np.asarray(moved, dtype=samples.dtype)
-
     def part(self, numbers: slice) -> Pairs:
         """Return the pairs of some of the values along the first axis."""
         linear, solved = self.linear[numbers], self.solved[numbers]
@@ -346,6 +335,49 @@ class Pairs:
         squares = float(self.products[1].sum() - (self.solved**2).sum() / self.count)
         spread = float(np.sqrt(max(squares, 0.0) / max(self.count - 1, 1)))
         return float(np.linalg.norm(self.shift)) / spread if spread > 0 else 0.0
+
+
+def correct(samples: FloatArray, solved: FloatArray) -> FloatArray:
+    """Return linear samples, (n, ...), with mean, deviation and skewness as of solved ones.
+
+    The first samples are those that are solved. Values that are not numbers stay as they are.
+    """
+    head, kind = np.s_[: len(solved)], samples.dtype
+    linear, tiny = samples[head].astype(np.float64), np.finfo(kind).tiny
+    pairs = reduce(add, map(Pairs.of, linear, solved))
+    middle, deviation = pairs.linear / pairs.count, np.maximum(linear.std(axis=0), tiny)
+    moved = samples - middle.astype(kind)
+    bent = moved / deviation.astype(kind)
+    bent *= bent - (bent[head] ** 3).mean(axis=0)
+    moved *= pairs.factor.astype(kind)
+    moved += (middle + pairs.shift).astype(kind)
+    bent *= _curvature(bent[head], solved - moved[head]).astype(kind)
+    bent += moved
+    bent -= bent.mean(axis=0)
+    bent *= moved.std(axis=0) / np.maximum(bent.std(axis=0), tiny)
+    bent += moved.mean(axis=0)
+    for values in (moved, bent):
+        samples = np.where(np.isfinite(values), values, samples)
+    return samples
+
+
+def _curvature(basis: FloatArray, rest: FloatArray) -> FloatArray:
+    """Return the strength of a parabola in what is left of samples; 0 where chance explains it."""
+    basis = basis - basis.mean(axis=0)
+    squares = np.maximum((basis**2).sum(axis=0), 1e-300)
+    strength = (basis * rest).sum(axis=0) / squares
+    left = ((rest - strength * basis) ** 2).sum(axis=0) / max(len(rest) - 3, 1)
+    chance = _CHANCE * left / squares / np.maximum(strength**2, 1e-300)
+    return np.asarray(strength * (1 - np.minimum(1.0, chance)) * (len(rest) >= _LEAST_PAIRS))
+
+
+def stratified_numbers(rng: np.random.Generator, n: int, count: int) -> FloatArray:
+    """Return n samples of `count` normal numbers, each with one sample in each n-th of its values.
+
+    One number that moves the whole field is so spread as evenly as many (Latin hypercube).
+    """
+    strata = rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T
+    return np.asarray(ndtri((strata + rng.uniform(size=strata.shape)) / n))
 
 
 @njit(nogil=True, cache=True)
@@ -426,7 +458,7 @@ class LinearResampling:
         _subtract_product(self._gains, strengths, lacking)
         weights = self._solve(lacking, report)
         weights += self._samples.start[:, None] * instrument.scale(numbers)
-        return self._readout.at_sites(weights)
+        return self._readout.at_sites(-weights)
 
     def _flux_gains(self, threads: int | None) -> FloatArray:
         """Return the flux that cells gain by each number of the instrument, (n, count)."""
