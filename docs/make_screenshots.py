@@ -143,7 +143,10 @@ def toroid_window() -> None:
     viewer = new_window("toroid with caustics")
     *_, shot = viewer.open_sample(PLUGIN, "toroid_with_caustics")
     shot.name = "toroid"
-    press_run(open_widget(viewer, "Invert shot"))
+    widget = open_widget(viewer, "Invert shot")
+    press_run(widget)
+    widget.area.verticalScrollBar().setValue(0)
+    widget.area.ensureWidgetVisible(widget.panel.status)
     photograph(viewer, "napari-toroid.png")
 
 
