@@ -304,7 +304,8 @@ def _sharpen(shot: RecordedShot, width: float, numbers: FloatArray) -> RecordedS
     mask = shot.scene.mask
 
     def blurred(values: FloatArray) -> FloatArray:
-        return gaussian_filter(np.where(mask, values, 0.0), width * abs(numbers[0]), mode="nearest")
+        lit = np.where(mask, values, 0.0)
+        return np.asarray(gaussian_filter(lit, width * abs(numbers[0]), mode="nearest"))
 
     # 1 / g of a wave that a blur leaves a share g of is 1 + (1 - g) + (1 - g)² + …
     used = np.maximum(blurred(mask.astype(np.float64)), _LEAST_BRIGHTNESS)
