@@ -68,3 +68,27 @@ def test_the_noise_of_a_reference_is_no_misfit(clean: FloatArray) -> None:
         assert found.verdict is Verdict.DETERMINED
         assert found.chi2 == pytest.approx(1, abs=0.3)
         assert share_off(found) < 2
+
+
+def test_a_fit_does_not_follow_the_noise_of_a_reference() -> None:
+    rng, hill = np.random.default_rng(7), bump(0.8, 7, (33, 30))
+    y, x = (np.indices(SIZE) - 31.5) / 32
+    beam = 150 * np.exp(-0.3 * (x**2 + y**2))
+    image, reference = rng.poisson(beam * counted(hill, SIZE)), rng.poisson(beam)
+    errors = []
+    for source in (reference.astype(float), beam):
+        found = fit(image.astype(float), source=source, options=FitOptions(samples=0, threads=1))
+        assert found.chi2 == pytest.approx(1, abs=0.3)
+        errors.append(distance(found.fields[0].displacement, on_pixels(hill, SIZE)))
+    assert errors[0] < 1.5 * errors[1]
+
+
+def test_a_beam_of_fine_structure_is_taken_as_it_is() -> None:
+    speckles = np.exp(0.2 * gaussian_filter(np.random.default_rng(8).normal(size=SIZE), 1.5) * 5)
+    found = fit(
+        speckles * counted(OBJECT, SIZE),
+        source=speckles,
+        noise=0.01,
+        options=FitOptions(samples=0, threads=1),
+    )
+    np.testing.assert_allclose(found.source[0] / found.source[0].mean(), speckles / speckles.mean())
