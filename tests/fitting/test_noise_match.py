@@ -77,18 +77,20 @@ def test_a_fit_does_not_follow_the_noise_of_a_reference() -> None:
     image, reference = rng.poisson(beam * counted(hill, SIZE)), rng.poisson(beam)
     errors = []
     for source in (reference.astype(float), beam):
-        found = fit(image.astype(float), source=source, options=FitOptions(samples=0, threads=1))
-        assert found.chi2 == pytest.approx(1, abs=0.3)
-        errors.append(distance(found.fields[0].displacement, on_pixels(hill, SIZE)))
+        result = fit(image.astype(float), source=source, options=FitOptions(samples=0, threads=1))
+        assert result.chi2 == pytest.approx(1, abs=0.3)
+        errors.append(distance(result.fields[0].displacement, on_pixels(hill, SIZE)))
     assert errors[0] < 1.5 * errors[1]
 
 
 def test_a_beam_of_fine_structure_is_taken_as_it_is() -> None:
     speckles = np.exp(0.2 * gaussian_filter(np.random.default_rng(8).normal(size=SIZE), 1.5) * 5)
-    found = fit(
+    result = fit(
         speckles * counted(OBJECT, SIZE),
         source=speckles,
         noise=0.01,
         options=FitOptions(samples=0, threads=1),
     )
-    np.testing.assert_allclose(found.source[0] / found.source[0].mean(), speckles / speckles.mean())
+    np.testing.assert_allclose(
+        result.source[0] / result.source[0].mean(), speckles / speckles.mean()
+    )

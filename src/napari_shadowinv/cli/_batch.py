@@ -247,8 +247,7 @@ def _site_rows(store: StackStore) -> Rows:
     reasons = dict.fromkeys(report.get("sites_reason") or "as requested" for report in reports)
     reason = next(iter(reasons)) if len(reasons) == 1 else "for different reasons"
     rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
-    totals = [report["total_error"] for report in reports if report.get("total_error")]
-    if totals:
+    if totals := [total for report in reports if (total := report.get("total_error"))]:
         median = percent(float(np.median(totals)))
         rows.append(("errors", f"{median} of the displacement (r.m.s., median of the shots)"))
     return rows

@@ -6,14 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from napari_shadowinv.cli._summary import (
-    Rows,
-    fact_rows,
-    headline_row,
-    options_text,
-    setup_text,
-    size_text,
-)
+from napari_shadowinv.cli import _summary
 from napari_shadowinv.cli._terminal import say, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import RESULT
@@ -69,7 +62,7 @@ def comparison_table(fits: Sequence[Fit]) -> Table:
     return table
 
 
-def fit_file_rows(dataset: xarray.Dataset) -> Rows:
+def fit_file_rows(dataset: xarray.Dataset) -> _summary.Rows:
     """Describe the file of a fit."""
     from napari_shadowinv.fitting import Fit, LeaveOneOut
 
@@ -80,18 +73,18 @@ def fit_file_rows(dataset: xarray.Dataset) -> Rows:
         ("kind", f"fit of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
         *fit_rows(fit),
-        *fact_rows(left_out),
+        *_summary.fact_rows(left_out),
         *([] if provenance is None else _provenance_rows(provenance)),
-        ("options", options_text(fit.options.model_dump())),
+        ("options", _summary.options_text(fit.options.model_dump())),
     ]
 
 
-def _provenance_rows(provenance: Provenance) -> Rows:
+def _provenance_rows(provenance: Provenance) -> _summary.Rows:
     """Return the steps before a fit, its choices, and the checksums of its files."""
     steps = [("step", step.summary) for step in provenance.recipe.steps]
     fit = provenance.recipe.fit
     choices = {} if fit is None else fit.model_dump(exclude_none=True, exclude={"options"})
-    rows = [*steps, ("fit", options_text(choices))]
+    rows = [*steps, ("fit", _summary.options_text(choices))]
     for number, image in enumerate(provenance.images, 1):
         masks = map(provenance.mask_of, (image.mask, image.source_mask))
         origins = [("image", image), ("source", image.source)]
@@ -104,13 +97,13 @@ def _provenance_rows(provenance: Provenance) -> Rows:
     return rows
 
 
-def fit_rows(fit: Fit, names: Sequence[str] = (), printed: tuple[str, ...] = ()) -> Rows:
+def fit_rows(fit: Fit, names: Sequence[str] = (), printed: tuple[str, ...] = ()) -> _summary.Rows:
     """Return the headline and facts of a fit, and the size and setup of its images, by `names`."""
     return [
-        headline_row(fit.headline),
-        *fact_rows(fit.facts_with_names(names) if names else fit.facts, printed),
-        ("size", size_text(fit.images[0])),
-        ("setup", setup_text(fit.setup, shape=fit.images[0].shape)),
+        _summary.headline_row(fit.headline),
+        *_summary.fact_rows(fit.facts_with_names(names) if names else fit.facts, printed),
+        ("size", _summary.size_text(fit.images[0])),
+        ("setup", _summary.setup_text(fit.setup, shape=fit.images[0].shape)),
     ]
 
 

@@ -422,12 +422,11 @@ class Fit(Summarised):
     @property
     def headline(self) -> Headline:
         """The peaks of the fields, the verdict and the warnings in one line."""
-        level, texts = Level.DOUBTFUL if self.cautions else self.verdict.level, []
+        level = Level.DOUBTFUL if self.cautions else self.verdict.level
+        texts = []
         if self.verdict is not Verdict.CONDITIONAL:  # whose explanation is the peak
-            deflectors = [deflector_titles()[field.name] for field in self.fields]
-            for field, deflector in zip(self.fields, deflectors, strict=True):
-                (shown,) = shown_fields([field.displacement], self.setup, deflector, mask=self.used)
-                texts.append(shown.short_peak_text(self.peak_error(field, shown)))
+            peaks = (self._shown_peak(field, self.setup) for field in self.fields)
+            texts = [shown.short_peak_text(error) for shown, error in peaks]
         texts += [self.explanation, *in_headline(self.warnings)]
         if not self.report.converged:
             level = Level.FAILED
@@ -543,20 +542,18 @@ class Fit(Summarised):
             text = ", ".join(parts)
             yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {to_figures(chi2, 3)}")
 
+    def _shown_peak(
+        self, field: FittedField, frame: Setup | None
+    ) -> tuple[ShownField, PeakError | None]:
+        deflector = deflector_titles()[field.name]
+        (shown,) = shown_fields([field.displacement], frame, deflector, mask=self.used)
+        return shown, self.peak_error(field, shown)
+
     def _field_fact(self, field: FittedField) -> Fact:
         setup, deflector = self.setup, deflector_titles()[field.name]
-        errors = []
-        for frame in (None, setup):
-            (shown,) = shown_fields([field.displacement], frame, deflector, mask=self.used)
-            errors.append(self.peak_error(field, shown))
-        peaks = peak_facts(
-            field.displacement,
-            setup,
-            deflector,
-            mask=self.used,
-            error=errors[0],
-            field_error=errors[1],
-        )
+        (_, error), (_, field_error) = (self._shown_peak(field, frame) for frame in (None, setup))
+        errors = {"error": error, "field_error": field_error}
+        peaks = peak_facts(field.displacement, setup, deflector, mask=self.used, **errors)
         text = "; ".join(fact.text for fact in peaks)
         return Fact(f"field_{field.name}", f"Field {field.name}", text)
 

@@ -14,14 +14,8 @@ from napari_shadowinv._napari.fit_layers import alternative_layers, start_name
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
 from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
-from napari_shadowinv._napari.widgets._panels import (
-    ReportTable,
-    Rows,
-    RunPanel,
-    VerdictLine,
-    fact_rows,
-)
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.facts import Fact
@@ -58,7 +52,7 @@ class RefineSection(QWidget):
 class FitView(QWidget):
     """The objective of a running fit; then its verdict, report and alternative solutions."""
 
-    def __init__(self, viewer: Any, panel: RunPanel) -> None:
+    def __init__(self, viewer: Any, panel: panels.RunPanel) -> None:
         super().__init__()
         self._viewer, self._panel = viewer, panel
         self._job: FitJob | None = None
@@ -66,13 +60,13 @@ class FitView(QWidget):
         self._alternative = ResultLayers(viewer, self)
         self.results = ResultLayers(viewer, self)
         self.curve = ObjectiveCurve()
-        self.verdict = VerdictLine()
+        self.verdict = panels.VerdictLine()
         self.solutions = SteadyComboBox(
             tip="Alternative solutions from other starting points. Select one to show it next to "
             "the best."
         )
         self._solutions_row = forms.labelled("Solution", self.solutions)
-        self.report = ReportTable()
+        self.report = panels.ReportTable()
         column(self, self.verdict, self._solutions_row, self.curve, self.report)
         self._redraw_timer = timer(self, _REDRAW_MS, self._draw)
         self.solutions.currentIndexChanged.connect(self._show_alternative)
@@ -113,11 +107,11 @@ class FitView(QWidget):
             self._show_report(result.content, result.content.facts)
         return True
 
-    def _show_report(self, fit: Fit, facts: Iterable[Fact], inputs: Rows = ()) -> None:
+    def _show_report(self, fit: Fit, facts: Iterable[Fact], inputs: panels.Rows = ()) -> None:
         self.verdict.show_headline(fit.headline)
         warnings = [("Warning", caution.text) for caution in fit.warnings]
         rows = [row for row in warnings if row not in inputs]
-        self.report.show_rows([*rows, *inputs, *fact_rows(facts, details=None)])
+        self.report.show_rows([*rows, *inputs, *panels.fact_rows(facts, details=None)])
 
     def _list_solutions(self, fit: Fit) -> None:
         with QSignalBlocker(self.solutions):
