@@ -23,51 +23,51 @@ def clean() -> FloatArray:
     return counted(OBJECT, SIZE)
 
 
-def share_off(found: Fit) -> float:
+def share_off(result: Fit) -> float:
     """Error of the field over the stated one."""
-    assert found.total_error is not None
-    return distance(found.fields[0].displacement, on_pixels(OBJECT, SIZE)) / found.total_error
+    assert result.total_error is not None
+    return distance(result.fields[0].displacement, on_pixels(OBJECT, SIZE)) / result.total_error
 
 
 def test_correlated_noise_widens_the_bars_of_one_image(clean: FloatArray) -> None:
     noise = np.random.default_rng(3).normal(0, 0.1, SIZE)
     image = clean + gaussian_filter(noise, 2.0, mode="wrap")
-    found = fit(image, source=np.ones(SIZE), options=OPTIONS)
-    assert share_off(found) < 2
-    assert found.verdict is not Verdict.MISFIT
+    result = fit(image, source=np.ones(SIZE), options=OPTIONS)
+    assert share_off(result) < 2
+    assert result.verdict is not Verdict.MISFIT
 
 
 def test_smoothed_counts_are_no_misfit(clean: FloatArray) -> None:
     counts = np.random.default_rng(4).poisson(COUNTS * clean).astype(float)
     image, source = gaussian_filter(counts, 0.8), np.full(SIZE, float(COUNTS))
-    found = fit(image, source=source, noise="poisson", psf=0.8, options=OPTIONS)
-    assert found.verdict is Verdict.DETERMINED
-    assert 0.5 < share_off(found) < 2
+    result = fit(image, source=source, noise="poisson", psf=0.8, options=OPTIONS)
+    assert result.verdict is Verdict.DETERMINED
+    assert 0.5 < share_off(result) < 2
 
 
 def test_noise_that_is_stated_too_large_is_used_smaller(clean: FloatArray) -> None:
     image = clean + np.random.default_rng(5).normal(0, 0.05, SIZE)
-    found = fit(image, source=np.ones(SIZE), noise=0.2, options=OPTIONS)
-    assert found.verdict is Verdict.DETERMINED
-    assert "the noise was stated 4." in found.explanation
-    assert found.noise == pytest.approx(0.05, rel=0.15)
-    assert 0.5 < share_off(found) < 2
+    result = fit(image, source=np.ones(SIZE), noise=0.2, options=OPTIONS)
+    assert result.verdict is Verdict.DETERMINED
+    assert "the noise was stated 4." in result.explanation
+    assert result.noise == pytest.approx(0.05, rel=0.15)
+    assert 0.5 < share_off(result) < 2
 
 
 def test_the_noise_of_a_reference_is_no_misfit(clean: FloatArray) -> None:
     rng = np.random.default_rng(6)
     image, reference = rng.poisson(4 * COUNTS * clean), rng.poisson(4 * COUNTS, SIZE)
     for noise in (None, "poisson"):
-        found = fit(
+        result = fit(
             image.astype(float),
             source=reference.astype(float),
             noise=noise,
             options=OPTIONS,
             instrument={"beam_rms": 0},
         )
-        assert found.verdict is Verdict.DETERMINED
-        assert found.chi2 == pytest.approx(1, abs=0.3)
-        assert share_off(found) < 2
+        assert result.verdict is Verdict.DETERMINED
+        assert result.chi2 == pytest.approx(1, abs=0.3)
+        assert share_off(result) < 2
 
 
 def test_a_fit_does_not_follow_the_noise_of_a_reference() -> None:

@@ -219,15 +219,17 @@ def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
 ) -> None:
     show(tool, fitted)
     assert "Determined" in tool.view.verdict.text()
-    assert not tool.view.verdict.styleSheet()
+    sound_style = tool.view.verdict.styleSheet()
     assert messages == []
     count = len(window.layers)
     explanation = "the forward model does not explain image 2"
     show(tool, replace(fitted, verdict=Verdict.MISFIT, explanation=explanation))
     assert "Does not fit" in tool.view.verdict.text()
     assert explanation[1:] in tool.view.verdict.text()
-    assert tool.view.verdict.styleSheet()
-    assert messages == [f"The fit's verdict is 'does not fit': {explanation}"]
+    assert tool.view.verdict.styleSheet() != sound_style
+    (message,) = messages
+    assert message.startswith("Does not fit: peak ")
+    assert message.endswith(f"; {explanation}")
     # The layers of the same images' earlier fit are replaced.
     assert len(window.layers) == count
     tool._last.keep_earlier.setChecked(True)
