@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.fft import dstn, idstn
+from scipy.fft import dct, idct
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import percent
@@ -27,15 +27,15 @@ def edge_changes(
 ) -> FloatArray:
     """Independent changes of a field, of one standard deviation each, by what lies beyond its edge.
 
-    Two opposite assumptions are made of it. The first lets no flux cross the edge, as if the object
-    went on as its mirror image; the second makes the potential constant along the edge, as if it
-    went on as its mirror image of opposite sign. A field that ends inside the image satisfies both,
-    so neither changes it. Objects beyond the edge that are like those inside add a field as strong
-    as the mirror image's. With half the sum of both changes nothing lies beyond, and half their
-    difference is the field of the mirror image: so the variance of any answer, whatever its own
-    boundary, is the mean of their squares.
+    Opposite assumptions are made of it. The first lets no flux cross the edge, as if the object
+    went on as its mirror image; the others make the potential constant along one edge, or the mean
+    of it alike along opposite edges, as if it went on there as its mirror image of opposite sign. A
+    field that ends inside the image satisfies them all, so none changes it. Objects beyond the edge
+    that are like those inside add a field as strong as the mirror image's, of either sign: so the
+    variance of any answer, whatever its own boundary, is the sum of the squares, weighted by how
+    likely each assumption is.
 
-    The third change is by flux that leaves on all sides, which looks like another exposure: along
+    The last change is by flux that leaves on all sides, which looks like another exposure: along
     the edge the image is then brighter or darker than its source. It is at most as large as the
     field.
 
@@ -50,31 +50,66 @@ def edge_changes(
 
     Returns
     -------
-    ndarray of float64, shape (3, 3, H, W)
+    ndarray of float64, shape (8, 3, H, W)
         The changes of the potential, px², and of the displacement's components, px.
     """
-    outflow = np.zeros(potential.shape)
-    for axis, part in enumerate(displacement):
-        inwards, edges = np.moveaxis(part, axis, 0), np.moveaxis(outflow, axis, 0)
+    outflow, opposite = np.zeros(potential.shape), np.zeros((6, *potential.shape))
+    shares = []
+    contrast = sum(np.gradient(part, axis=axis) for axis, part in enumerate(displacement))
+    for side, plane in enumerate(opposite[:4]):
+        axis, is_last = divmod(side, 2)
+        inwards, edges, flipped, values, source = (
+            np.moveaxis(each, axis, 0)[:: -1 if is_last else 1]
+            for each in (displacement[axis], outflow, plane, potential, contrast)
+        )
+        share = _changed_share(source, values[0])
+        at_edge = (source[1:4] ** 2).mean() / max((source**2).mean(), 1e-300)
+        shares.append(share * min(1.0, float(at_edge)))
         # Half a pixel outside the outermost points.
-        edges[0] -= 1.5 * inwards[0] - 0.5 * inwards[1]
-        edges[-1] += 1.5 * inwards[-1] - 0.5 * inwards[-2]
+        normal = (1.5 * inwards[0] - 0.5 * inwards[1]) * np.sqrt(1 - share)
+        edges[0] += normal if is_last else -normal
+        flipped[:] = np.sqrt(share) * _held_at_edge(values[0], len(values))
+    for axis, plane in enumerate(opposite[4:]):
+        values, across = np.moveaxis(potential, axis, 0), np.moveaxis(plane, axis, 0)
+        step = (values[0].mean() - values[-1].mean()) * np.sqrt(
+            min(shares[2 * axis : 2 * axis + 2])
+        )
+        across[:] = step * np.linspace(-0.5, 0.5, len(across))[:, None]
     turned_back = potential_of_slopes(spacing * outflow)
-    # Sines vanish at the border, whose values act on the points next to it.
-    held = border_mean(potential) - potential
-    by_border = np.zeros([side - 2 for side in held.shape])
-    by_border[0] += held[0, 1:-1]
-    by_border[-1] += held[-1, 1:-1]
-    by_border[:, 0] += held[1:-1, 0]
-    by_border[:, -1] += held[1:-1, -1]
-    rows, columns = (2 - 2 * np.cos(np.pi * np.arange(1, n - 1) / (n - 1)) for n in held.shape)
-    held[1:-1, 1:-1] = idstn(dstn(by_border, type=1) / (rows[:, None] + columns), type=1)
-    leaving = _divergence_at_edge(displacement, spacing) * _even_source(held.shape, spacing)
-    planes = turned_back / np.sqrt(2), held / np.sqrt(2), leaving
+    leaving = _divergence_at_edge(displacement, spacing) * _even_source(potential.shape, spacing)
+    planes = turned_back, *opposite, leaving
     changes = np.array([[each, *-np.array(np.gradient(each, spacing))] for each in planes])
-    largest = np.sqrt((displacement**2).sum() / max((changes[2, 1:] ** 2).sum(), 1e-300))
-    changes[2] *= min(1.0, float(largest))
+    largest = np.sqrt((displacement**2).sum() / max((changes[-1, 1:] ** 2).sum(), 1e-300))
+    changes[-1] *= min(1.0, float(largest))
     return changes
+
+
+def _held_at_edge(values: FloatArray, depth: int) -> FloatArray:
+    """Return the harmonic potential, (depth, n), that takes values away along the first row.
+
+    No flux crosses the other edges.
+    """
+    waves = dct(values - values.mean(), norm="ortho")
+    rates = 2 * np.arcsinh(np.sin(np.pi / 2 * np.arange(len(values)) / len(values)))
+    z = np.arange(depth)[:, None]
+    decay = np.exp(-rates * z) + np.exp(-rates * (2 * depth - 1 - z))
+    return np.asarray(-idct(waves * decay / decay[0], norm="ortho", axis=1))
+
+
+def _changed_share(contrast: FloatArray, potential: FloatArray) -> float:
+    """Return the weight, up to half, of an object of opposite sign beyond an edge.
+
+    Its effect falls off as exp(-z / w) with the distance z from the edge to where it begins, w
+    being the length over which the potential varies along the edge. It begins anywhere within the
+    depth over which the contrast, (H, W) from the edge inwards, resembles that at the edge.
+    """
+    strip = contrast[1:4].mean(axis=0)
+    unlike = contrast[1:] @ strip < (strip @ strip) / 2
+    depth = 1 + (int(unlike.argmax()) if unlike.any() else len(unlike))
+    values = potential - potential.mean()
+    width = np.sqrt((values**2).sum() / max((np.diff(values) ** 2).sum(), 1e-300))
+    ratio = min(2 * depth / max(width, 1e-300), 1e3)
+    return float(-np.expm1(-ratio) / (2 * max(ratio, 1e-9)))
 
 
 def _divergence_at_edge(
