@@ -250,6 +250,7 @@ def test_band_holds_what_a_closed_edge_takes_from_an_object():
     deviation = profile["profile"].std[5:35]
     assert (error < 0).all()
     assert (-error < 1.3 * deviation).all()
+    assert (deviation < -5 * error).all()
 
 
 def codes(result) -> set[str]:
