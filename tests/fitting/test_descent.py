@@ -11,9 +11,12 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
-from napari_shadowinv.fitting.descent import coarser, descend, finer, settle
+from napari_shadowinv.fitting.conjugate_gradients import solve
+from napari_shadowinv.fitting.descent import Preconditioner, coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.instrument import Imperfect, beam_shapes
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+from napari_shadowinv.options import BeamPrior
 
 SIZE, PAD = (48, 64), 16
 
@@ -289,3 +292,38 @@ def test_a_hopeless_search_ends_before_its_first_step(
     assert (steps, len(built)) == (0, 1)
     assert end is truth
     assert value > 3 * to_beat
+
+
+def steps_of_solution(scene: Scene) -> int:
+    """How many steps a linear system of a scene without an object takes."""
+    scales, nothing = Preconditioner(scene), scene.nothing()
+    linear, steps = scene.linear(nothing), 0
+
+    def times(flat: FloatArray) -> FloatArray:
+        nonlocal steps
+        steps += 1
+        return scales.hessian_times(linear, flat)
+
+    noise = np.random.default_rng(0).normal(size=scene.images.shape)
+    right = scales.transpose_times(linear.pull(noise)).flat()
+    solve(times, right, tolerance=1e-4, iterations=400)
+    return steps
+
+
+def with_unknown_beam(scene: Scene) -> Scene:
+    height, width = scene.images.shape[1:]
+    shapes = beam_shapes(BeamPrior(rms=0.1), np.ones((height, width), bool), ((PAD, PAD),) * 2)
+    return replace(scene, imperfect=Imperfect(shapes=(shapes,)))
+
+
+def test_a_beam_that_fields_can_replace_costs_few_steps(scene: Scene) -> None:
+    assert steps_of_solution(with_unknown_beam(scene)) < 2.5 * steps_of_solution(scene) < 40
+
+
+def test_scales_of_beams_and_fields_have_their_transpose(scene: Scene) -> None:
+    unsure = with_unknown_beam(scene)
+    scales, like, rng = Preconditioner(unsure), unsure.nothing(), np.random.default_rng(1)
+    first, second = (like.like(rng.normal(size=like.flat().size)) for _ in range(2))
+    there = scales.times(first).flat() @ second.flat()
+    back = first.flat() @ scales.transpose_times(second).flat()
+    assert there == pytest.approx(back, rel=1e-9)

@@ -91,6 +91,7 @@ _SPACING_OF_SAMPLES = 1 / 3  # px
 _CHECKED = 2  # samples of an instrument that are solved, too
 # Before a field has been found, they would take its place.
 _HELD_IN_SEARCH = frozenset({"gamma", "blur", "other_field"})
+_HELD_WITH_SOURCE = frozenset({"beam", "beam_between"})
 
 
 def fit(
@@ -199,7 +200,8 @@ def fit(
     # One image cannot tell the instrument from the object: its numbers stay at 0.
     alone = replace(EXACT, shapes=scene.imperfect.shapes[:1]) if data.unknown else EXACT
     with measure_time("starts", seconds):
-        rough = replace(scene, held=_HELD_IN_SEARCH)
+        known = frozenset() if data.unknown else _HELD_WITH_SOURCE
+        rough = replace(scene, held=_HELD_IN_SEARCH | known)
         if data.single:
             rough = replace(scene, imperfect=alone)
         minima = search(rough, collect_starts(data, on_step, should_stop), on_step)
@@ -399,7 +401,7 @@ def _find_openness(
     if is_solved:
         checked, solved = samples, posterior.solve(samples)
     else:
-        checked = samples[: _CHECKED if scene.imperfect.parts else 0]
+        checked = samples[: _CHECKED if scene.imperfect.of_response else 0]
         solved = posterior.solve(checked, steps=1)
     pairs = compare_samples(posterior.scene, checked, solved) if solved else None
     samples = solved if is_solved else samples

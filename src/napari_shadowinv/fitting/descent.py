@@ -151,18 +151,20 @@ _SCALE, _TRANSPOSE = "nmyx,nyx->myx", "nmyx,myx->nyx"  # sums over the fields of
 class Preconditioner:
     """Scales in which the Hessian is about the identity: Sᵀ H S ≈ 1.
 
-    Diagonal in the cosines of the potentials, except for the coupling of two fields.
+    Diagonal in the cosines of the potentials, except for the coupling of two fields, and of fields
+    and beams.
     """
 
     def __init__(self, scene: Scene) -> None:
         prior, squares = scene.prior, scene.prior.wave_numbers
-        data = np.zeros((*squares.shape, *[scene.strengths.shape[1]] * 2))
-        for strengths, weights, psf in zip(scene.strengths, scene.weights, scene.psf, strict=True):
-            width = psf if isinstance(psf, float) else 0.0
-            transfer = np.exp(-squares * (scene.blur**2 + width**2))
-            # An image's change by a weak potential is its Laplacian.
-            each = weights.mean() * (KNOT * squares) ** 2 * transfer
-            data += each[..., None, None] * np.outer(strengths, strengths)
+        widths = [psf if isinstance(psf, float) else 0.0 for psf in scene.psf]
+        variances = scene.blur**2 + np.square(widths)
+        weights = np.exp(-variances[:, None, None] * squares)
+        weights *= KNOT**2 * scene.weights.mean(axis=(1, 2))[:, None, None]
+        # An image's change by a weak potential is its Laplacian.
+        laplacian = -squares * np.sqrt(prior.power_seen)
+        data = np.einsum("lyx,li,lj->yxij", weights, scene.strengths, scene.strengths)
+        data *= laplacian[:, :, None, None] ** 2
         of_data = np.moveaxis(np.diagonal(data, axis1=2, axis2=3), -1, 0)
         rough = prior.roughness
         self._kept = np.divide(of_data, of_data + rough, out=np.ones_like(rough), where=rough > 0)
@@ -182,6 +184,42 @@ class Preconditioner:
         added = [block.scales(scene.weights) for block in scene.added]
         common, separate = scene.number_scales()
         self._diagonals = [common, brightness, frames, separate, *added]
+        self._couple(scene, weights, laplacian)
+
+    def _couple(self, scene: Scene, weights: FloatArray, laplacian: FloatArray) -> None:
+        """Count in that weak fields can replace beams.
+
+        With M the scaled Hessian between long waves of the potentials and numbers of the beams, and
+        D that of these numbers, all other blocks being the identity: M and a root of (D - MᵀM)⁻¹.
+        `weights` (L, …) are those of each image's cosines.
+        """
+        beams = scene.beam_cosines()
+        scales, count = self.others[beams.places], beams.waves.shape[1:]
+        long = np.s_[..., : count[0], : count[1]]
+        own = np.diag(np.where(scales > 0, scales**2, 1.0))
+        pulls = np.zeros((len(scales), scene.strengths.shape[1], *count))
+        for root, strengths, seen in zip(
+            np.sqrt(weights[long]), scene.strengths, beams.images.T, strict=True
+        ):
+            waves = (scales * seen)[:, None, None] * root * beams.waves
+            own += np.einsum("qyx,pyx->qp", waves, waves)
+            pulls += strengths[:, None, None] * (root * laplacian[long] * waves)[:, None]
+        table = np.einsum("nmyx,qmyx->qnyx", self._potentials[long], pulls)
+        own -= np.einsum("qmyx,pmyx->qp", table, table)
+        self._long, self._coupled, self._table = long, beams.places, table
+        self._root = np.linalg.inv(np.linalg.cholesky(own)).T
+
+    def _turn(self, waves: FloatArray, others: FloatArray) -> None:
+        """Turn scaled values in place: with the beams move the fields that replace them."""
+        numbers = np.einsum("qp,p->q", self._root, others[self._coupled])
+        others[self._coupled] = numbers
+        waves[self._long] -= np.einsum("q,qmyx->myx", numbers, self._table)
+
+    def _turn_back(self, waves: FloatArray, others: FloatArray) -> None:
+        """Apply the transpose of `_turn` in place."""
+        moved = np.einsum("qmyx,myx->q", self._table, waves[self._long])
+        numbers = others[self._coupled] - moved
+        others[self._coupled] = np.einsum("qp,q->p", self._root, numbers)
 
     def held(self) -> Preconditioner:
         """Return scales in which the numbers of an instrument do not change."""
@@ -189,6 +227,8 @@ class Preconditioner:
         scales._diagonals = [scale.copy() for scale in self._diagonals]
         scales._diagonals[0][:] = 0
         scales._diagonals[3][:] = 0
+        scales._coupled = scales._coupled[:0]
+        scales._root, scales._table = scales._root[:0, :0], scales._table[:0]
         return scales
 
     def damp(self, unknowns: Unknowns) -> Unknowns:
@@ -198,35 +238,52 @@ class Preconditioner:
 
     def times(self, scaled: Unknowns) -> Unknowns:
         """Return S times scaled unknowns: their change."""
-        waves = self._potentials_times(scaled.potentials)
-        products = map(np.multiply, self._diagonals, scaled.blocks[1:])
-        return Unknowns.from_blocks([idctn(waves, axes=(1, 2), norm="ortho"), *products])
+        return scaled.like(self._changed(scaled.flat(), scaled)[1])
+
+    def _changed(self, scaled: FloatArray, like: Unknowns) -> tuple[FloatArray, FloatArray]:
+        """Cosines of the potentials' change by scaled values, and the change of all values."""
+        size = like.potentials.size
+        flat = scaled.copy()
+        waves, others = flat[:size].reshape(like.potentials.shape), flat[size:]
+        self._turn(waves, others)
+        waves = self._potentials_times(waves)
+        flat[:size] = idctn(waves, axes=(1, 2), norm="ortho").ravel()
+        others *= self.others
+        return waves, flat
 
     def transpose_times(self, slope: Unknowns) -> Unknowns:
         """Return Sᵀ times derivatives: those with respect to scaled unknowns."""
         waves = dctn(slope.potentials, axes=(1, 2), norm="ortho")
-        potentials = self._potentials_times(waves, _TRANSPOSE)
-        products = map(np.multiply, self._diagonals, slope.blocks[1:])
-        return Unknowns.from_blocks([potentials, *products])
+        return slope.like(self._scaled(waves, slope.flat()))
+
+    def _scaled(self, waves: FloatArray, flat: FloatArray) -> FloatArray:
+        """Sᵀ times derivatives, by the cosines of those by potentials, in place of all."""
+        waves = self._potentials_times(waves, _TRANSPOSE)
+        others = flat[waves.size :]
+        others *= self.others
+        self._turn_back(waves, others)
+        flat[: waves.size] = waves.ravel()
+        return flat
 
     def hessian_times(self, linear: Linear, scaled: FloatArray) -> FloatArray:
         """Return Sᵀ H S times scaled unknowns, both flat, by half of the transforms of each."""
         unknowns, prior = linear.unknowns, linear.scene.prior
-        shape = unknowns.potentials.shape
-        size = unknowns.potentials.size
-        waves = self._potentials_times(scaled[:size].reshape(shape))
-        potentials = idctn(waves, axes=(1, 2), norm="ortho")
-        others = self.others * scaled[size:]
-        change = unknowns.like(np.concatenate([potentials.ravel(), others]))
+        waves, flat = self._changed(scaled, unknowns)
+        change = unknowns.like(flat)
         slope = linear.normal_times(change)
         prior.add_ties(change.potentials, slope.potentials)
         of_data = dctn(slope.potentials, axes=(1, 2), norm="ortho")
         of_data += prior.roughness * waves
-        result = slope.flat()
-        result[:size] = self._potentials_times(of_data, _TRANSPOSE).ravel()
-        result[size:] += linear.weights_of_others * others
-        result[size:] *= self.others
-        return result
+        result, size = slope.flat(), waves.size
+        result[size:] += linear.weights_of_others * flat[size:]
+        return self._scaled(of_data, result)
+
+    @property
+    def has_rough_numbers(self) -> bool:
+        """Whether numbers of the instrument may change in scales that leave out the fields."""
+        numbers = self._diagonals[0], self._diagonals[3]
+        free = sum(np.count_nonzero(scales) for scales in numbers)
+        return bool(free > len(self._coupled))
 
     @property
     def others(self) -> FloatArray:
@@ -241,7 +298,7 @@ class Preconditioner:
 
     def log_size(self) -> float:
         """Return log |det S| plus about half the log-determinant of the prior."""
-        scales = self.others
+        scales = np.append(self.others, np.diag(self._root))
         return -self.log_ratio + float(np.log(scales[scales > 0]).sum())
 
 
@@ -343,13 +400,14 @@ def settle(
         Whether steps were left.
     """
     tolerance, solving = _NEWTON, _MOST_SOLVING
-    # Scales of numbers, which fields may replace, of frames and added light are rough.
-    is_scaled = not (scene.has_free_numbers or scene.added or scene.free_frames.any())
-    if scene.has_free_numbers and to_beat is None:
+    scales = Preconditioner(scene)
+    # Scales of numbers that fields may replace, of frames and added light are rough.
+    is_scaled = not (scales.has_rough_numbers or scene.added or scene.free_frames.any())
+    if scales.has_rough_numbers and to_beat is None:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
+    if scene.has_free_numbers and to_beat is None:
         least_gain *= _GAIN_IN_VALLEY
     modes = SoftModes() if modes is None else modes
-    scales = Preconditioner(scene)
     now = start
     counts = scene.ray_counts(now)
     value, slope = scene.value_and_gradient(now, counts)

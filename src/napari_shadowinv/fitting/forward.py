@@ -14,11 +14,13 @@ from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
+from scipy.fft import dct
 from scipy.ndimage import gaussian_filter, laplace
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
+from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, Part, widen, widening
 from napari_shadowinv.fitting.rays import Pulls, RayModel, TracedBeam, at_rest
 from napari_shadowinv.fitting.unknowns import Prior, PriorTerms, Unknowns
@@ -315,6 +317,40 @@ class Scene(PriorTerms):
             part.of(common, separate)[...] = 0 if is_held else 1 / np.sqrt(1 + curvature)
         return common, separate
 
+    def beam_cosines(self, longest: int = 24, most: int = 150) -> BeamCosines:
+        """Return the cosines of smooth changes of the beams by their first numbers, by 1.
+
+        Parameters
+        ----------
+        longest : int, default 24
+            Cosines along each axis, of the longest waves.
+        most : int, default 150
+            Numbers of each beam.
+        """
+        lines: list[FloatArray] = []
+        knots: list[FloatArray] = []
+        for n, side in zip(self.rays.shape, self.rays.size, strict=True):
+            place = np.asarray(KNOT * (np.arange(float(n)) - 1) - self.pad)
+            inside = np.clip(np.minimum(place, side - place) / KNOT + 0.5, 0, 1)
+            lines.append(dct(np.diag(inside), axis=0, norm="ortho")[:longest])
+            knots.append(place + self.pad - 0.5)
+        numbers, count = self.nothing(), len(self.images)
+        numbers = numbers.like(np.arange(float(numbers.flat().size)) - numbers.potentials.size)
+        waves = [np.empty((0, len(lines[0]), len(lines[1])))]
+        places, images = [np.empty(0, np.int64)], [np.empty((0, count))]
+        for part, shapes in self.imperfect.shape_parts():
+            products = shapes.products
+            if part.key in self.held or products is None or products.envelope is not None:
+                continue
+            cosines = products.cosines(lines, knots)[:most]
+            rows = np.atleast_2d(part.of(numbers.common, numbers.separate))
+            members = np.ones((1, count)) if part.is_common else np.eye(count)
+            for row, seen in zip(rows, members, strict=True):
+                waves.append(cosines)
+                places.append(row[len(shapes.planes) :][:most].astype(np.int64))
+                images.append(np.tile(seen, (len(cosines), 1)))
+        return BeamCosines(np.concatenate(places), np.concatenate(images), np.concatenate(waves))
+
     def _shots(self, unknowns: Unknowns, counts: list[IntArray] | None) -> Iterator[_Shot]:
         counts = counts or self.ray_counts(unknowns)
         for k, psi in enumerate(self.potentials(unknowns)):
@@ -418,6 +454,18 @@ class Scene(PriorTerms):
         if not isinstance(width, float):
             return _spread(padded, width[::-1, ::-1])
         return padded if imperfect.blur else _spread(padded, width)
+
+
+class BeamCosines(NamedTuple):
+    """Cosines of the change of beams by n numbers, within the image.
+
+    `places` (n,) of the numbers among all values but the potentials, `images` (n, L), 1 where a
+    number acts, and `waves` (n, …), the cosines at the knots.
+    """
+
+    places: IntArray
+    images: FloatArray
+    waves: FloatArray
 
 
 class _Shot(NamedTuple):

@@ -104,6 +104,17 @@ class ProductShapes:
         mixed = self._along(weights, self.modes)
         return np.asarray(squares - 2 * self.means * mixed + self.means**2 * weights.sum())
 
+    def cosines(self, lines: Sequence[FloatArray], at: Sequence[FloatArray]) -> FloatArray:
+        """Return products of cosines along y and x with each pattern at places, shape (k, n, m)."""
+        along_y, along_x = (
+            np.array([line @ np.interp(places, np.arange(len(mode)), mode) for mode in modes])
+            for line, places, modes in zip(lines, at, self.modes, strict=True)
+        )
+        rows, columns = self.places
+        waves = along_y[rows][:, :, None] * along_x[columns][:, None, :]
+        constant = np.multiply.outer(*(line.sum(axis=1) for line in lines))
+        return np.asarray(waves - self.means[:, None, None] * constant)
+
     def coarsen(self, factor: int) -> ProductShapes:
         """Return the patterns in larger pixels."""
         along_y, along_x = (
@@ -316,15 +327,16 @@ class Imperfect:
 
     def shape_changes(self, common: FloatArray, separate: FloatArray) -> FloatArray:
         """Return the sum of the shapes times their numbers."""
-        changes = (each.sum(part.of(common, separate)) for part, each in self._shape_parts())
+        changes = (each.sum(part.of(common, separate)) for part, each in self.shape_parts())
         return np.asarray(sum(changes))
 
     def pull_shapes(self, pull: FloatArray, common: FloatArray, separate: FloatArray) -> None:
         """Add the transpose of `shape_changes` times a pull to derivatives by the numbers."""
-        for part, each in self._shape_parts():
+        for part, each in self.shape_parts():
             part.of(common, separate)[:] += each.pull(pull)
 
-    def _shape_parts(self) -> Iterator[tuple[Part, Shapes]]:
+    def shape_parts(self) -> Iterator[tuple[Part, Shapes]]:
+        """Yield the changes of beams, with the places of their numbers."""
         places = {part.key: part for part in self.parts}
         return ((places[each.key], each) for each in self.shapes if each.key in places)
 

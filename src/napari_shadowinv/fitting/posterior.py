@@ -158,7 +158,7 @@ class Posterior:
         Numbers of the instrument that are held are drawn first; all other unknowns respond to them.
         """
         if tolerance is None:
-            tolerance = _IN_VALLEY if self.scene.has_free_numbers else _CLOSELY
+            tolerance = _IN_VALLEY if self._scales.has_rough_numbers else _CLOSELY
         draws = [self._draw() for _ in range(count)]
         changes = self._changes([slope for _, slope in draws], tolerance)
         return [

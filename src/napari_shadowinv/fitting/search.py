@@ -220,11 +220,15 @@ def estimate_smoothness(
         smoothness = np.tile(FIRST_SMOOTHNESS, (len(smoothness), 1))
     response = scene.imperfect.of_response
     scene = replace(scene, smoothness=smoothness, held=scene.held | response)
-    likely = _with_likely_numbers(scene, end)
-    end = settle_minimum(scene, likely, on_step, is_rough=not is_fixed)
-    if is_fixed and not response:
-        return scene, end
-    if not is_fixed:
+    end = _with_likely_numbers(scene, end)
+    if is_fixed:
+        end = settle_minimum(scene, end, on_step)
+        if not response:
+            return scene, end
+    else:
+        # How rough a field is hardly depends on numbers.
+        free, scene = scene.held, replace(scene, held=scene.imperfect.keys)
+        end = settle_minimum(scene, end, on_step, is_rough=True)
         for _ in range(_ROUNDS):  # towards the likeliest λ and κ
             estimate, change = posterior_of(scene, end, rng, on_step).likely_smoothness()
             smoothness = estimate / smoothness_in_pixels(end.bin)
@@ -232,7 +236,7 @@ def estimate_smoothness(
                 break
             scene = replace(scene, smoothness=smoothness)
             end = settle_minimum(scene, end, on_step, is_rough=True)
-        scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness)
+        scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness, held=free)
     if response and scene.images.size <= _MOST_RECORDED and not is_near:
         # In larger pixels fine structure is lost by which a blur differs from a smooth object.
         end = in_recorded_pixels(scene, end)

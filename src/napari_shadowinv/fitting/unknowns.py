@@ -293,6 +293,15 @@ class Prior(PriorTerms):
         waves = [np.pi * np.arange(n) / (n * KNOT) for n in self.rays.shape]
         return np.asarray(waves[0][:, None] ** 2 + waves[1] ** 2)
 
+    @cached_property
+    def power_seen(self) -> FloatArray:
+        """Power of each cosine of the coefficients that splines and pixels let through."""
+        along_y, along_x = (
+            np.sinc(np.arange(n) / (2 * n)) ** 8 * np.sinc(np.arange(n) / (2 * n * KNOT)) ** 2
+            for n in self.rays.shape
+        )
+        return np.asarray(along_y[:, None] * along_x)
+
     def of_potentials(self) -> FloatArray:
         """Return the approximate penalty of each field's cosines, shape (M, …)."""
         squares = self.wave_numbers
