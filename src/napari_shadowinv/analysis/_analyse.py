@@ -20,6 +20,7 @@ from napari_shadowinv.analysis.result import ProductResult
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, caution_facts, percent
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.inversion.samples import stratified_numbers
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.results import unpack_result
 
@@ -190,8 +191,9 @@ class _Task:
             systematic["pixels"] = self.measure(*finer) - evaluation.value
             systematic |= self._by_product()
         samples = evaluation.samples
-        for error in systematic.values():
-            for sample, strength in zip(samples, _standard_numbers(rng, len(samples)), strict=True):
+        numbers = stratified_numbers(rng, len(samples), len(systematic))
+        for sample, strengths in zip(samples, numbers, strict=True):
+            for strength, error in zip(strengths, systematic.values(), strict=True):
                 sample += strength * error
         doubts = [headline, *caution_facts(evaluation.cautions)]
         start = 0
@@ -233,14 +235,6 @@ class _Task:
             for name, shape in shapes.items()
         ]
         return {"smoothing": np.concatenate(parts)}
-
-
-def _standard_numbers(rng: np.random.Generator, count: int) -> FloatArray:
-    """Return normal numbers of mean 0 and standard deviation 1."""
-    numbers = rng.normal(size=count)
-    if count < 2:
-        return numbers
-    return np.asarray((numbers - numbers.mean()) / numbers.std(ddof=1))
 
 
 def _result(

@@ -10,9 +10,7 @@ the truth may be, and the sample is its mirror image about the inversion. The li
 solved transport to a small change of the image costs one linear system with a matrix that all
 samples share; to solve the transport again costs a few, each with its own. An instrument's
 imperfections are larger than noise, so with them the first 24 linear samples are solved as well,
-and correct the mean, the deviation and the skewness of all (control variates). Each number of an
-imperfection is drawn once from each of as many equal parts of its distribution as there are
-samples.
+and correct the mean, the deviation and the skewness of all (control variates).
 
 References
 ----------
@@ -78,8 +76,6 @@ Result = TypeVar("Result")
 
 _CHECKED, _SOLVED = 3, 3 * WIDTH  # linear samples that are solved, too; with an instrument
 _LINEAR_ENOUGH = 0.3  # of their change
-_SPREAD_ENOUGH = 0.15  # of the size of the changes
-_MEAN_ENOUGH = 0.3  # of the standard deviation
 _MAX_BEAM_RMS = 0.9
 _ENOUGH_FOR_QUANTILES = 40
 _POLL_SECONDS = 0.1
@@ -290,10 +286,9 @@ class Uncertainty(Summarised):
             ``…_std`` for each potential, displacement and field. The method of the samples is a
             JSON text in the attribute ``uncertainty``.
         """
-        samples: tuple[str, ...] = ("n", "noise", "method", "nonlinearity", "tolerance")
-        samples += ("spread_ratio", "mean_shift", "imperfections")
-        samples += ("iterations", "residuals", "converged")
-        values = {name: getattr(self, name) for name in samples}
+        names = "n noise method nonlinearity tolerance spread_ratio mean_shift imperfections "
+        names += "iterations residuals converged"
+        values: dict[str, Any] = {name: getattr(self, name) for name in names.split()}
         values["warnings"] = [asdict(caution) for caution in self.warnings]
         history = json.dumps(values)
         dataset = self.inversion.to_dataset(
@@ -462,7 +457,8 @@ def uncertainty(
     ).to_tolerance_of_noise(seeds[0])
     draws = None if instrument is None else _draws(image, inversion, plan)
     if draws is not None:
-        numbers = stratified_numbers(np.random.default_rng(options.seed), int(n), draws.count)
+        rng = np.random.default_rng([options.seed, *b"instrument"])
+        numbers = stratified_numbers(rng, int(n), draws.count)
         resampling = replace(resampling, instrument=draws, numbers=numbers)
     report = Reporter(on_progress, should_stop)
     image_fields = np.stack([inversion.potential, *inversion.displacement])
@@ -480,10 +476,10 @@ def uncertainty(
     outcomes: list[tuple[int, float, bool]] = []
 
     def solve_samples(seeds: list[Seed], report: Reporter) -> Iterator[FloatArray]:
-        for sample in _in_order(resampling.sample, [[seed] for seed in seeds], workers, report):
-            solution = sample.solution  # large, so not stored
+        blocks = [[seed] for seed in seeds]
+        for fields, solution in _in_order(resampling.sample, blocks, workers, report):
             outcomes.append((solution.iterations, solution.residual, solution.converged))
-            yield sign * (sample.field - image_fields)
+            yield sign * (fields - image_fields)
 
     pairs, of_solved = None, []
     if method == "resolve":
@@ -517,10 +513,9 @@ def uncertainty(
                     of_solved.append(asked(pair.solved, seed))
         scatter = reduce(add, _in_order(response.scatter, _blocks(seeds), workers, report))
     mean, std, of_samples = scatter.mean, scatter.std, _joined(scatter.quantities)
-    check = _LinearCheck()
+    check = {"nonlinearity": 0.0, "spread_ratio": 1.0, "mean_shift": 0.0}
     if pairs is not None:
-        moves = pairs.part(np.s_[1:])
-        check = _LinearCheck(moves.nonlinearity, moves.spread_ratio, moves.mean_shift)
+        check = {name: getattr(pairs.part(np.s_[1:]), name) for name in check}
     if draws is not None and pairs is not None:
         mean, std = mean + pairs.shift, std * pairs.factor
         for name, exact in _joined(of_solved).items():
@@ -528,8 +523,12 @@ def uncertainty(
     mean = image_fields + mean
     std = np.sqrt(std**2 + (by_edge**2).sum(axis=0))
     warnings = inversion.report.warnings
-    if (caution := check.caution(with_instrument=draws is not None)) is not None:
-        warnings = (caution, *warnings)
+    if draws is None and check["nonlinearity"] > _LINEAR_ENOUGH:
+        text = (
+            f"the response to noise is not linear: samples that were solved differ by "
+            f"{check['nonlinearity']:.0%} of what the noise changes; use the method 'resolve'"
+        )
+        warnings = (Caution("samples", text), *warnings)
     iterations, residuals, converged = zip(*outcomes, strict=True)
     if failed := converged.count(False):
         text = (
@@ -548,7 +547,7 @@ def uncertainty(
         n=int(n),
         noise=noise_text,
         method=method,
-        **asdict(check),
+        **check,
         imperfections=names,
         quantities={
             name: Quantity(value, of_samples[name], isinstance(functions[name], Maximum))
@@ -612,34 +611,6 @@ def _draws(image: ArrayLike, inversion: Inversion, plan: SitePlan) -> Instrument
     )
     draws = InstrumentDraws(shot, instrument, beam)
     return draws if draws.names else None
-
-
-@dataclass(frozen=True)
-class _LinearCheck:
-    """Linear samples against the same ones solved."""
-
-    nonlinearity: float = 0.0
-    spread_ratio: float = 1.0
-    mean_shift: float = 0.0
-
-    def caution(self, *, with_instrument: bool) -> Caution | None:
-        """Warn if the linear answer is not enough."""
-        if not with_instrument:
-            text = (
-                f"the response to noise is not linear: samples that were solved differ by "
-                f"{self.nonlinearity:.0%} of what the noise changes; use the method 'resolve'"
-            )
-            return Caution("samples", text) if self.nonlinearity > _LINEAR_ENOUGH else None
-        is_spread = abs(self.spread_ratio - 1) > _SPREAD_ENOUGH
-        if not is_spread and self.mean_shift < _MEAN_ENOUGH:
-            return None
-        text = (
-            "the response to noise and instrument is not linear: samples that were solved scatter "
-            f"{to_figures(self.spread_ratio)} times as far, and their mean differs by "
-            f"{to_figures(self.mean_shift)} of an error bar; the bands are corrected for both, but "
-            "not for a skewed distribution: use the method 'resolve'"
-        )
-        return Caution("samples", text)
 
 
 def _joined(samples: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:

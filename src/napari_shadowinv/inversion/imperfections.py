@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
@@ -106,7 +106,7 @@ class SmoothField:
         squares = along_y**2 @ weights @ (along_x**2).T - means**2
         order = np.argsort(squares, axis=None)[::-1]
         held = np.cumsum(squares.ravel()[order]) / squares.sum()
-        self.count: int = int(np.searchsorted(held, share)) + 1
+        self.count = int(np.searchsorted(held, share)) + 1
         chosen = order[: self.count]
         self.places = np.stack(np.unravel_index(chosen, squares.shape))
         self.means = means.ravel()[chosen]
@@ -121,7 +121,6 @@ class SmoothField:
         return np.asarray(self.size * field)
 
 
-@lru_cache(maxsize=8)
 def _line_modes(size: int, length: float, share: float) -> FloatArray:
     """Return principal components of a random field along a line of pixels, (k, size)."""
     places = np.linspace(0, size - 1, min(size, _MAX_MODE_PLACES))
@@ -305,8 +304,8 @@ def _sharpen(shot: RecordedShot, width: float, numbers: FloatArray) -> RecordedS
     mask = shot.scene.mask
 
     def blurred(values: FloatArray) -> FloatArray:
-        lit = np.where(mask, values, 0.0)
-        return np.asarray(gaussian_filter(lit, width * abs(numbers[0]), mode="nearest"))
+        values = np.where(mask, values, 0.0)
+        return np.asarray(gaussian_filter(values, width * abs(numbers[0]), mode="nearest"))
 
     # 1 / g of a wave that a blur leaves a share g of is 1 + (1 - g) + (1 - g)² + …
     used = np.maximum(blurred(mask.astype(np.float64)), _LEAST_BRIGHTNESS)
@@ -384,7 +383,7 @@ class BeamExcess:
                 ]
             ).reshape(-1, *source.shape)
             self.rest_share = beam.components.rest / beam.rms
-        self.count: int = len(self.shapes) + self.rest.count
+        self.count = len(self.shapes) + self.rest.count
 
     def of(self, numbers: FloatArray) -> FloatArray:
         """Return the difference of `count` numbers, (H, W), whose r.m.s. is about 1."""

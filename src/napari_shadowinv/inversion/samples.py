@@ -15,7 +15,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from operator import add
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -140,13 +139,6 @@ Measure = Callable[[FloatArray, Seed], dict[str, FloatArray]]
 """Returns quantities of a sample's change of potential and displacement, (3, H, W), by its seed."""
 
 
-class Sample(NamedTuple):
-    """One noisy image, inverted."""
-
-    field: FloatArray  # potential and displacement, (3, H, W)
-    solution: LevelSolution
-
-
 @dataclass(frozen=True)
 class FullResampling:
     """Solution of the transport of each sample on a plan's finest level, from start weights."""
@@ -158,8 +150,8 @@ class FullResampling:
     instrument: InstrumentDraws | None = None
     numbers: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # of all samples
 
-    def sample(self, seeds: list[Seed], report: Reporter) -> Sample:
-        """Invert the noisy image of one seed, without caustics and other results."""
+    def sample(self, seeds: list[Seed], report: Reporter) -> tuple[FloatArray, LevelSolution]:
+        """Return potential and displacement of the noisy image of one seed, (3, H, W)."""
         (seed,) = seeds
         plan, image, scale = self._changed(seed)
         solution = solve(
@@ -169,7 +161,7 @@ class FullResampling:
             plan.within(values) for values in read_out(solution, self.options)
         )
         field = np.stack([potential - border_mean(potential), *displacement])
-        return Sample(scale * field, solution)
+        return scale * field, solution
 
     def _changed(self, seed: Seed) -> tuple[SitePlan, FloatArray, float]:
         """Return plan and image of a sample, and the scale of its field."""
@@ -374,10 +366,12 @@ def _curvature(basis: FloatArray, rest: FloatArray) -> FloatArray:
 def stratified_numbers(rng: np.random.Generator, n: int, count: int) -> FloatArray:
     """Return n samples of `count` normal numbers, each with one sample in each n-th of its values.
 
-    One number that moves the whole field is so spread as evenly as many (Latin hypercube).
+    One number that moves the whole field is so spread as evenly as many (Latin hypercube). Each has
+    mean 0 and standard deviation 1.
     """
     strata = rng.permuted(np.tile(np.arange(n), (count, 1)), axis=1).T
-    return np.asarray(ndtri((strata + rng.uniform(size=strata.shape)) / n))
+    numbers = np.asarray(ndtri((strata + rng.uniform(size=strata.shape)) / n))
+    return (numbers - numbers.mean(axis=0)) / numbers.std(axis=0, ddof=1) if n > 1 else numbers
 
 
 @njit(nogil=True, cache=True)
