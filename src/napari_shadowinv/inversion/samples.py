@@ -344,10 +344,7 @@ def correct(samples: FloatArray, solved: FloatArray) -> FloatArray:
     moved *= pairs.factor.astype(kind)
     moved += (middle + pairs.shift).astype(kind)
     bent *= _curvature(bent[head], solved - moved[head]).astype(kind)
-    bent += moved
-    bent -= bent.mean(axis=0)
-    bent *= moved.std(axis=0) / np.maximum(bent.std(axis=0), tiny)
-    bent += moved.mean(axis=0)
+    bent += moved - bent.mean(axis=0)
     for values in (moved, bent):
         samples = np.where(np.isfinite(values), values, samples)
     return samples
