@@ -280,10 +280,12 @@ class Preconditioner:
 
     @property
     def has_rough_numbers(self) -> bool:
-        """Whether numbers of the instrument may change in scales that leave out the fields."""
-        numbers = self._diagonals[0], self._diagonals[3]
-        free = sum(np.count_nonzero(scales) for scales in numbers)
-        return bool(free > len(self._coupled))
+        """Whether numbers of the instrument may change in scales that hardly know the fields.
+
+        Where each image has a beam of its own, fields are replaced nearly altogether.
+        """
+        common, separate = (self._diagonals[place] for place in (0, 3))
+        return bool(separate.any() or np.count_nonzero(common) > len(self._coupled))
 
     @property
     def others(self) -> FloatArray:
