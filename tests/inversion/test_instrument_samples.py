@@ -252,6 +252,13 @@ def test_a_dark_level_above_the_darkest_pixels_leaves_them_dark(image, source):
     assert all(np.isfinite(result.residuals))
 
 
+def test_an_instrument_too_uncertain_for_a_linear_answer_is_reported(image, source):
+    result = sample(image, source, Instrument(background=0.4), n=24)
+    (caution,) = (c for c in result.warnings if c.code == "samples")
+    assert "use the method 'resolve'" in caution.text
+    assert result.nonlinearity > 0.6
+
+
 @pytest.mark.parametrize("kind", ["masked", "free"])
 def test_linear_samples_follow_a_mask_and_a_margin(image, source, kind):
     mask, options = None, OPTIONS

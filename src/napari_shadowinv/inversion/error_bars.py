@@ -75,7 +75,7 @@ if TYPE_CHECKING:
 Result = TypeVar("Result")
 
 _CHECKED, _SOLVED = 3, 3 * WIDTH  # linear samples that are solved, too; with an instrument
-_LINEAR_ENOUGH = 0.3  # of their change
+_LINEAR_ENOUGH, _CORRECTABLE = 0.3, 0.6  # of their change
 _MAX_BEAM_RMS = 0.9
 _ENOUGH_FOR_QUANTILES = 40
 _POLL_SECONDS = 0.1
@@ -523,10 +523,13 @@ def uncertainty(
     mean = image_fields + mean
     std = np.sqrt(std**2 + (by_edge**2).sum(axis=0))
     warnings = inversion.report.warnings
-    if draws is None and check["nonlinearity"] > _LINEAR_ENOUGH:
+    # With an instrument, samples are corrected for what is not linear, as far as that is small.
+    limit = _LINEAR_ENOUGH if draws is None else _CORRECTABLE
+    if check["nonlinearity"] > limit:
+        cause = "noise" if draws is None else "noise and instrument"
         text = (
-            f"the response to noise is not linear: samples that were solved differ by "
-            f"{check['nonlinearity']:.0%} of what the noise changes; use the method 'resolve'"
+            f"the response to {cause} is not linear: samples that were solved differ by "
+            f"{check['nonlinearity']:.0%} of what these change; use the method 'resolve'"
         )
         warnings = (Caution("samples", text), *warnings)
     iterations, residuals, converged = zip(*outcomes, strict=True)
