@@ -25,19 +25,10 @@ Arrays are ``[y, x]``, vectors in axis order (y, x), a pixel's centre is at its 
 index, and lengths are object-plane pixels unless a setup makes them SI.
 """
 
-from typing import Any
-
 import lazy_loader
 
 __version__ = "0.1.0"
 
 # Names are imported when they are first used: numba and scipy take a second to load.
-_import_name, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
+__getattr__, __dir__, _names = lazy_loader.attach_stub(__name__, __file__)
 __all__ = [*_names, "__version__"]
-
-
-def __getattr__(name: str) -> Any:
-    from napari_shadowinv._system.machine import paused_collector
-
-    with paused_collector():
-        return _import_name(name)

@@ -1,6 +1,5 @@
 """The command `shadowinv`, also as ``python -m napari_shadowinv``."""
 
-import gc
 import os
 import signal
 import sys
@@ -12,11 +11,8 @@ def main() -> None:
     heeds_ctrl_c = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heeds_ctrl_c:
         signal.signal(signal.SIGINT, _cancel)
-    gc.disable()  # what is being loaded stays, so searching it for garbage takes time in vain
     from napari_shadowinv.cli import app
 
-    gc.freeze()
-    gc.enable()
     try:
         app()
     finally:

@@ -1,13 +1,12 @@
 """Memory, threads and signals.
 
-- `physical_memory`, `available_threads`, `set_default_threads`, `paused_collector`
+- `physical_memory`, `available_threads`, `set_default_threads`
 - `in_ranges`, `run_together`, `results_of`, `begin`, `Crew`: work in threads
 - Ctrl-C, SIGTERM and SIGHUP: `defer_interrupts`, `clear_up_when_terminated`, `handling`
 """
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 import threading
@@ -55,26 +54,6 @@ def _group_limits() -> Iterator[int]:
         for folder in (root, *(root / part for part in (group, *group.parents))):
             with suppress(OSError, ValueError):
                 yield int((folder / file).read_text())  # "max" for none
-
-
-@contextmanager
-def paused_collector() -> Iterator[None]:
-    """Pause the garbage collector while modules and kernels are loaded.
-
-    All that is loaded stays, so searching it for garbage takes time in vain.
-    """
-    if not gc.isenabled():
-        yield
-        return
-    gc.disable()
-    try:
-        yield
-    finally:
-        if not gc.get_freeze_count():
-            # Objects that are frozen and thawed are old: the next short searches skip them.
-            gc.freeze()
-            gc.unfreeze()
-        gc.enable()
 
 
 _default_threads: int | None = None

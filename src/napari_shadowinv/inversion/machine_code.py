@@ -15,21 +15,21 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from napari_shadowinv._system.machine import available_threads, paused_collector
+from napari_shadowinv._system.machine import available_threads
 
 _REST = "from napari_shadowinv.inversion.compilation import compile_rest; compile_rest()"
 
 
 @contextmanager
 def loading_kernels() -> Iterator[None]:
-    """Load kernels where this process has none, without the garbage collector.
+    """Load kernels where this process has none.
 
     Where none are cached, another process compiles those that this one needs last.
     """
     if is_loaded():
         yield
         return
-    with paused_collector(), _compiling_together():
+    with _compiling_together():
         yield
 
 
