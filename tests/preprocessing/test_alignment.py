@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from helpers.shifted_pair import shifted_pair
 from napari_shadowinv import InputError, Instrument, invert
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import opposite_pair, paper_setup, toroid
 from napari_shadowinv.preprocessing import measure_shift, move, register_source
 
 SIDE = 96
@@ -43,6 +43,14 @@ def test_noise_shows_no_shift():
     assert measure_shift(image, np.ones(image.shape)).error.min() > 100
     with pytest.raises(InputError, match=r"source has shape \(120, 149\), the image \(120, 150\)"):
         measure_shift(image, source[:, 1:])
+
+
+def test_an_object_at_the_borders_does_not_move_a_uniform_source():
+    image = synthetic_image(opposite_pair((200, 200), paper_setup()).displacement)
+    for seed in range(15):
+        noise = 0.003 * np.random.default_rng(seed).normal(size=(2, 200, 200))
+        shift = measure_shift(image + noise[0], 1 + noise[1] / 3)
+        assert not shift.is_significant.any()
 
 
 @pytest.mark.parametrize("peak", [97.0, 194.0])

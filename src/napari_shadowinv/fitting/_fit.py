@@ -91,7 +91,6 @@ _SPACING_OF_SAMPLES = 1 / 3  # px
 _CHECKED = 2  # samples of an instrument that are solved, too
 # Before a field has been found, they would take its place.
 _HELD_IN_SEARCH = frozenset({"gamma", "blur", "other_field"})
-_HELD_WITH_SOURCE = frozenset({"beam", "beam_between"})
 
 
 def fit(
@@ -200,8 +199,9 @@ def fit(
     # One image cannot tell the instrument from the object: its numbers stay at 0.
     alone = replace(EXACT, shapes=scene.imperfect.shapes[:1]) if data.unknown else EXACT
     with measure_time("starts", seconds):
-        known = frozenset() if data.unknown else _HELD_WITH_SOURCE
-        rough = replace(scene, held=_HELD_IN_SEARCH | known)
+        # A common beam comes after the field, where there is a source for it.
+        common = set() if data.unknown else {"beam"}
+        rough = replace(scene, held=_HELD_IN_SEARCH | common)
         if data.single:
             rough = replace(scene, imperfect=alone)
         minima = search(rough, collect_starts(data, on_step, should_stop), on_step)

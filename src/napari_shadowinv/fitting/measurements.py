@@ -422,11 +422,14 @@ def smooth_references(
         return beams, np.zeros(len(beams))
     excess = (images - best) / deviations
     details = excess - _surroundings(excess, used)
-    left = [
-        (NORMAL_MAD * np.median(np.abs(plane[where]))) ** 2 - estimated_noise(whole, use) ** 2
-        for plane, where, whole, use in zip(details, calm, excess, used, strict=True)
-    ]
-    return best, np.sqrt(np.maximum(left, 0.0))
+    left = np.array(
+        [
+            (NORMAL_MAD * np.median(np.abs(plane[where]))) ** 2 - estimated_noise(whole, use) ** 2
+            for plane, where, whole, use in zip(details, calm, excess, used, strict=True)
+        ]
+    )
+    is_certain = left > 5 / np.sqrt(calm.sum(axis=(1, 2)))
+    return best, np.sqrt(np.where(is_certain, left, 0.0))
 
 
 def _surroundings(planes: FloatArray, used: BoolArray) -> FloatArray:

@@ -226,8 +226,9 @@ def estimate_smoothness(
         if not response:
             return scene, end
     else:
-        # How rough a field is hardly depends on numbers.
-        free, scene = scene.held, replace(scene, held=scene.imperfect.keys)
+        # How rough a field is hardly depends on numbers that all images share.
+        shared = {part.key for part in scene.imperfect.parts if part.is_common}
+        free, scene = scene.held, replace(scene, held=scene.held | shared)
         end = settle_minimum(scene, end, on_step, is_rough=True)
         for _ in range(_ROUNDS):  # towards the likeliest λ and κ
             estimate, change = posterior_of(scene, end, rng, on_step).likely_smoothness()

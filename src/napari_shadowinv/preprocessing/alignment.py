@@ -215,15 +215,17 @@ def _coarse_shift(shot: FloatArray, source: FloatArray, usable: BoolArray) -> Fl
         shot, source, reference_mask=border, moving_mask=border, overlap_ratio=_MIN_OVERLAP
     )
 
-    def misfit(shift: FloatArray) -> float:
-        moved = ndimage.shift(source, shift, order=1)
-        both = border & ndimage.shift(border, shift, order=0, cval=False)
-        difference = shot[both] / shot[both].mean() - moved[both] / moved[both].mean()
+    shift = np.asarray(found, dtype=np.float64)
+    both = border & ndimage.shift(border, shift, order=0, cval=False)
+
+    def misfit(beam: FloatArray, where: BoolArray) -> float:
+        difference = shot[where] / shot[where].mean() - beam[where] / beam[where].mean()
         return float(np.median(np.abs(difference)))
 
-    shift = np.asarray(found, dtype=np.float64)
-    fits = misfit(shift) < _COARSE_MISFIT * misfit(np.zeros(2))
-    return block * shift if fits else np.zeros(2)
+    # Where they overlap, a beam without structure must not fit as well.
+    moved = misfit(ndimage.shift(source, shift, order=1), both)
+    unmoved = min(misfit(source, border), misfit(np.ones_like(source), both))
+    return block * shift if moved < _COARSE_MISFIT * unmoved else np.zeros(2)
 
 
 Step = tuple[FloatArray, FloatArray]
