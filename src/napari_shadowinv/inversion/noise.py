@@ -378,7 +378,7 @@ def measure_correlation(
     noise = max(alike, key=lambda noise: noise.white_variance)
     # Beyond its width V of blurred noise is constant, and that of structure still rises.
     far = noise.white + noise.blurred * float(_blurred_shares(lags[-1:], noise.width)[0])
-    is_bound = noise.is_bound or least > _MAX_MISFIT or variances[-1] > _MAX_FAR_EXCESS * far
+    is_bound = noise.is_bound or least > _MAX_MISFIT or float(variances[-1]) > _MAX_FAR_EXCESS * far
     return replace(noise, is_bound=is_bound)
 
 
