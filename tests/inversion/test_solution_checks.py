@@ -321,7 +321,7 @@ def test_what_lies_beyond_the_edge_is_in_the_total(name, boundary):
     inversion = invert(image, source=np.ones(image.shape), options=options)
     true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
     error = float(np.sqrt(((inversion.displacement - true) ** 2).sum(axis=0).mean()))
-    assert inversion.verdict is Verdict.EDGE
+    assert inversion.verdict in (Verdict.EDGE, Verdict.UNCERTAIN)  # of a jet little
     assert error < 3 * inversion.errors.total.rms
     assert set(sides.split()) <= set(inversion.errors.sides)
     assert ("on all sides" in inversion.headline.text) == (len(inversion.errors.sides) == 4)

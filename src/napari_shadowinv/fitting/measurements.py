@@ -12,10 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import gaussian_filter, uniform_filter
+from scipy.ndimage import uniform_filter
 
 from napari_shadowinv._system.arrays import (
-    NORMAL_MAD,
     SQUARE_PIXELS,
     as_numbers,
     check_usable,
@@ -31,6 +30,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import Around, imperfect_instrument
 from napari_shadowinv.fitting.rays import RayModel
+from napari_shadowinv.fitting.references import estimated_noise, smooth_references
 from napari_shadowinv.fitting.shots import (
     Images,
     NearField,
@@ -40,7 +40,7 @@ from napari_shadowinv.fitting.shots import (
     value_of_first,
 )
 from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
-from napari_shadowinv.inversion.noise import finest_differences, measure_correlation
+from napari_shadowinv.inversion.noise import measure_correlation
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
@@ -65,7 +65,6 @@ _LARGEST_NOISE = 1e6  # of the beam, of the least noisy pixel
 _LEAST_COUNTS = 1.0
 _TOO_LARGE = 2.5  # times the variance that is measured
 _HIDDEN_TIMES = 9.0  # the same
-_SURROUNDINGS_PX = 4.0, 4.0  # beyond the correlation of noise
 _SMOOTHED = 5  # px, over which images are averaged for the standard deviation of their noise
 _DARKEST = 1e-3  # of an image's mean
 _SAME = _ALIKE = 1e-6
@@ -109,7 +108,7 @@ class FitData:
     start: FloatArray | None  # potential in px² of the first field
     near: NearField | None  # the only start, if there is one
     noise: NoiseMatch
-    reference_noise: FloatArray  # (L,), standard deviation of what is left of it in the beams
+    reference_noise: FloatArray  # (L,), standard deviation of the beams' own, as far as it is left
 
     def noise_of(self, weights: FloatArray) -> FloatArray:
         """Return the standard deviation of each image's noise, or of each pixel's if it varies.
@@ -191,19 +190,19 @@ def collect_data(
     # Differences of image and beam contain the noise of both.
     deviations = _deviations(noise, data - recorded if noise is None else data, used)
     floors = _LEAST_NOISE * _means(recorded, used)[:, None, None]
-    beams, left = smooth_references(recorded, data, np.maximum(deviations, floors), used)
+    beams, remaining = smooth_references(recorded, data, np.maximum(deviations, floors), used)
     shapes = [beam / beam.mean() for beam in beams]
     units = _means(beams, used)
     _refuse_other_units(_means(data, used) / units, names)
     _refuse_what_is_given_twice(data, recorded, used, matrix, names)
     unknown = isinstance(source, str)
     scaled = np.where(used, data / units[:, None, None], 0.0)
-    left = left[:, None, None] * deviations
+    remaining = remaining[:, None, None] * deviations
     if noise is None:
         deviations = _deviations(None, data - beams, used)
-    elif not left.any():
-        left += np.array(list(map(estimated_noise, beams, used)))[:, None, None]
-    deviations = np.hypot(deviations, left) / units[:, None, None]
+    elif not remaining.any():
+        remaining += np.array(list(map(estimated_noise, beams, used)))[:, None, None]
+    deviations = np.hypot(deviations, remaining) / units[:, None, None]
     _refuse_hopeless_noise(deviations, used, names)
     match = match_noise(
         deviations,
@@ -296,7 +295,7 @@ def collect_data(
         start=_checked_start(near.potential if near else start, (height, width)),
         near=near,
         noise=match,
-        reference_noise=np.median(left, axis=(1, 2)),
+        reference_noise=np.median(remaining, axis=(1, 2)),
     )
 
 
@@ -359,82 +358,6 @@ def strengths_of(
             for setup in setups
         ]
     )
-
-
-def estimated_noise(image: FloatArray, used: BoolArray) -> float:
-    """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
-    all_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
-    return float(NORMAL_MAD * np.median(finest_differences(image, all_used)))
-
-
-def smooth_references(
-    beams: FloatArray,
-    images: FloatArray,
-    deviations: FloatArray,
-    used: BoolArray,
-    widths: Sequence[float] = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0),
-    calm_share: float = 0.25,
-    least_gain: float = 10.0,
-) -> tuple[FloatArray, FloatArray]:
-    """Blur recorded beams as much as their structure allows, which leaves less of their noise.
-
-    A fit would use that noise: a beam that is moved by half a pixel is an average of pixels, with
-    less noise, so that such displacements explain images best, true or not.
-
-    Parameters
-    ----------
-    beams, images, deviations : ndarray, shape (L, H, W)
-        The last are about the standard deviations of the images' noise.
-    used : ndarray of bool, shape (L, H, W)
-        Pixels that can be used.
-    widths : sequence of float
-        Standard deviations of the Gaussians that are tried, px. The one whose beams are nearest to
-        the images is taken, as these have noise of their own.
-    calm_share : float
-        Share of the pixels that are compared: those where image and beam differ least on average.
-    least_gain : float
-        By how much the sum of the squared normalised differences must fall.
-
-    Returns
-    -------
-    blurred : ndarray, shape (L, H, W)
-    left : ndarray, shape (L,)
-        Standard deviation of what differences of neighbouring pixels of image and blurred beam do
-        not show of the beam's error, in units of `deviations`; 0 where the beams were not blurred.
-    """
-    inside = used.any(axis=0).astype(np.float64)
-    excess = (images - beams) / deviations
-    contrast = _surroundings(_surroundings(excess, used) ** 2, used)
-    levels = [
-        np.quantile(plane[use], calm_share) for plane, use in zip(contrast, used, strict=True)
-    ]
-    calm = used & (contrast <= np.array(levels)[:, None, None])
-    best, least = None, float((excess[calm] ** 2).sum()) - least_gain
-    for width in widths:
-        around = (0, width, width)
-        reach = np.maximum(gaussian_filter(inside, width, mode="nearest"), 1e-9)
-        blurred = gaussian_filter(beams * inside, around, mode="nearest") / reach
-        trial = np.where(inside > 0, blurred, beams)
-        squares = float((((images - trial) / deviations)[calm] ** 2).sum())
-        if squares < least:
-            best, least = trial, squares
-    if best is None:
-        return beams, np.zeros(len(beams))
-    excess = (images - best) / deviations
-    details = excess - _surroundings(excess, used)
-    left = np.array(
-        [
-            (NORMAL_MAD * np.median(np.abs(plane[where]))) ** 2 - estimated_noise(whole, use) ** 2
-            for plane, where, whole, use in zip(details, calm, excess, used, strict=True)
-        ]
-    )
-    is_certain = left > 5 / np.sqrt(calm.sum(axis=(1, 2)))
-    return best, np.sqrt(np.where(is_certain, left, 0.0))
-
-
-def _surroundings(planes: FloatArray, used: BoolArray) -> FloatArray:
-    """Means around each pixel, over more than noise is correlated."""
-    return np.asarray(gaussian_filter(np.where(used, planes, 0.0), (0, *_SURROUNDINGS_PX)))
 
 
 @dataclass(frozen=True)

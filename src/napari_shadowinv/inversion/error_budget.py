@@ -70,7 +70,7 @@ class Errors:
         Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`, and of the
         instrument's imperfections.
     edge : ErrorEstimate
-        Effect of what may lie beyond the image's edge, with what the other errors add to it.
+        Effect of an object beyond the image's edge, with the share of the other errors there.
     sides : tuple of str
         Sides of the image near which the edge matters most: 'top', 'bottom', 'left', 'right'.
     beam : ErrorEstimate or None
@@ -92,7 +92,7 @@ class Errors:
         recorded source, which is of another exposure, 'stated' by the user, 'seen' as a
         difference of image and source outside the object, 'references' for a prior from them,
         'outside' for a source estimated from the image outside the object, with its variance,
-        'filtered' for what filters take from an object in an exact beam.
+        'filtered' for the share of an object that filters take, in an exact beam.
     noise_correlation : float
         Standard deviation of the Gaussian blur with the measured correlation of the noise, px; 0
         for white noise.
@@ -148,12 +148,12 @@ class Errors:
         parts = {noise: self.noise, "discretisation": self.discretisation, **self.effects}
         if self.beam is not None:
             parts[self._beam_name] = self.beam
-        known = {name: error for name, error in parts.items() if not math.isnan(error.rms)}
+        finite = {name: error for name, error in parts.items() if not math.isnan(error.rms)}
         # Other errors move the field at the edge, too: only what exceeds them is the object's.
-        excess = np.array(self.edge) ** 2 - (np.array(list(known.values())) ** 2).sum(axis=0)
+        excess = np.array(self.edge) ** 2 - (np.array(list(finite.values())) ** 2).sum(axis=0)
         if excess[0] > 0:
-            known["edge"] = root_of(*np.maximum(excess, 0.0))
-        return dict(sorted(known.items(), key=lambda part: -part[1].rms))
+            finite["edge"] = root_of(*np.maximum(excess, 0.0))
+        return dict(sorted(finite.items(), key=lambda part: -part[1].rms))
 
     @property
     def _beam_name(self) -> str:
@@ -205,13 +205,13 @@ class Errors:
 
     @property
     def _measured(self) -> Errors:
-        """The budget without what was assumed of the beam."""
+        """The budget without the parts whose sizes were assumed."""
         effects = {name: error for name, error in self.effects.items() if name != self.assumed}
         beam = None if self.beam_basis in _UNMEASURED else self.beam
         return replace(self, beam=beam, effects=effects, assumed="")
 
     def beam_condition(self, share: float) -> BeamCondition | None:
-        """Return the condition on what was assumed of the beam; None if it takes more than that.
+        """Return the condition on the assumed parts; None if a small total takes more than that.
 
         Parameters
         ----------
@@ -225,21 +225,22 @@ class Errors:
             sizes.append(("%", 100 * self.beam_variation, self.beam))
         if shift := self.effects.get(self.assumed):
             sizes.append(("px", self.sizes[self.assumed], shift))
-        rest = self._measured.total
+        measured = self._measured.total
         return BeamCondition.within(
             share,
-            (rest.rms / self.rms, rest.at_peak / self.peak),
+            (measured.rms / self.rms, measured.at_peak / self.peak),
             [(unit, n, e.rms / self.rms, e.at_peak / self.peak) for unit, n, e in sizes],
             recorded=bool(shift) or self.beam_basis == "reference",
         )
 
     def measured_text(self, subject: str) -> str:
-        """Return the errors by what was measured, and the largest one if it was assumed."""
-        measured, largest = self._measured, self.largest_part
+        """Return the measured errors, and the largest one if it was assumed."""
+        measured = self._measured
         if measured.parts.keys() - self.parts.keys():  # an edge that the beam explains
             measured = self
         text = f"errors of {measured.share_text} of the {subject} (r.m.s.): {measured.largest_part}"
-        return text if largest == measured.largest_part else f"{text}, and {largest}"
+        is_same = next(iter(measured.parts)) == next(iter(self.parts))
+        return text if is_same else f"{text}, and {self.largest_part}"
 
     def measure_next(self, share: float) -> str:
         """Return what has to be known better for a total of at most `share`, and that total.
@@ -355,12 +356,12 @@ class Errors:
         return [*rows, ("beam", by_beam), ("instrument", by_instrument)]
 
     def edge_caution(self, max_error: float) -> Caution | None:
-        """Warn if what lies beyond the edge moves the field by more than `max_error` of it."""
+        """Warn if an object beyond the edge may move the field by more than `max_error` of it."""
         edge = self.parts.get("edge")
         if edge is None or not self.rms > 0:
             return None
-        others = math.sqrt(max(self.total.rms**2 - edge.rms**2, 0.0)) / self.rms
-        text = edge_doubt(edge.rms / self.rms, others, max_error, self.sides)
+        elsewhere = math.sqrt(max(self.total.rms**2 - edge.rms**2, 0.0)) / self.rms
+        text = edge_doubt(edge.rms / self.rms, elsewhere, max_error, self.sides)
         return Caution("edge", text) if text else None
 
     def beam_caution(self) -> Caution | None:

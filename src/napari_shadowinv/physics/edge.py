@@ -1,6 +1,6 @@
 """Errors of a field by the unseen: objects beyond the edge of its image.
 
-- changes of a field by what may lie there: `edge_changes`
+- changes of a field by objects there: `edge_changes`
 - the sides of the image that they come from: `edge_sides`, in words `edge_doubt`
 
 An image fixes the divergence of the displacement inside it, but not the flux that crosses its edge.
@@ -25,7 +25,7 @@ SIDES = ("top", "bottom", "left", "right")
 def edge_changes(
     potential: FloatArray, displacement: FloatArray, spacing: float = 1.0
 ) -> FloatArray:
-    """Independent changes of a field, of one standard deviation each, by what lies beyond its edge.
+    """Independent changes of a field, of one standard deviation each, by objects beyond its edge.
 
     Opposite assumptions are made of it. The first lets no flux cross the edge, as if the object
     went on as its mirror image; the others make the potential constant along one edge, or the mean

@@ -1,0 +1,90 @@
+"""Beams that were recorded for a fit: `smooth_references`; noise in images: `estimated_noise`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv._system.arrays import NORMAL_MAD
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.inversion.noise import finest_differences
+
+_SURROUNDINGS_PX = 4.0, 4.0  # beyond the correlation of noise
+
+
+def estimated_noise(image: FloatArray, used: BoolArray) -> float:
+    """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
+    all_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
+    return float(NORMAL_MAD * np.median(finest_differences(image, all_used)))
+
+
+def smooth_references(
+    beams: FloatArray,
+    images: FloatArray,
+    deviations: FloatArray,
+    used: BoolArray,
+    widths: Sequence[float] = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0),
+    calm_share: float = 0.25,
+    least_gain: float = 10.0,
+) -> tuple[FloatArray, FloatArray]:
+    """Blur recorded beams as much as their structure allows, which leaves less of their noise.
+
+    A fit would use that noise: a beam that is moved by half a pixel is an average of pixels, with
+    less noise, so that such displacements explain images best, true or not.
+
+    Parameters
+    ----------
+    beams, images, deviations : ndarray, shape (L, H, W)
+        The last are about the standard deviations of the images' noise.
+    used : ndarray of bool, shape (L, H, W)
+        Pixels that can be used.
+    widths : sequence of float
+        Standard deviations of the Gaussians that are tried, px. The one whose beams are nearest to
+        the images is taken, as these have noise of their own.
+    calm_share : float
+        Share of the pixels that are compared: those where image and beam differ least on average.
+    least_gain : float
+        By how much the sum of the squared normalised differences must fall.
+
+    Returns
+    -------
+    blurred : ndarray, shape (L, H, W)
+    remaining : ndarray, shape (L,)
+        Standard deviation of the beams' errors beyond differences of neighbouring pixels of image
+        and blurred beam, in units of `deviations`; 0 where the beams were not blurred.
+    """
+    inside = used.any(axis=0).astype(np.float64)
+    excess = (images - beams) / deviations
+    contrast = _surroundings(_surroundings(excess, used) ** 2, used)
+    levels = [
+        np.quantile(plane[use], calm_share) for plane, use in zip(contrast, used, strict=True)
+    ]
+    calm = used & (contrast <= np.array(levels)[:, None, None])
+    best, least = None, float((excess[calm] ** 2).sum()) - least_gain
+    for width in widths:
+        around = (0, width, width)
+        reach = np.maximum(gaussian_filter(inside, width, mode="nearest"), 1e-9)
+        blurred = gaussian_filter(beams * inside, around, mode="nearest") / reach
+        trial = np.where(inside > 0, blurred, beams)
+        squares = float((((images - trial) / deviations)[calm] ** 2).sum())
+        if squares < least:
+            best, least = trial, squares
+    if best is None:
+        return beams, np.zeros(len(beams))
+    excess = (images - best) / deviations
+    details = excess - _surroundings(excess, used)
+    remaining = np.array(
+        [
+            (NORMAL_MAD * np.median(np.abs(plane[where]))) ** 2 - estimated_noise(whole, use) ** 2
+            for plane, where, whole, use in zip(details, calm, excess, used, strict=True)
+        ]
+    )
+    is_certain = remaining > 5 / np.sqrt(calm.sum(axis=(1, 2)))
+    return best, np.sqrt(np.where(is_certain, remaining, 0.0))
+
+
+def _surroundings(planes: FloatArray, used: BoolArray) -> FloatArray:
+    """Means around each pixel, over more than noise is correlated."""
+    return np.asarray(gaussian_filter(np.where(used, planes, 0.0), (0, *_SURROUNDINGS_PX)))
