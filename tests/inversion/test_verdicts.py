@@ -51,6 +51,16 @@ def test_measure_next_of_noise_is_an_average(image):
     assert errors.measure_next(1.1 * errors.share) == ""
 
 
+def test_an_edge_that_the_assumed_beam_partly_explains_is_named_once(make_inversion):
+    """The error at the edge counts what exceeds the others, with what was assumed among them."""
+    solved = make_inversion((48, 64))
+    edge = ErrorEstimate(0.5 * solved.errors.rms, 0.0)
+    beam = ErrorEstimate(0.3 * solved.errors.rms, 0.0)
+    quiet = dict.fromkeys(("noise", "discretisation"), ErrorEstimate(0.0, 0.0))
+    errors = dataclasses.replace(solved.errors, edge=edge, beam=beam, effects={}, **quiet)
+    assert errors.measured_text("field") == "errors of 50 % of the field (r.m.s.): edge 40 %"
+
+
 def test_the_total_against_the_largest_error_decides_the_verdict(image):
     inversion = invert(image, options=FEW, instrument={"beam_rms": 0.001})
     share = inversion.errors.share

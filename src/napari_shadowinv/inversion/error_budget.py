@@ -236,7 +236,7 @@ class Errors:
     def measured_text(self, subject: str) -> str:
         """Return the measured errors, and the largest one if it was assumed."""
         measured = self._measured
-        if measured.parts.keys() - self.parts.keys():  # an edge that the beam explains
+        if measured.parts.get("edge") != self.parts.get("edge"):  # the beam explains some of it
             measured = self
         text = f"errors of {measured.share_text} of the {subject} (r.m.s.): {measured.largest_part}"
         is_same = next(iter(measured.parts)) == next(iter(self.parts))
