@@ -53,7 +53,7 @@ def test_invert_makes_the_layers_of_the_default_inversion(
     field = proton_setup.path_integrated_b(invert(shot).displacement)
     data, keywords = by_role["field"]
     np.testing.assert_allclose(data, 1e6 * np.hypot(*field), rtol=1e-9)
-    assert keywords["name"] == "? |∫B×dz| (µT·m) – shot"
+    assert keywords["name"] == "± |∫B×dz| (µT·m) – shot"
     assert keywords["translate"] == (30.0, 60.0)
     assert keywords["scale"] == (1.5, 1.5)
 
@@ -257,7 +257,7 @@ def test_from_the_menu_an_inversion_brings_its_layers_and_the_scale_bar(
     add_shot(window, shot, proton_setup)
     in_loop(registered("invert_uniform"))
     qtbot.waitUntil(lambda: len(window.layers) == 5, timeout=120_000)
-    assert window.layers.selection.active.name == "? |∫B×dz| (µT·m) – shot"
+    assert window.layers.selection.active.name == "± |∫B×dz| (µT·m) – shot"
     overlays = getattr(getattr(window, "canvas", None), "overlays", window)  # napari before 0.9
     assert overlays.scale_bar.visible
 
