@@ -181,8 +181,6 @@ def first_windows() -> None:
     bar = invert_shot.area.verticalScrollBar()
     bar.setValue(bar.maximum() - 15)  # begin with a whole row
     photograph(viewer, "tutorial-first-field.png", close=False)
-    invert_shot.instrument.set_values({"beam_rms": 0.0, "registration": 0.0})
-    press_run(invert_shot)
     show_only(viewer, "residual (% of mean)")
     viewer.layers.selection.active = viewer.layers["✓ residual (% of mean) – toroid"]
     photograph(viewer, "tutorial-first-residual.png", close=False)
