@@ -99,11 +99,11 @@ def test_batch_writes_and_reports_shots(night, folder):
     assert provenance.image.source.file == "reference.npy"
     assert "line_integrated_density" in dataset
     reports = StackStore(Path("n.shadowinv.zarr")).reports()
-    noise = np.median([report["errors"]["noise"][0] for report in reports])
+    total = np.median([report["total_error"] for report in reports])
     status = flat(shadowinv("status", "n.shadowinv.zarr").output)
     for text in flat(result.output), status:
         assert "100; as requested" in text
-        assert f"noise {noise:.2g} px" in text
+        assert f"errors {100 * total:.2g} % of the displacement (r.m.s., median" in text
 
 
 def test_shots_that_fail_are_named_and_the_exit_code_is_one(night, folder):

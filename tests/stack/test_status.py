@@ -33,7 +33,7 @@ def test_text_names_the_numbers_above_zero(status, text):
 def test_status_counts_shots_of_earlier_runs(make_night, out):
     night = make_night(4)
     np.save(night.path(1), 0 * night.images[1])
-    few = InversionOptions(n_sites=30)  # too few sites for the image: a warning
+    few = InversionOptions(n_sites=8)  # too few sites for the image: a warning
     exact = Instrument(beam_rms=0)  # so that the warnings are about the field
     events: list[RunStatus] = []
     night.run(out, options=few, instrument=exact, on_progress=events.append)

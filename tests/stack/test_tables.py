@@ -303,7 +303,7 @@ def test_the_command_inverts_a_table(pack: Path, out: Path) -> None:
     assert shadowinv(*arguments, "--quiet").exit_code == 0
     assert "energies 5, 14.7, 30 MeV" in flat(shadowinv("status", out).stdout)
     listed = shadowinv("status", out, "--all").stdout.splitlines()
-    assert [line.split()[4] for line in listed if "film" in line] == ["5", "14.7", "30"]
+    assert [line.split()[2] for line in listed if "film" in line] == ["5", "14.7", "30"]
     assert shadowinv("export", out, "--format", "pradformat", "--out", "h5").exit_code == 0
     for index, energy in enumerate(ENERGIES):
         exported = read(Path(f"h5/{index:04d}_film{index}.h5"))
