@@ -83,7 +83,7 @@ def on_films(truth: Truth, doses, plane: Callable[[int], np.ndarray], layer: int
 
 def test_doses_print_a_few_lines_with_a_picture(doses) -> None:
     lines = repr(doses).splitlines()
-    assert lines[1] == doses.headline.text
+    assert lines[1] == str(doses.headline)
     assert len(lines) <= 6
     assert "<img" in doses._repr_html_()
 

@@ -313,7 +313,7 @@ def test_the_verdict_of_a_fit_is_on_top_in_its_colour(make_fit: MakeFit) -> None
         (line,) = [
             text
             for text in fit_figure(fit, title="Shot").texts
-            if text.get_text().startswith(fit.verdict.upper())
+            if text.get_text().startswith(fit.verdict.capitalize())
         ]
         assert fit.explanation in line.get_text()
         colours.append(line.get_color())
