@@ -54,7 +54,7 @@ SHAPE = (48, 64)
 LENGTHS = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2, "pixel_size": 1.5e-6}
 ENERGIES = (14.7, 6.0)
 SETUPS = tuple(ProtonSetup(energy=energy, **LENGTHS) for energy in ENERGIES)
-TRUTH = gaussian_blob(SHAPE, 20.0, 8.0, (22.0, 35.0)).displacement
+TRUTH = gaussian_blob(SHAPE, 17.5, 7.0, (22.0, 35.0)).displacement  # ends inside the image
 BEAM, GAIN, PSF = 1, 2, 3
 QUICK = {"samples": 0, "max_iterations": 5, "spacing": 0.25, "smoothness": 5.0}
 MIDDLE = np.s_[2:42, 11:59]  # of an image, with the whole object
