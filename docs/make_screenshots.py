@@ -275,7 +275,7 @@ def series_window() -> None:
 
 def fit_window() -> None:
     """Two films of one toroid: the widget, its verdict and the field."""
-    viewer = new_window("two energies", height=840)
+    viewer = new_window("two energies", height=860)
     setup = paper_setup()
     truth = toroid((96, 96), setup, 90.0, 16e-6).displacement
     for seed, energy in enumerate((14.7, 30.0)):
