@@ -123,7 +123,7 @@ def test_two_energies_have_the_numbers_of_their_page(tmp_path, monkeypatch, caps
     (setup,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
     Path("setup.toml").write_text(setup, encoding="utf-8")
     (line,) = re.findall(r"^    shadowinv (.*)$", page, re.MULTILINE)
-    result = CliRunner().invoke(app, shlex.split(line), env={"COLUMNS": "200"})
+    result = CliRunner().invoke(app, shlex.split(line), env={"COLUMNS": "300"})
     assert result.exit_code == 0, result.output
     rows = [" ".join(row.split()) for row in result.output.splitlines()]
     expected_rows = [" ".join(row.split()) for row in printed_by_command.splitlines()]
