@@ -585,7 +585,7 @@ def test_fields_are_compared_and_the_likeliest_is_written() -> None:
         "--noise",
         20,
         "--samples",
-        0,
+        2,
         "--max-iterations",
         5,
         "--spacing",
