@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import subprocess
 import sys
@@ -19,7 +18,6 @@ from napari_shadowinv._system.machine import (
     available_threads,
     begin,
     in_ranges,
-    paused_collector,
     physical_memory,
     results_of,
 )
@@ -176,36 +174,3 @@ def test_memory_is_that_of_the_control_group(
         limit.write_text(text)
         if installed is not None:
             assert memory() == (expected or installed)
-
-
-def test_a_paused_collector_works_again_afterwards_and_holds_nothing_back():
-    gc.enable()  # other tests may have ended a command before it was loaded
-    gc.unfreeze()
-    with paused_collector():
-        assert not gc.isenabled()
-        with paused_collector():  # in another thread, say
-            pass
-        assert not gc.isenabled()
-    assert gc.isenabled()
-    assert gc.get_freeze_count() == 0
-    with pytest.raises(KeyError), paused_collector():
-        raise KeyError
-    assert gc.isenabled()
-
-
-def test_a_paused_collector_leaves_what_its_caller_froze():
-    gc.freeze()
-    try:
-        frozen = gc.get_freeze_count()
-        with paused_collector():
-            pass
-        assert 0 < gc.get_freeze_count() <= frozen
-    finally:
-        gc.unfreeze()
-    gc.disable()
-    try:
-        with paused_collector():
-            pass
-        assert not gc.isenabled()
-    finally:
-        gc.enable()
