@@ -199,8 +199,8 @@ def fit(
     # One image cannot tell the instrument from the object: its numbers stay at 0.
     alone = replace(EXACT, shapes=scene.imperfect.shapes[:1]) if data.unknown else EXACT
     with measure_time("starts", seconds):
-        # A common beam comes after the field, where there is a source for it.
-        common = set() if data.unknown else {"beam"}
+        # A common beam comes after the field, where a source was recorded.
+        common = set() if data.unknown or data.assumed else {"beam"}
         rough = replace(scene, held=_HELD_IN_SEARCH | common)
         if data.single:
             rough = replace(scene, imperfect=alone)
