@@ -149,23 +149,25 @@ def _split_blocks(
 
 
 def _check_no_coordinates(path: Path, image: FloatArray) -> None:
-    """Refuse a table whose first column or row counts, or that lists x, y and value."""
-    for name, table in (("column", image), ("row", image.T)):
+    """Refuse a table whose outer column or row counts, or that lists x, y and value."""
+    sides = {"first column": image, "first row": image.T}
+    sides |= {"last column": image[:, ::-1], "last row": image[::-1].T}
+    for name, table in sides.items():
         # The first number may belong to the other axis.
         if _is_axis(table[1:, 0]) and not _is_axis(table[1:, 1]):
             raise FileFormatError(
-                f"{path} has coordinates or numbers of pixels in its first {name} "
+                f"{path} has coordinates or numbers of pixels in its {name} "
                 f"({', '.join(f'{number:g}' for number in table[1:4, 0])}, …): expected pixels "
-                f"only; delete this {name}, "
+                f"only; delete this {name.split()[1]}, "
                 "or export the image as a matrix without axes"
             )
     height, width = image.shape
     if width in (3, 4) and height >= _MIN_TRIPLETS:
-        sides = [np.unique(image[:, column]).size for column in (0, 1)]
-        if math.prod(sides) == height and min(sides) > 1:
+        counts = [np.unique(image[:, column]).size for column in (0, 1)]
+        if math.prod(counts) == height and min(counts) > 1:
             raise FileFormatError(
-                f"{path} lists coordinates and values of {sides[0]} × {sides[1]} pixels in columns:"
-                " expected one row of pixels per line; export the image as a matrix"
+                f"{path} lists coordinates and values of {counts[0]} × {counts[1]} pixels in "
+                "columns: expected one row of pixels per line; export the image as a matrix"
             )
 
 
