@@ -17,8 +17,9 @@ from napari_shadowinv.fitting.measurements import (
     collect_data,
     strengths_of,
 )
-from napari_shadowinv.fitting.references import estimated_noise, smooth_references
+from napari_shadowinv.fitting.references import smooth_references
 from napari_shadowinv.fitting.shots import FitShot, point_spread
+from napari_shadowinv.inversion.noise import estimated_noise
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.preprocessing import Radiograph

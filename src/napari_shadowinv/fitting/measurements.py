@@ -30,7 +30,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import Around, imperfect_instrument
 from napari_shadowinv.fitting.rays import RayModel
-from napari_shadowinv.fitting.references import estimated_noise, smooth_references
+from napari_shadowinv.fitting.references import smooth_references
 from napari_shadowinv.fitting.shots import (
     Images,
     NearField,
@@ -40,7 +40,7 @@ from napari_shadowinv.fitting.shots import (
     value_of_first,
 )
 from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
-from napari_shadowinv.inversion.noise import measure_correlation
+from napari_shadowinv.inversion.noise import estimated_noise, measure_correlation
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
@@ -187,40 +187,15 @@ def collect_data(
     if free_brightness:
         factors = _means(data, used) / _means(recorded, used)
     recorded = factors[:, None, None] * recorded
-    # Differences of image and beam contain the noise of both.
-    deviations = _deviations(noise, data - recorded if noise is None else data, used)
-    floors = _LEAST_NOISE * _means(recorded, used)[:, None, None]
-    beams, remaining = smooth_references(recorded, data, np.maximum(deviations, floors), used)
+    _refuse_other_units(_means(data, used) / _means(recorded, used), names)
+    _refuse_what_is_given_twice(data, recorded, used, matrix, names)
+    beams, deviations, match, remaining = _relative_noise(
+        data, recorded, used, noise, instrument, names
+    )
     shapes = [beam / beam.mean() for beam in beams]
     units = _means(beams, used)
-    _refuse_other_units(_means(data, used) / units, names)
-    _refuse_what_is_given_twice(data, recorded, used, matrix, names)
     unknown = isinstance(source, str)
     scaled = np.where(used, data / units[:, None, None], 0.0)
-    remaining = remaining[:, None, None] * deviations
-    if noise is None:
-        deviations = _deviations(None, data - beams, used)
-    elif not remaining.any():
-        remaining += np.array(list(map(estimated_noise, beams, used)))[:, None, None]
-    deviations = np.hypot(deviations, remaining) / units[:, None, None]
-    _refuse_hopeless_noise(deviations, used, names)
-    match = match_noise(
-        deviations,
-        (data - beams) / units[:, None, None],
-        data / units[:, None, None],
-        used,
-        instrument.noise_correlation,
-        is_estimated=noise is None or (isinstance(noise, str) and noise == "proportional"),
-    )
-    # On long waves, beams are as noisy as they were recorded.
-    before, after = (
-        np.array([estimated_noise(*pair) for pair in zip(data - each, used, strict=True)])
-        for each in (recorded, beams)
-    )
-    pixels = match.factors * np.median(deviations**2, axis=(1, 2))
-    more = np.maximum(before**2 - after**2, 0.0) / units**2
-    match = match.with_long_waves(more / pixels)
-    deviations = deviations * np.sqrt(match.factors)[:, None, None]
     weights = np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0)
 
     free = options.boundary == "free"
@@ -295,8 +270,53 @@ def collect_data(
         start=_checked_start(near.potential if near else start, (height, width)),
         near=near,
         noise=match,
-        reference_noise=np.median(remaining, axis=(1, 2)),
+        reference_noise=remaining,
     )
+
+
+def _relative_noise(
+    data: FloatArray,
+    recorded: FloatArray,
+    used: BoolArray,
+    noise: Any,
+    instrument: Instrument,
+    names: Sequence[str],
+) -> tuple[FloatArray, FloatArray, NoiseMatch, FloatArray]:
+    """Return beams that are blurred as far as they may be, and the noise of images less beams.
+
+    The standard deviations are those of pixels in units of the beams; the last are of what is
+    left in a pixel of each beam, as recorded.
+    """
+    # Differences of image and beam contain the noise of both.
+    deviations = _deviations(noise, data - recorded if noise is None else data, used)
+    floors = _LEAST_NOISE * _means(recorded, used)[:, None, None]
+    beams, shares = smooth_references(recorded, data, np.maximum(deviations, floors), used)
+    remaining = shares[:, None, None] * deviations
+    if noise is None:
+        deviations = _deviations(None, data - beams, used)
+    elif not remaining.any():
+        remaining += np.array(list(map(estimated_noise, beams, used)))[:, None, None]
+    units = _means(beams, used)[:, None, None]
+    deviations = np.hypot(deviations, remaining) / units
+    _refuse_hopeless_noise(deviations, used, names)
+    match = match_noise(
+        deviations,
+        (data - beams) / units,
+        data / units,
+        used,
+        instrument.noise_correlation,
+        is_estimated=noise is None or (isinstance(noise, str) and noise == "proportional"),
+    )
+    # On long waves, beams are as noisy as they were recorded.
+    before, after = (
+        np.array(list(map(estimated_noise, (data - each) / units, used)))
+        for each in (recorded, beams)
+    )
+    more = np.maximum(before**2 - after**2, 0.0)
+    pixels = match.factors * np.median(deviations**2, axis=(1, 2))
+    match = match.with_long_waves(more / pixels)
+    deviations = deviations * np.sqrt(match.factors)[:, None, None]
+    return beams, deviations, match, np.median(remaining, axis=(1, 2))
 
 
 def strengths_of(

@@ -1,4 +1,4 @@
-"""Beams that were recorded for a fit: `smooth_references`; noise in images: `estimated_noise`."""
+"""Beams that were recorded for a fit, without the noise that rays would carry along."""
 
 from __future__ import annotations
 
@@ -9,15 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._system.arrays import NORMAL_MAD
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.inversion.noise import finest_differences
-
-_SURROUNDINGS_PX = 4.0, 4.0  # beyond the correlation of noise
-
-
-def estimated_noise(image: FloatArray, used: BoolArray) -> float:
-    """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
-    all_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
-    return float(NORMAL_MAD * np.median(finest_differences(image, all_used)))
+from napari_shadowinv.inversion.noise import estimated_noise
 
 
 def smooth_references(
@@ -28,6 +20,7 @@ def smooth_references(
     widths: Sequence[float] = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0),
     calm_share: float = 0.25,
     least_gain: float = 10.0,
+    least_certain: float = 5.0,
 ) -> tuple[FloatArray, FloatArray]:
     """Blur recorded beams as much as their structure allows, which leaves less of their noise.
 
@@ -47,6 +40,8 @@ def smooth_references(
         Share of the pixels that are compared: those where image and beam differ least on average.
     least_gain : float
         By how much the sum of the squared normalised differences must fall.
+    least_certain : float
+        Least error that is not chance, of the variance, times the root of the number of pixels.
 
     Returns
     -------
@@ -81,10 +76,10 @@ def smooth_references(
             for plane, where, whole, use in zip(details, calm, excess, used, strict=True)
         ]
     )
-    is_certain = remaining > 5 / np.sqrt(calm.sum(axis=(1, 2)))
+    is_certain = remaining > least_certain / np.sqrt(calm.sum(axis=(1, 2)))
     return best, np.sqrt(np.where(is_certain, remaining, 0.0))
 
 
-def _surroundings(planes: FloatArray, used: BoolArray) -> FloatArray:
+def _surroundings(planes: FloatArray, used: BoolArray, width: float = 4.0) -> FloatArray:
     """Means around each pixel, over more than noise is correlated."""
-    return np.asarray(gaussian_filter(np.where(used, planes, 0.0), (0, *_SURROUNDINGS_PX)))
+    return np.asarray(gaussian_filter(np.where(used, planes, 0.0), (0, width, width)))

@@ -41,15 +41,10 @@ from napari_shadowinv.inversion.solution_checks import (
     is_coarse,
     mark_caustics,
 )
-from napari_shadowinv.options import (
-    DEFAULT_REGISTRATION,
-    MAX_DEFAULT_SITES,
-    Instrument,
-    InversionOptions,
-)
+from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOptions
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
-from napari_shadowinv.preprocessing.alignment import register_source
+from napari_shadowinv.preprocessing.alignment import RegisteredSource, register_source
 from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_warnings
 from napari_shadowinv.transport.sites import RATIO, Levels, Margin, SitePlan, edge_flux, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
@@ -268,16 +263,12 @@ def invert(
         if unlit and plan is not None:
             plan, start = _plan(plan.source, options, mask, plan.measured), None
         prepared = prepare(image, source, options, mask)
-        moved: Caution | None = None
-        is_shift_assumed = False
+        registered = RegisteredSource(prepared.source, 0.0)
         if measured:
-            recorded = prepared.source
-            source, error, moved = register_source(
-                prepared.image, recorded, prepared.mask, instrument
-            )
-            is_shift_assumed = instrument.registration is None and error == DEFAULT_REGISTRATION
-            instrument = instrument.with_registration(error)
-            if source is not recorded:
+            registered = register_source(prepared.image, prepared.source, prepared.mask, instrument)
+            instrument = instrument.with_registration(registered.error)
+            source, is_moved = registered.source, registered.source is not prepared.source
+            if is_moved:
                 plan = start = None
                 prepared = prepare(image, source, options, mask)
         report("prepare", 1, 1)
@@ -316,7 +307,7 @@ def invert(
 
         noise = begin(estimate_noise, options.threads)
         budget = Budget(
-            plan, prepared, noise, options, instrument, is_shift_assumed=is_shift_assumed
+            plan, prepared, noise, options, instrument, is_shift_assumed=registered.is_assumed
         )
         if not options.is_adaptive and not levels.is_complete:
             levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
@@ -367,7 +358,14 @@ def invert(
         why = "with the most sites placed unless more are given"
         by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
     with measure_time("prepare", seconds):
-        warnings = *by_errors, moved, *unlit, *quality.warnings, *by_accuracy, *begin_checks()()
+        warnings = (
+            *by_errors,
+            registered.caution,
+            *unlit,
+            *quality.warnings,
+            *by_accuracy,
+            *begin_checks()(),
+        )
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,

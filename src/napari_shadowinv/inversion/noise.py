@@ -290,6 +290,12 @@ def finest_differences(values: FloatArray, used: BoolArray) -> FloatArray:
     return finest.ravel() if used.all() else finest[used]
 
 
+def estimated_noise(image: FloatArray, used: BoolArray) -> float:
+    """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
+    all_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
+    return float(NORMAL_MAD * np.median(finest_differences(image, all_used)))
+
+
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 

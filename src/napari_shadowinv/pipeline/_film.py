@@ -43,7 +43,7 @@ from napari_shadowinv.film import (
 from napari_shadowinv.film.registration import EDGE_ERROR_PX
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.film_doses import FilmDoses
-from napari_shadowinv.fitting.references import estimated_noise
+from napari_shadowinv.inversion.noise import estimated_noise
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.images import INCH_M, Scan, read_scan
 from napari_shadowinv.pipeline.inversion_run import picture_mask

@@ -101,11 +101,14 @@ class RegisteredSource(NamedTuple):
         Standard deviation of the shift that is left, px.
     caution : Caution or None
         If the source was moved further than was expected.
+    is_assumed : bool
+        Whether the error is the usual one, as nobody stated it and nothing shows the shift.
     """
 
     source: FloatArray
     error: float
-    caution: Caution | None
+    caution: Caution | None = None
+    is_assumed: bool = False
 
 
 def register_source(
@@ -118,14 +121,15 @@ def register_source(
     beam = instrument.beam_of(measured=True, source=source)
     expected = DEFAULT_REGISTRATION if instrument.registration is None else instrument.registration
     if not expected or not np.ptp(source[usable]) > 0:
-        return RegisteredSource(source, 0.0, None)
+        return RegisteredSource(source, 0.0)
     shift = measure_shift(image, source, usable, beam)
     error = shift.left(expected)
     if not shift.is_significant.any():
-        return RegisteredSource(source, error, None)
+        is_assumed = instrument.registration is None and error == expected
+        return RegisteredSource(source, error, is_assumed=is_assumed)
     moved = np.where(usable, move(source, shift.significant), 0.0)
     if np.abs(shift.significant).max() < _SIGNIFICANT_ERRORS * expected:
-        return RegisteredSource(moved, error, None)
+        return RegisteredSource(moved, error)
     text = (
         f"register: the source was moved by {shift.text} to fit the image; what is left of the "
         "shift is in the error. State a registration of 0 if both are on the same pixels"
