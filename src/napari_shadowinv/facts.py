@@ -31,9 +31,6 @@ from napari_shadowinv.cautions import Caution
 _MIN_PLAIN, _MAX_PLAIN = 1e-3, 1e5  # other numbers have a power of ten
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-WITH_WARNINGS = ", with warnings"
-"""Behind a verdict in the title of a headline, whose level is then that of its warnings."""
-
 _MAX_LINES, _LINE_LETTERS = 5, 160  # of a summary, below its title
 _PICTURE_PX = 256
 _SHOWN_PERCENTILES = 0.5, 99.5
@@ -233,7 +230,7 @@ class Headline:
         """The one word for trust: the verdict, or else the level."""
         if self.verdict is None or self.level is Level.FAILED:
             return self.level.value
-        return self.verdict + WITH_WARNINGS * (self.level is not self.verdict.level)
+        return self.verdict + ", with warnings" * (self.level is not self.verdict.level)
 
     def __str__(self) -> str:
         return f"{self.title.capitalize()}: {self.text}"

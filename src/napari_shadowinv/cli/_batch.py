@@ -223,9 +223,9 @@ def _recipe_rows(store: StackStore) -> Rows:
     origins = map(Provenance.of, store.reports())
     sources = [origin.image.source for origin in origins if origin is not None]
     files = list(dict.fromkeys(source.file for source in sources if source and source.file))
-    rows = [("source", _list_text(files) or source or str(store.attributes["source_image"]))]
+    rows: Rows = [("source", _list_text(files) or source or str(store.attributes["source_image"]))]
     steps = () if provenance is None else provenance.recipe.steps
-    return rows + [("step", step.summary) for step in steps]
+    return [*rows, *(("step", step.summary) for step in steps)]
 
 
 def _beam_rows(store: StackStore) -> Rows:
@@ -246,7 +246,7 @@ def _site_rows(store: StackStore) -> Rows:
     least, most = f"{counts[0]:,}", f"{counts[-1]:,}"
     reasons = dict.fromkeys(report.get("sites_reason") or "as requested" for report in reports)
     reason = next(iter(reasons)) if len(reasons) == 1 else "for different reasons"
-    rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
+    rows: Rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
     if totals := [total for report in reports if (total := report.get("total_error"))]:
         median = percent(float(np.median(totals)))
         rows.append(("errors", f"{median} of the displacement (r.m.s., median of the shots)"))
@@ -309,11 +309,9 @@ def _verdict_rows(store: StackStore) -> Rows:
         return []
     shots = {Verdict.DETERMINED.value: [], **shots}
     listed = [f"{len(shots[each])} {each}" for each in shots if _is_success(each)]
-    return [("verdicts", ", ".join(listed))] + [
-        ("warning", f"{len(names)} {verdict}: {_list_text(names)}")
-        for verdict, names in shots.items()
-        if not _is_success(verdict)
-    ]
+    doubtful = {verdict: names for verdict, names in shots.items() if not _is_success(verdict)}
+    warnings = (f"{len(n)} {verdict}: {_list_text(n)}" for verdict, n in doubtful.items())
+    return [("verdicts", ", ".join(listed)), *(("warning", text) for text in warnings)]
 
 
 @as_file_errors

@@ -84,7 +84,7 @@ def _provenance_rows(provenance: Provenance) -> _summary.Rows:
     steps = [("step", step.summary) for step in provenance.recipe.steps]
     fit = provenance.recipe.fit
     choices = {} if fit is None else fit.model_dump(exclude_none=True, exclude={"options"})
-    rows = [*steps, ("fit", _summary.options_text(choices))]
+    rows: _summary.Rows = [*steps, ("fit", _summary.options_text(choices))]
     for number, image in enumerate(provenance.images, 1):
         masks = map(provenance.mask_of, (image.mask, image.source_mask))
         origins = [("image", image), ("source", image.source)]

@@ -51,7 +51,7 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     if is_stack(path):
         return store_rows(StackStore(path))
     if variable is None and is_field_grid(path):
-        return describe_field_grid(path)
+        return [*describe_field_grid(path)]
     frames = find_frames(path, variable)
     if len(frames) > 1:
         return _frame_rows(read(path, variable=variable), frames[0].variable)
@@ -84,7 +84,9 @@ def _picture_rows(path: Path, form: Format) -> _summary.Rows:
     array, metadata = form.read(path)
     found = film_warnings(array, None) if array.ndim == 2 else ()
     warnings = (*found, *metadata.get("warnings", ()))
-    rows = [("kind", f"{form.name.upper()} picture, {metadata['bits']} bits per sample")]
+    rows: _summary.Rows = [
+        ("kind", f"{form.name.upper()} picture, {metadata['bits']} bits per sample")
+    ]
     if array.ndim == 3:
         advice = "convert a film scan to dose, or choose one with --channel"
         rows.append(("channels", f"{array.shape[-1]}: {advice}"))
@@ -132,7 +134,7 @@ def _array_rows(array: AnyArray, dtype: str = "") -> _summary.Rows:
     values = array.astype(np.float64)
     finite = values[np.isfinite(values)]
     shape = f"{array.shape}, [y, x]" if array.ndim == 2 else str(array.shape)
-    rows = [("shape", shape), ("dtype", dtype or str(array.dtype))]
+    rows: _summary.Rows = [("shape", shape), ("dtype", dtype or str(array.dtype))]
     if finite.size:
         rows.append(("min, mean, max", f"{finite.min():g}, {finite.mean():g}, {finite.max():g}"))
     rows.append(("negative", f"{np.count_nonzero(finite < 0)} values"))

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from napari_shadowinv.preprocessing import Radiograph
     from napari_shadowinv.provenance import Provenance
 
-Rows = list[tuple[str, str]]
+Rows = list[tuple[str, ...]]
+"""Name, value, and the level of trust of a headline."""
 
 _STYLES = {
     "warning": "yellow",
@@ -36,21 +37,17 @@ def two_columns(title: str, rows: Rows) -> Table:
     from rich import box
     from rich.table import Table
 
-    from napari_shadowinv.facts import WITH_WARNINGS, Verdict
-
-    levels = {verdict.value: verdict.level.value for verdict in Verdict}
     table = Table(title=plain(title), title_justify="left", box=box.SIMPLE, show_header=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
-    for name, value in rows:
-        level = levels.get(name, "doubtful" if name.endswith(WITH_WARNINGS) else name)
-        table.add_row(plain(name), plain(value, _STYLES.get(level, "")))
+    for name, value, *level in rows:
+        table.add_row(plain(name), plain(value, _STYLES.get(level[0] if level else name, "")))
     return table
 
 
-def headline_row(headline: Headline) -> tuple[str, str]:
+def headline_row(headline: Headline) -> tuple[str, str, str]:
     """Return the headline of a result; the name of the row is its title."""
-    return (headline.title, headline.text)
+    return (headline.title, headline.text, headline.level.value)
 
 
 def provenance_rows(provenance: Provenance | None) -> Rows:
@@ -63,7 +60,7 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
         origin = source.file or "an array"
     else:
         origin = "uniform" if estimate is None else estimate.summary
-    rows = [*[("prepared", note) for note in image.notes], ("source", origin)]
+    rows: Rows = [*[("prepared", note) for note in image.notes], ("source", origin)]
     for name, index in (("mask", image.mask), ("source mask", image.source_mask)):
         if (mask := provenance.mask_of(index)) is not None:
             rows.append((name, mask.file or "drawn"))

@@ -286,9 +286,10 @@ class Uncertainty(Summarised):
             ``…_std`` for each potential, displacement and field. The method of the samples is a
             JSON text in the attribute ``uncertainty``.
         """
-        names = "n noise method nonlinearity tolerance spread_ratio mean_shift imperfections "
-        names += "iterations residuals converged"
-        values: dict[str, Any] = {name: getattr(self, name) for name in names.split()}
+        names: tuple[str, ...] = ("n", "noise", "method", "nonlinearity", "tolerance")
+        names += ("spread_ratio", "mean_shift", "imperfections")
+        names += ("iterations", "residuals", "converged")
+        values: dict[str, Any] = {name: getattr(self, name) for name in names}
         values["warnings"] = [asdict(caution) for caution in self.warnings]
         history = json.dumps(values)
         dataset = self.inversion.to_dataset(
