@@ -102,7 +102,7 @@ def test_a_wider_beam_starts_as_the_narrower_one() -> None:
     wide = replace(imperfect, shapes=(replace(imperfect.shapes[0], key="beam"),), background=0.1)
     adapted = wide.adapt(unknowns, imperfect)
     before, after = (
-        each.shape_changes(numbers.common, numbers.separate[0])
+        each.shape_changes(numbers.common, numbers.separate)
         for each, numbers in ((imperfect, unknowns), (wide, adapted))
     )
     np.testing.assert_allclose(after, before)

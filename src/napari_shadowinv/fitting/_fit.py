@@ -430,15 +430,16 @@ def _find_openness(
 
 def collect_starts(data: FitData, on_step: Any, should_stop: ShouldStop | None) -> list[Start]:
     """Return the starting points: no field, a field that is known, and inversions by transport."""
-    scene = data.scene
+    # A beam that is about uniform comes after the field.
+    scene, held = data.scene, data.assumed
     candidates = []
     if data.near is not None:
         return [Start("near field", ((2, 1.0),), data.start)]
     if data.start is not None:
-        candidates.append(Start("given", ((2, 1.0),), data.start))
+        candidates.append(Start("given", ((2, 1.0),), data.start, held))
     if not data.single:
-        candidates.append(Start("from far", _FROM_FAR))
-    candidates.append(Start("from near", _FROM_NEAR))
+        candidates.append(Start("from far", _FROM_FAR, beam_held=held))
+    candidates.append(Start("from near", _FROM_NEAR, beam_held=held))
     if data.unknown and not data.single:
         candidates.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
     if scene.strengths.shape[1] > 1 or data.unknown:
@@ -451,7 +452,7 @@ def collect_starts(data: FitData, on_step: Any, should_stop: ShouldStop | None) 
         return candidates
     potential = gaussian_filter(transported, _ROUNDED) / scene.strengths[weakest, 0]
     if not data.single:
-        return [*candidates, Start("transport", ((2, 2.0), (2, 1.0)), potential)]
+        return [*candidates, Start("transport", ((2, 2.0), (2, 1.0)), potential, held)]
     return candidates + [
         Start(f"{share:g} × transport", _FROM_FIELD, share * potential)
         for share in _SHARES_OF_TRANSPORT

@@ -15,12 +15,14 @@ from collections import deque
 from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._system.arrays import block_sums, complete_block_means
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.forward import Linear, Scene
@@ -148,6 +150,19 @@ _MOST_PIXELS = 2_000_000  # of all images
 _SCALE, _TRANSPOSE = "nmyx,nyx->myx", "nmyx,myx->nyx"  # sums over the fields of scales
 
 
+class _Coupling(NamedTuple):
+    """The coupling of the `long` waves of potentials and numbers of the beams, at `places`.
+
+    With M the scaled Hessian between both, and D that of these numbers, all other blocks being the
+    identity: M as a `table` (n, M, …) and a `root` of (D - MᵀM)⁻¹.
+    """
+
+    long: tuple[Any, ...]
+    places: IntArray
+    table: FloatArray
+    root: FloatArray
+
+
 class Preconditioner:
     """Scales in which the Hessian is about the identity: Sᵀ H S ≈ 1.
 
@@ -184,42 +199,42 @@ class Preconditioner:
         added = [block.scales(scene.weights) for block in scene.added]
         common, separate = scene.number_scales()
         self._diagonals = [common, brightness, frames, separate, *added]
-        self._couple(scene, weights, laplacian)
+        self._scene, self._weights, self._laplacian = scene, weights, laplacian
 
-    def _couple(self, scene: Scene, weights: FloatArray, laplacian: FloatArray) -> None:
-        """Count in that weak fields can replace beams.
-
-        With M the scaled Hessian between long waves of the potentials and numbers of the beams, and
-        D that of these numbers, all other blocks being the identity: M and a root of (D - MᵀM)⁻¹.
-        `weights` (L, …) are those of each image's cosines.
-        """
+    @cached_property
+    def _coupling(self) -> _Coupling:
+        """How weak fields can replace beams."""
+        scene, weights, laplacian = self._scene, self._weights, self._laplacian
         beams = scene.beam_cosines()
         scales, count = self.others[beams.places], beams.waves.shape[1:]
         long = np.s_[..., : count[0], : count[1]]
         own = np.diag(np.where(scales > 0, scales**2, 1.0))
         pulls = np.zeros((len(scales), scene.strengths.shape[1], *count))
-        for root, strengths, seen in zip(
-            np.sqrt(weights[long]), scene.strengths, beams.images.T, strict=True
-        ):
-            waves = (scales * seen)[:, None, None] * root * beams.waves
+        # Images whose beams have the same numbers are counted together.
+        groups: dict[bytes, list[int]] = {}
+        for k, seen in enumerate(beams.images.T):
+            groups.setdefault(seen.tobytes(), []).append(k)
+        for group in groups.values():
+            waves = (scales * beams.images[:, group[0]])[:, None, None] * beams.waves
+            of_fields = np.einsum("lm,lyx->myx", scene.strengths[group], weights[long][group])
+            pulls += of_fields * (laplacian[long] * waves)[:, None]
+            waves *= np.sqrt(weights[long][group].sum(axis=0))
             own += np.einsum("qyx,pyx->qp", waves, waves)
-            pulls += strengths[:, None, None] * (root * laplacian[long] * waves)[:, None]
         table = np.einsum("nmyx,qmyx->qnyx", self._potentials[long], pulls)
         own -= np.einsum("qmyx,pmyx->qp", table, table)
-        self._long, self._coupled, self._table = long, beams.places, table
-        self._root = np.linalg.inv(np.linalg.cholesky(own)).T
+        return _Coupling(long, beams.places, table, np.linalg.inv(np.linalg.cholesky(own)).T)
 
     def _turn(self, waves: FloatArray, others: FloatArray) -> None:
         """Turn scaled values in place: with the beams move the fields that replace them."""
-        numbers = np.einsum("qp,p->q", self._root, others[self._coupled])
-        others[self._coupled] = numbers
-        waves[self._long] -= np.einsum("q,qmyx->myx", numbers, self._table)
+        long, places, table, root = self._coupling
+        others[places] = numbers = np.einsum("qp,p->q", root, others[places])
+        waves[long] -= np.einsum("q,qmyx->myx", numbers, table)
 
     def _turn_back(self, waves: FloatArray, others: FloatArray) -> None:
         """Apply the transpose of `_turn` in place."""
-        moved = np.einsum("qmyx,myx->q", self._table, waves[self._long])
-        numbers = others[self._coupled] - moved
-        others[self._coupled] = np.einsum("qp,q->p", self._root, numbers)
+        long, places, table, root = self._coupling
+        numbers = others[places] - np.einsum("qmyx,myx->q", table, waves[long])
+        others[places] = np.einsum("qp,q->p", root, numbers)
 
     def held(self) -> Preconditioner:
         """Return scales in which the numbers of an instrument do not change."""
@@ -227,8 +242,8 @@ class Preconditioner:
         scales._diagonals = [scale.copy() for scale in self._diagonals]
         scales._diagonals[0][:] = 0
         scales._diagonals[3][:] = 0
-        scales._coupled = scales._coupled[:0]
-        scales._root, scales._table = scales._root[:0, :0], scales._table[:0]
+        long, places, table, root = self._coupling
+        scales._coupling = _Coupling(long, places[:0], table[:0], root[:0, :0])
         return scales
 
     def damp(self, unknowns: Unknowns) -> Unknowns:
@@ -285,7 +300,7 @@ class Preconditioner:
         Where each image has a beam of its own, fields are replaced nearly altogether.
         """
         common, separate = (self._diagonals[place] for place in (0, 3))
-        return bool(separate.any() or np.count_nonzero(common) > len(self._coupled))
+        return bool(separate.any() or np.count_nonzero(common) > len(self._coupling.places))
 
     @property
     def others(self) -> FloatArray:
@@ -300,7 +315,7 @@ class Preconditioner:
 
     def log_size(self) -> float:
         """Return log |det S| plus about half the log-determinant of the prior."""
-        scales = np.append(self.others, np.diag(self._root))
+        scales = np.append(self.others, np.diag(self._coupling.root))
         return -self.log_ratio + float(np.log(scales[scales > 0]).sum())
 
 

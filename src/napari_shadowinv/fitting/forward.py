@@ -149,8 +149,9 @@ class Scene(PriorTerms):
     def beam(self, unknowns: Unknowns) -> FloatArray:
         """Return the beam of each image within it, without brightness, shape (L, H, W)."""
         height, width = self.rays.size
-        beams = np.stack([self._light(unknowns, k) for k in range(len(self.beams))])
-        return np.asarray(beams[:, self.pad : self.pad + height, self.pad : self.pad + width])
+        return np.asarray(
+            self._lights(unknowns)[:, self.pad : self.pad + height, self.pad : self.pad + width]
+        )
 
     def chi2(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> FloatArray:
         """Return the mean of ((f - I) / σ)² over each image's used pixels, shape (L,)."""
@@ -195,9 +196,11 @@ class Scene(PriorTerms):
             self._add_light_pulls(slope, k, scaled)
             seen.effects.add_pulls(slope, k, scaled)
             self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
-            if self.imperfect.changes_beam:
-                self._add_beam_pulls(slope, k, pulls.beam, self._entering(unknowns, k))
             slope.frames[k] += pulls.frame
+        if self._frees_light:
+            of_beams = [pulls.beam for *_, pulls in differentiated]
+            entering = self._entering(unknowns, [shot.traced.beam for shot in shots])
+            self._add_beam_pulls(slope, of_beams, entering)
         return value, self._only_free(slope)
 
     def _pulls(
@@ -211,7 +214,7 @@ class Scene(PriorTerms):
         of_rays = self.rays.gradient(
             shot.traced,
             self._spread_back(k, seen.slope * scaled, unknowns),
-            of_beam=self.imperfect.changes_beam,
+            of_beam=self._frees_light,
             of_frame=k > 0 and bool(self.free_frames.any()),
         )
         value = float(np.einsum("yx,yx", residual, residual)) / 2
@@ -240,10 +243,13 @@ class Scene(PriorTerms):
             changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.brightness[k]) * bare
         return changes
 
-    def linear(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> Linear:
-        """Return the scene to first order around unknowns."""
+    def linear(
+        self, unknowns: Unknowns, counts: list[IntArray] | None = None, *, of_held: bool = False
+    ) -> Linear:
+        """Return the scene to first order around unknowns; by light that is held only if asked."""
         shots = list(self._shots(unknowns, counts))
-        of_beam, of_frame = self.imperfect.changes_beam, bool(self.free_frames.any())
+        of_beam = self._frees_light or (of_held and bool(self.imperfect.shapes))
+        of_frame = bool(self.free_frames.any())
 
         def differentiate(shot: _Shot) -> csr_array:
             of_its_frame = shot.number > 0 and of_frame
@@ -266,6 +272,12 @@ class Scene(PriorTerms):
     def has_free_numbers(self) -> bool:
         """Whether numbers of the instrument may change."""
         return bool(self.imperfect.keys - self.held)
+
+    @property
+    def _frees_light(self) -> bool:
+        """Whether the light that enters may change, or depends on the detector."""
+        shapes = any(part.key not in self.held for part, _ in self.imperfect.shape_parts())
+        return shapes or bool(self.imperfect.gamma or self.imperfect.background)
 
     def response_units(self) -> list[Unknowns]:
         """Return a change by each number on which the response to fields depends: by 1."""
@@ -353,15 +365,18 @@ class Scene(PriorTerms):
 
     def _shots(self, unknowns: Unknowns, counts: list[IntArray] | None) -> Iterator[_Shot]:
         counts = counts or self.ray_counts(unknowns)
+        lights = self._lights(unknowns)
         for k, psi in enumerate(self.potentials(unknowns)):
-            beam = self._light(unknowns, k)
-            yield _Shot(k, TracedBeam(psi, counts[k], beam, unknowns.frames[k]))
+            yield _Shot(k, TracedBeam(psi, counts[k], lights[k], unknowns.frames[k]))
 
-    def _light(self, unknowns: Unknowns, k: int) -> FloatArray:
-        """The light that enters for an image."""
-        numbers = unknowns.common, unknowns.separate[k]
-        light = self.imperfect.entering(self.beams[k], *numbers)
-        return np.asarray(light * self.imperfect.excess(*numbers))
+    def _lights(self, unknowns: Unknowns) -> FloatArray:
+        """The light that enters for each image."""
+        common, separate = unknowns.common, unknowns.separate
+        light = [
+            self.imperfect.entering(beam, common, own)
+            for beam, own in zip(self.beams, separate, strict=True)
+        ]
+        return np.stack(light) * np.exp(self.imperfect.shape_changes(common, separate))
 
     def _seen(self, unknowns: Unknowns, shot: _Shot) -> _Seen:
         """An image without its brightness, and its derivatives."""
@@ -411,19 +426,22 @@ class Scene(PriorTerms):
             along = np.einsum("m,myx,yx->", other[k], unknowns.potentials, pull)
             slope.common[self.imperfect.place("other_field")] += along
 
-    def _entering(self, unknowns: Unknowns, k: int) -> _Entering:
-        """The light of an image's beam, and its relative changes by the instrument's numbers."""
-        imperfect, numbers = self.imperfect, (unknowns.common, unknowns.separate[k])
-        light = self._light(unknowns, k)
-        return _Entering(light, _Effects(imperfect.entering_changes(self.beams[k], *numbers)))
+    def _entering(self, unknowns: Unknowns, lights: Sequence[FloatArray]) -> list[_Entering]:
+        """The light of each image's beam, and its relative changes by the instrument's numbers."""
+        common, changes = unknowns.common, self.imperfect.entering_changes
+        planes = zip(lights, self.beams, unknowns.separate, strict=True)
+        return [
+            _Entering(light, _Effects(changes(beam, common, own))) for light, beam, own in planes
+        ]
 
     def _add_beam_pulls(
-        self, slope: Unknowns, k: int, pull: FloatArray, entering: _Entering
+        self, slope: Unknowns, pulls: Sequence[FloatArray], entering: Sequence[_Entering]
     ) -> None:
         """Add derivatives by the light that enters."""
-        of_logarithm = pull * entering.light
-        entering.effects.add_pulls(slope, k, of_logarithm)
-        self.imperfect.pull_shapes(of_logarithm, slope.common, slope.separate[k])
+        of_logarithm = np.stack(pulls) * np.stack([each.light for each in entering])
+        for k, each in enumerate(entering):
+            each.effects.add_pulls(slope, k, of_logarithm[k])
+        self.imperfect.pull_shapes(of_logarithm, slope.common, slope.separate)
 
     def _only_free(self, slope: Unknowns) -> Unknowns:
         frames = np.where(self.free_frames, slope.frames, 0.0)
@@ -539,10 +557,10 @@ class Linear:
         scene = self.scene
         if not scene._is_sharp:
             return self.pull(self.push(change))
-        count, potentials = len(self.jacobians), self._potential_changes(change)
+        count = len(self.jacobians)
         totals, pulls = scene.rays.normal_times(
             self.jacobians,
-            [self._columns(change, potentials, k) for k in range(count)],
+            self._columns(change),
             *self._weights_and_slopes,
             [self._light_change(change, k) for k in range(count)]
             if self._has_light
@@ -552,16 +570,14 @@ class Linear:
         for k in range(count):
             if self._has_light:
                 self._add_light_pulls(slope, k, pulls[k])
-            self._add_columns(slope, k, totals[k])
-        return scene._only_free(slope)
+        return self._with_columns(slope, totals)
 
     def push(self, change: Unknowns) -> FloatArray:
         """Return the change of all residuals (f - I) / σ, to first order, shape (L, H, W)."""
         scene = self.scene
-        potentials = self._potential_changes(change)
-        changes = np.empty_like(scene.images)
+        changes, columns = np.empty_like(scene.images), self._columns(change)
         for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
-            landed = scene.rays.push(jacobian, self._columns(change, potentials, k))
+            landed = scene.rays.push(jacobian, columns[k])
             spread = scene._spread(k, landed, self.unknowns)
             image = seen.slope * spread + self._light_change(change, k)
             np.multiply(self._roots[k], image, out=changes[k])
@@ -570,33 +586,38 @@ class Linear:
     def pull(self, residuals: FloatArray) -> Unknowns:
         """Return the transpose of `push` times residuals."""
         scene = self.scene
-        slope = self.unknowns.zeros()
+        slope, columns = self.unknowns.zeros(), []
         for k, (jacobian, seen) in enumerate(zip(self.jacobians, self.seen, strict=True)):
             pull = self._roots[k] * residuals[k]
             self._add_light_pulls(slope, k, pull)
             back = scene._spread_back(k, seen.slope * pull, self.unknowns)
-            self._add_columns(slope, k, scene.rays.pull(jacobian, back))
-        return scene._only_free(slope)
+            columns.append(scene.rays.pull(jacobian, back))
+        return self._with_columns(slope, columns)
 
-    def _columns(self, change: Unknowns, potentials: FloatArray, k: int) -> FloatArray:
-        """Changes of the columns of an image's Jacobian."""
-        columns = potentials[k].reshape(-1)
+    def _columns(self, change: Unknowns) -> list[FloatArray]:
+        """Changes of the columns of each image's Jacobian."""
+        potentials = list(self._potential_changes(change).reshape(len(self.jacobians), -1))
         if not self._has_others:
-            return np.asarray(columns)
-        of_beam = self._entering[k].light * self._beam_change(change, k)
-        return np.concatenate([columns, of_beam.ravel(), change.frames[k]])
+            return potentials
+        shapes = self.scene.imperfect.shape_changes(change.common, change.separate)
+        columns = []
+        for k, (own, beam) in enumerate(zip(potentials, self._entering, strict=True)):
+            of_beam = beam.light * beam.effects.push(change, k, shapes[k % len(shapes)])
+            columns.append(np.concatenate([own, of_beam.ravel(), change.frames[k]]))
+        return columns
 
-    def _add_columns(self, slope: Unknowns, k: int, columns: FloatArray) -> None:
-        """Add derivatives by the columns of an image's Jacobian."""
+    def _with_columns(self, slope: Unknowns, columns: Sequence[FloatArray]) -> Unknowns:
+        """Add derivatives by the columns of each Jacobian, and return those that are free."""
         scene = self.scene
         size = math.prod(scene.rays.shape)
-        psi = columns[:size].reshape(scene.rays.shape)
-        scene._add_potential_pulls(slope, self.unknowns, self._strengths[k], k, psi)
+        for k, each in enumerate(columns):
+            psi = each[:size].reshape(scene.rays.shape)
+            scene._add_potential_pulls(slope, self.unknowns, self._strengths[k], k, psi)
         if self._has_others:
-            if scene.imperfect.changes_beam:
-                of_beam = columns[size:-6].reshape(scene.beams.shape[1:])
-                scene._add_beam_pulls(slope, k, of_beam, self._entering[k])
-            slope.frames[k] = columns[-6:]
+            of_beams = [each[size:-6].reshape(scene.beams.shape[1:]) for each in columns]
+            scene._add_beam_pulls(slope, of_beams, self._entering)
+            slope.frames[:] = [each[-6:] for each in columns]
+        return scene._only_free(slope)
 
     def _light_change(self, change: Unknowns, k: int) -> FloatArray:
         """The change of an image by numbers that act where it is seen."""
@@ -618,14 +639,6 @@ class Linear:
             changes += np.einsum("lm,myx->lyx", other, self.unknowns.potentials)
         return np.asarray(changes)
 
-    def _beam_change(self, change: Unknowns, k: int) -> FloatArray:
-        """Relative change of the light that enters for an image."""
-        imperfect = self.scene.imperfect
-        total = self._entering[k].effects.push(change, k, np.zeros(()))
-        if imperfect.shapes:
-            total = total + imperfect.shape_changes(change.common, change.separate[k])
-        return np.asarray(total)
-
     @property
     def _has_others(self) -> bool:
         """Whether the Jacobians have columns for the beam and the frame."""
@@ -638,7 +651,7 @@ class Linear:
 
     @cached_property
     def _entering(self) -> list[_Entering]:
-        return [self.scene._entering(self.unknowns, k) for k in range(len(self.jacobians))]
+        return self.scene._entering(self.unknowns, self.scene._lights(self.unknowns))
 
     @cached_property
     def _strengths(self) -> FloatArray:

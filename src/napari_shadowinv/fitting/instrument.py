@@ -36,6 +36,7 @@ _OF_RESPONSE = frozenset({"gamma", "blur", "background", "other_field"})
 # What modes leave out of a beam must be far below the noise of all pixels together.
 _FITTED_VARIANCE = 0.99999
 _DIMMEST = 1e-2  # of a beam's mean, for a relative change
+_NO_CHANGE = np.zeros((1, 1))
 
 Around = tuple[tuple[int, int], tuple[int, int]]
 
@@ -243,11 +244,6 @@ class Imperfect:
         """The imperfections that change how images respond to a field, not the light before it."""
         return self.keys & _OF_RESPONSE
 
-    @property
-    def changes_beam(self) -> bool:
-        """Whether the light that enters depends on the numbers."""
-        return bool(self.gamma or self.background or self.shapes)
-
     def only(self, images: list[int]) -> Imperfect:
         """Return what concerns some of the images."""
         if self.other_strengths is None:
@@ -319,21 +315,22 @@ class Imperfect:
             elif part.key == "background":
                 yield part, np.where(is_lit, -self.background / (exponent * light), 0.0)
 
-    def excess(self, common: FloatArray, separate: FloatArray) -> FloatArray | float:
-        """Return the factor by which a beam is brighter than its source."""
-        if not self.shapes:
-            return 1.0
-        return np.exp(self.shape_changes(common, separate))
-
     def shape_changes(self, common: FloatArray, separate: FloatArray) -> FloatArray:
-        """Return the sum of the shapes times their numbers."""
-        changes = (each.sum(part.of(common, separate)) for part, each in self.shape_parts())
-        return np.asarray(sum(changes))
+        """Return the shapes times their numbers, for each image or all, (L, H, W) or (1, …)."""
+        rows = separate[:1] if all(each.is_common for each in self.shapes) else separate
+        changes = (
+            sum((each.sum(part.of(common, row)) for part, each in self.shape_parts()), _NO_CHANGE)
+            for row in rows
+        )
+        return np.stack(list(changes))
 
-    def pull_shapes(self, pull: FloatArray, common: FloatArray, separate: FloatArray) -> None:
-        """Add the transpose of `shape_changes` times a pull to derivatives by the numbers."""
+    def pull_shapes(self, pulls: FloatArray, common: FloatArray, separate: FloatArray) -> None:
+        """Add the transpose of `shape_changes` times pulls to derivatives by the numbers."""
         for part, each in self.shape_parts():
-            part.of(common, separate)[:] += each.pull(pull)
+            rows = np.atleast_2d(part.of(common, separate))
+            totals = pulls.sum(axis=0, keepdims=True) if part.is_common else pulls
+            for row, pull in zip(rows, totals, strict=True):
+                row += each.pull(pull)
 
     def shape_parts(self) -> Iterator[tuple[Part, Shapes]]:
         """Yield the changes of beams, with the places of their numbers."""

@@ -109,7 +109,7 @@ class Posterior:
     ) -> None:
         self.scene, self._unknowns, self._rng = scene, unknowns, rng
         self._counts = scene.ray_counts(unknowns)
-        self._linear = linear or scene.linear(unknowns, self._counts)
+        self._linear = linear or scene.linear(unknowns, self._counts, of_held=True)
         self._scales = Preconditioner(scene)
         self._after_step = after_step or (lambda: None)
         self._modes = SoftModes() if modes is None else modes

@@ -50,6 +50,8 @@ def smooth_references(
         Standard deviation of the beams' errors beyond differences of neighbouring pixels of image
         and blurred beam, in units of `deviations`; 0 where the beams were not blurred.
     """
+    if not np.ptp(beams, axis=(1, 2)).any():
+        return beams, np.zeros(len(beams))
     inside = used.any(axis=0).astype(np.float64)
     excess = (images - beams) / deviations
     contrast = _surroundings(_surroundings(excess, used) ** 2, used)

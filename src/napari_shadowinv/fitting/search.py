@@ -306,8 +306,9 @@ def posterior_of(
     scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep, stage: str = "smoothness"
 ) -> Posterior:
     """Return the Gaussian around a minimum of a scene, in its pixels."""
-    report = partial(on_step, stage, end.value)
-    return Posterior(end.coarsen(scene), end.unknowns, rng, report, end.modes)
+    report, middle = partial(on_step, stage, end.value), end.coarsen(scene)
+    linear = middle.linear(end.unknowns)
+    return Posterior(middle, end.unknowns, rng, report, end.modes, linear)
 
 
 def settle_minimum(
