@@ -34,7 +34,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.options import DEFAULT_REGISTRATION, REFERENCE_BEAM, BeamPrior, Instrument
 from napari_shadowinv.preprocessing.image_checks import border_ring
 
-_SIDE_PX, _COARSE_SIDE_PX = 384, 128  # of the planes that are compared
+_SIDE_PX, _COARSE_SIDE_PX = 384, 64  # of the planes that are compared
 _CELLS = 24  # along the longer side
 _DEPTHS = 1, 2, 4  # cells, of the borders
 _AGREEING_ERRORS = 1.5  # of the shift by a border, for a deeper one to count
@@ -251,19 +251,28 @@ def _by_borders(shot: FloatArray, source: FloatArray, usable: BoolArray, beam: B
         [-complete_block_means(each, cell) / level for each in np.gradient(smooth)]
         for smooth in (ndimage.gaussian_filter(plane, cell / 2) for plane in (source, shot))
     ]
+    rows, columns = np.indices(lit.shape)
+    depths = np.minimum(
+        np.minimum(rows, columns), np.minimum(lit.shape[0] - rows, lit.shape[1] - columns) - 1
+    )
+    places = np.argwhere(lit & (depths < max(_DEPTHS)))
+    places = places[np.argsort(depths[tuple(places.T)], kind="stable")]
+    order = tuple(places.T)
+    counts = [count for depth in _DEPTHS if (count := int((depths[order] < depth).sum())) > 8]
+    if not counts:
+        return _NO_STEP
+    of_source, of_shot = (
+        np.stack([np.ones(len(places)), *(pattern[order] for pattern in both)], axis=1)
+        for both in patterns
+    )
+    columns = np.column_stack([of_source, of_shot, ratio[order]])
+    noise = max(_noise_of(ratio, lit), _LEAST_NOISE**2)
     best = _NO_STEP
-    for depth in _DEPTHS:
-        border = lit.copy()
-        border[depth:-depth, depth:-depth] = False
-        if border.sum() > 8:
-            at_border = [[pattern[border] for pattern in both] for both in patterns]
-            places = cell / min(shot.shape) * np.argwhere(border)
-            noise = max(_noise_of(ratio, lit), _LEAST_NOISE**2)
-            found = _likeliest_shift(ratio[border], at_border, places, noise, beam)
-            # Deeper borders show more, until they reach the object.
-            allowed = _AGREEING_ERRORS * np.sqrt(np.diag(best[1]))
-            if best is _NO_STEP or (np.abs(found[0] - best[0]) < allowed).all():
-                best = min(best, found, key=lambda step: float(np.trace(step[1])))
+    for found in _likeliest_shifts(columns, cell / min(shot.shape) * places, counts, noise, beam):
+        # Deeper borders show more, until they reach the object.
+        allowed = _AGREEING_ERRORS * np.sqrt(np.diag(best[1]))
+        if best is _NO_STEP or (np.abs(found[0] - best[0]) < allowed).all():
+            best = min(best, found, key=lambda step: float(np.trace(step[1])))
     return best
 
 
@@ -275,34 +284,37 @@ def _noise_of(ratio: FloatArray, lit: BoolArray) -> float:
     return float((NORMAL_MAD * np.median(np.abs(finest[used]))) ** 2) if used.any() else 0.0
 
 
-def _likeliest_shift(
-    ratio: FloatArray,
-    patterns: list[list[FloatArray]],
-    places: FloatArray,
-    noise: float,
-    beam: BeamPrior,
-) -> Step:
-    """Return the shift, by generalised least squares with the likeliest difference of beams."""
-    of_source, of_shot = (np.stack([np.ones_like(ratio), *both], axis=1) for both in patterns)
-    squares = ((places[:, None] - places) ** 2).sum(axis=2)
-    long, short = (np.exp(-squares / (2 * length**2)) for length in (beam.length, beam.length / 4))
-    columns = np.column_stack([of_source, of_shot, ratio])
-    best, likeliest = _NO_STEP, -np.inf
+def _likeliest_shifts(
+    columns: FloatArray, places: FloatArray, counts: list[int], noise: float, beam: BeamPrior
+) -> list[Step]:
+    """Return the shift by the first cells, so many each time.
+
+    By generalised least squares with the likeliest difference of beams. `columns` (n, 7) are three
+    patterns of the source, as many of the image, and the ratio of both.
+    """
+    squares = sum((line[:, None] - line) ** 2 for line in places.T)
+    long = np.exp(-squares / (2 * beam.length**2))
+    short = long**16  # a quarter of the length
+    best, likeliest = [_NO_STEP] * len(counts), [-np.inf] * len(counts)
     for of_beam, of_rest in _DIFFERENCES:
-        structure = of_beam**2 * long + of_rest**2 * short
-        covariance = beam.rms**2 * structure + noise * np.eye(len(ratio))
+        covariance = beam.rms**2 * (of_beam**2 * long + of_rest**2 * short)
+        covariance += noise * np.eye(len(places))
+        # Its first rows are the root of the first cells' covariance.
         root = linalg.cholesky(covariance, lower=True, check_finite=False)
         white = linalg.solve_triangular(root, columns, lower=True, check_finite=False)
-        source, shot, values = white[:, :3], white[:, 3:6], white[:, 6]
-        normal, square = source.T @ shot, source.T @ source
-        if not (np.linalg.cond(normal) < 1e12 and np.linalg.cond(square) < 1e12):
-            continue
-        misfit = float(((values - source @ np.linalg.solve(square, source.T @ values)) ** 2).sum())
-        evidence = -misfit / 2 - float(np.log(np.diag(root)).sum())
-        if evidence > likeliest:
-            likeliest, inverse = evidence, np.linalg.inv(normal)
-            spread = inverse @ square @ inverse.T * max(1.0, misfit / len(ratio))
-            best = (inverse @ (source.T @ values))[1:], spread[1:, 1:]
+        logarithms = np.cumsum(np.log(np.diag(root)))
+        for k, count in enumerate(counts):
+            source, shot, values = white[:count, :3], white[:count, 3:6], white[:count, 6]
+            normal, square = source.T @ shot, source.T @ source
+            if not (np.linalg.cond(normal) < 1e12 and np.linalg.cond(square) < 1e12):
+                continue
+            rest = values - source @ np.linalg.solve(square, source.T @ values)
+            misfit = float((rest**2).sum())
+            evidence = -misfit / 2 - float(logarithms[count - 1])
+            if evidence > likeliest[k]:
+                likeliest[k], inverse = evidence, np.linalg.inv(normal)
+                spread = inverse @ square @ inverse.T * max(1.0, misfit / count)
+                best[k] = (inverse @ (source.T @ values))[1:], spread[1:, 1:]
     return best
 
 
@@ -312,7 +324,7 @@ def _by_finest(shot: FloatArray, source: FloatArray, usable: BoolArray) -> Step:
         ndimage.gaussian_filter(plane, _FINE_PX) - ndimage.gaussian_filter(plane, _COARSE_PX)
         for plane in (source, shot)
     )
-    inner = ndimage.binary_erosion(usable, np.ones((9, 9)))
+    inner = ndimage.minimum_filter(usable, 9, mode="constant", cval=False)
     rows, columns = (np.arange(side) * _PARTS // side for side in shot.shape)
     parts = (rows[:, None] * _PARTS + columns)[inner]
     difference = (sharp - fine)[inner]
