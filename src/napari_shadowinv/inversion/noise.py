@@ -434,10 +434,11 @@ class _CalmDifferences:
         limits = np.array(self.mask.shape)[:, None] - lag
         rows, columns = places[:, ((places >= lag) & (places < limits)).all(axis=0)]
         total, is_used = np.zeros(len(rows)), np.ones(len(rows), bool)
+        middle, width = rows * self.mask.shape[1] + columns, self.mask.shape[1]
         for down, right in itertools.product((-lag, 0, lag), repeat=2):
-            at = rows + down, columns + right
-            total += (-2.0) ** ((down == 0) + (right == 0)) * self.excess[at]
-            is_used &= self.mask[at]
+            at = middle + (down * width + right)
+            total += (-2.0) ** ((down == 0) + (right == 0)) * self.excess.take(at)
+            is_used &= self.mask.take(at)
         squares = (total[is_used] / 6) ** 2
         brightness = self.brightness[rows, columns][is_used]
         if len(squares) < _MIN_PIXELS or not brightness.any():
