@@ -284,7 +284,7 @@ def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
     """A converged answer that explains both images, and is off by a quarter and more."""
     cut = bump(0.7, 8, (0, 30))
     images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
-    options = FitOptions(samples=0, boundary=boundary)
+    options = FitOptions(samples=4, boundary=boundary)
     known = {"strengths": [1, 0.7], "source": np.ones(SIZE), "noise": 0.02}
     result = fit(noisy(images, 0.02), options=options, **known)
     assert result.chi2.max() < 1.3
@@ -298,9 +298,19 @@ def test_an_object_cut_by_either_end_of_a_filled_side_is_reported(column: int) -
     size = (40, 464)
     cut = bump(0.7, 8, (20, column))
     images = [counted(lambda y, x: s * cut(y, x), size) for s in (1, 0.7)]  # noqa: B023
-    result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=PLAIN)
+    options = PLAIN.model_copy(update={"samples": 4})
+    result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=options)
     assert result.verdict is Verdict.EDGE
     assert "larger field of view" in result.explanation
+
+
+def test_without_samples_the_edge_is_not_computed() -> None:
+    """There is no other error that an error by the edge has to exceed."""
+    cut = bump(0.7, 8, (0, 30))
+    images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
+    result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=HASTY)
+    assert result.verdict is not Verdict.EDGE
+    assert (result.report.parts, result.report.sides) == ({}, ())
 
 
 def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:

@@ -559,7 +559,7 @@ def _added_light(
 
 
 def _changes_by_edge(
-    potentials: FloatArray, displacements: FloatArray, errors: FloatArray | None
+    potentials: FloatArray, displacements: FloatArray, errors: FloatArray
 ) -> FloatArray:
     """Return each field's `edge_changes`, (M, k, 3, H, W), as far as they exceed other errors.
 
@@ -567,7 +567,7 @@ def _changes_by_edge(
     """
     changes = np.array(list(map(edge_changes, potentials, displacements)))
     squares = (changes[:, :, 1:] ** 2).sum(axis=1).mean(axis=(1, 2, 3))
-    explained = 0.0 if errors is None else (errors**2).mean(axis=(1, 2, 3))
+    explained = (errors**2).mean(axis=(1, 2, 3))
     excess = np.maximum(1 - explained / np.maximum(squares, 1e-300), 0.0)
     return np.asarray(np.sqrt(excess)[:, None, None, None, None] * changes)
 
@@ -615,12 +615,15 @@ def _result(
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
     displacements = scene.displacement(unknowns)[..., :height, :width].copy()
     potentials = potentials_of(scene, unknowns, data.size)
-    changes = _changes_by_edge(potentials, displacements, errors)
-    by_edge = np.sqrt((changes[:, :, 1:] ** 2).sum(axis=1))
-    if by_edge.any():
-        by_part = {**by_part, "edge": by_edge}
-        errors = None if errors is None else np.hypot(errors, by_edge)
-        samples = None if samples is None else _with_edge(samples, changes[:, :, 0], options.seed)
+    total, sides = float("nan"), tuple[str, ...]()
+    if errors is not None and samples is not None:  # which an error by the edge has to exceed
+        changes = _changes_by_edge(potentials, displacements, errors)
+        by_edge = np.sqrt((changes[:, :, 1:] ** 2).sum(axis=1))
+        if by_edge.any():
+            by_part, errors = {**by_part, "edge": by_edge}, np.hypot(errors, by_edge)
+            samples = _with_edge(samples, changes[:, :, 0], options.seed)
+        total = largest_share(errors, displacements)
+        sides = edge_sides((by_edge**2).sum(axis=(0, 1)))
     fields = [
         FittedField(
             name,
@@ -632,10 +635,8 @@ def _result(
         )
         for m, name in enumerate(names)
     ]
-    total = float("nan") if errors is None else largest_share(errors, displacements)
     shares = {key: largest_share(each, displacements) for key, each in by_part.items()}
     parts = dict(sorted(shares.items(), key=lambda part: -part[1]))
-    sides = edge_sides((by_edge**2).sum(axis=(0, 1)))
     report = replace(
         report,
         total=total,
