@@ -74,10 +74,6 @@ _TOO_QUIET = 0.4  # χ²; an estimated noise may be too large by a third
 _AS_GOOD = 0.03  # of the objective
 _OTHER_FIELD = 0.05  # of the displacement, r.m.s.
 _OPEN = 0.05  # of the displacement, r.m.s.
-# Bars hold the truth in 56 and 84 % of the pixels there instead of 68 and 95 %, and in 32 and 58 %
-# with an unknown beam: the shares of a normal distribution with a deviation so many times larger.
-_DEEP_FOLDS = 0.3  # of the object
-_BARS_DEEP_FOLDS, _BARS_DEEP_FOLDS_AND_BEAM = 1.4, 2.4
 _LOST = 0.01  # of the rays
 # Of 60 fits on 96 px, the r.m.s. ratio of error to total was 1.0, with a transmission 1.3; of 60 on
 # 64 px the largest was 3.9, of one on 200 px with a blur 3.0.
@@ -240,9 +236,6 @@ def assess_verdict(
         (shown,) = shown_fields([field.displacement], setup, deflector, mask=used)
         return Verdict.CONDITIONAL, shown.conditional_text(condition)
     unchecked = "" if np.isfinite(total) else "; error bars were not worked out"
-    if np.isfinite(total) and _share_squeezed(jacobian, displacement, 0.0) > _DEEP_FOLDS:
-        times = _BARS_DEEP_FOLDS_AND_BEAM if beam_unknown else _BARS_DEEP_FOLDS
-        unchecked += f"; beyond deep folds the error bars are about {times:g} times too small"
     if pattern.correlation > 0:
         unchecked += (
             f"; the noise is correlated over {pattern.correlation:.1f} px, which makes the error "
@@ -287,7 +280,7 @@ def _cause_text(pattern: Pattern) -> str:
 
 
 def _share_squeezed(jacobian: FloatArray, displacement: FloatArray, least: float) -> float:
-    """The share of an object, where it displaces rays, with less of a Jacobian; at 0, folded."""
+    """The share of an object, where it displaces rays, with less of a Jacobian."""
     size = np.hypot(*displacement)
     return float((jacobian < least).sum() / max((size > _OBJECT * size.max()).sum(), 1))
 
