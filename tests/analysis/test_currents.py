@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import constants
+from scipy.special import erf
 
 from helpers.exact_fields import SETUP, field_of
 from napari_shadowinv.analysis import (
@@ -14,6 +17,7 @@ from napari_shadowinv.analysis import (
     Flux,
     analyse,
 )
+from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.physics.phantoms import Phantom, gaussian_blob, toroid
@@ -44,6 +48,25 @@ def test_current_of_a_toroid_is_that_of_its_formula():
     # Counter-clockwise as shown, so the current is towards the viewer, against the beam.
     exact = -2 * np.pi * radius * strength / constants.mu_0
     current = number(field, EnclosedCurrent(center=(75, 75), radius=25))
+    assert current == pytest.approx(exact, rel=1e-3)
+
+
+def test_current_of_an_inversion_lacks_nothing_by_its_read_out():
+    # Means over pixels of exp(-r²/2σ²), whose central differences lack 1 % of the current.
+    sigma, radius, middle = 5.0, 8.0, 40
+    edges = (np.arange(82) - middle - 0.5) / (np.sqrt(2) * sigma)
+    line = sigma * np.sqrt(np.pi / 2) * np.diff(erf(edges))
+    potential = np.multiply.outer(line, line)
+    displacement = -np.array(np.gradient(potential))
+    frame = FieldFrame(potential.shape, potential > -1, SETUP, "B", FIELD_UNITS["T m"])
+    circle = EnclosedCurrent(center=(middle, middle), radius=radius)
+    outward = radius / sigma**2 * np.exp(-(radius**2) / (2 * sigma**2))
+    field = SETUP.path_integrated_b([outward, 0.0])[1]
+    exact = -2 * np.pi * radius * PIXEL * abs(field) / constants.mu_0
+    (read_out,) = circle.measure(potential, displacement, frame).values()
+    assert abs(read_out / exact - 1) > 8e-3
+    inverted = replace(frame, is_pixel_mean=True)
+    (current,) = circle.measure(potential, displacement, inverted).values()
     assert current == pytest.approx(exact, rel=1e-3)
 
 
