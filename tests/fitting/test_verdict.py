@@ -352,6 +352,14 @@ def test_several_fields_that_explain_as_well_are_told() -> None:
     assert "31%" in why
 
 
+def test_fields_that_differ_within_the_stated_error_are_one_answer() -> None:
+    open_by_noise = GOOD | {"total": 0.12, "parts": {"noise": 0.12}}
+    verdict, why = assess(**open_by_noise | {"rivals": [(0.0, 0.2)]})
+    assert verdict is Verdict.UNCERTAIN
+    assert why.startswith("errors of 12.0%")
+    assert assess(**open_by_noise | {"rivals": [(0.0, 0.3)]})[0] is Verdict.SEVERAL
+
+
 @pytest.mark.parametrize("other", [(0.5, 0.9), (0.0, 0.01)])
 def test_other_fields_do_not_matter_if_they_are_worse_or_the_same(
     other: tuple[float, float],
@@ -367,7 +375,7 @@ def test_noise_that_leaves_much_open_is_told() -> None:
 
 def test_the_gravest_doubt_comes_first() -> None:
     """Images that are not explained, then one image, then other fields, then noise."""
-    all_of_them = GOOD | ALONE | {"beam_unknown": True, "rivals": [(0.0, 0.5)], "total": 0.5}
+    all_of_them = GOOD | ALONE | {"beam_unknown": True, "rivals": [(0.0, 1.5)], "total": 0.5}
     assert assess(**all_of_them | {"chi2": np.array([9.0])})[0] is Verdict.MISFIT
     assert assess(**all_of_them)[0] is Verdict.AMBIGUOUS
     assert assess(**all_of_them | {"beam_unknown": False})[0] is Verdict.SEVERAL

@@ -72,7 +72,7 @@ _OBJECT = 0.1  # of the largest displacement
 _NEARLY = 5.0  # χ² of a misfit by an edge alone
 _TOO_QUIET = 0.4  # χ²; an estimated noise may be too large by a third
 _AS_GOOD = 0.03  # of the objective
-_OTHER_FIELD = 0.05  # of the displacement, r.m.s.
+_OTHER_FIELD, _WITHIN_TOTALS = 0.05, 2.0  # of the displacement, r.m.s., and of its stated error
 _OPEN = 0.05  # of the displacement, r.m.s.
 _LOST = 0.01  # of the rays
 # Of 60 fits on 96 px, the r.m.s. ratio of error to total was 1.0, with a transmission 1.3; of 60 on
@@ -181,7 +181,8 @@ def assess_verdict(
     rivals = [
         basin.distance
         for basin in alternatives
-        if basin.objective / best.objective - 1 < _AS_GOOD and basin.distance > _OTHER_FIELD
+        if basin.objective / best.objective - 1 < _AS_GOOD
+        and basin.distance > max(_OTHER_FIELD, _WITHIN_TOTALS * total)
     ]
     if rivals:
         return Verdict.SEVERAL, (
