@@ -11,9 +11,9 @@ from scipy.fft import idctn
 from helpers.fit_images import hessian_times
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
-from napari_shadowinv.fitting.descent import descend, settle
+from napari_shadowinv.fitting.descent import coarser, descend, settle
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import Imperfect
+from napari_shadowinv.fitting.instrument import Imperfect, Shapes
 from napari_shadowinv.fitting.posterior import Posterior, Sample, compare_samples, draw_variations
 from napari_shadowinv.fitting.search import Minimum, estimate_smoothness
 from napari_shadowinv.fitting.unknowns import Unknowns
@@ -85,6 +85,15 @@ def test_held_numbers_are_drawn_as_uncertain_as_they_are_said_to_be() -> None:
         scales = np.sqrt(np.diag(expected))
         difference = np.cov(np.array(draws).T) - expected
         assert np.abs(difference / np.outer(scales, scales)).max() < tolerance
+
+
+def test_a_few_samples_spread_numbers_that_move_the_whole_field_as_many_do() -> None:
+    scene, unknowns = imperfect_scene()
+    known = replace(scene, spread=np.diag([0.3, 0.2, 0.4]))
+    posterior = Posterior(known, unknowns, np.random.default_rng(0))
+    draws = np.array([numbers_of(scene, each.change) for each in posterior.draw_samples(6, 0.1)])
+    np.testing.assert_allclose(np.sqrt((draws**2).mean(axis=0)), [0.3, 0.2, 0.4])
+    np.testing.assert_allclose(draws.mean(axis=0), 0, atol=1e-12)
 
 
 def test_the_curvature_of_numbers_is_the_schur_complement_of_the_hessian() -> None:
@@ -317,3 +326,17 @@ def test_numbers_that_begin_far_away_end_within_their_errors() -> None:
         settled.spread, numbers_of(scene, end.unknowns) - numbers_of(scene, truth)
     )
     assert np.abs(off).max() < 3
+
+
+@pytest.mark.parametrize("is_common", [True, False])
+def test_beams_of_their_own_are_told_from_fields_by_the_finest_structure(is_common: bool) -> None:
+    """In pixels of two, a broad lens moves an object whose structure would show it."""
+    scene, _ = imperfect_scene()
+    line = np.cos(np.arange(scene.beams.shape[1]) / 9)
+    planes = 0.05 * np.multiply.outer(line, np.ones(scene.beams.shape[2]))[None]
+    beams = Shapes("beam" if is_common else "beam_between", planes, is_common=is_common)
+    scene = replace(scene, imperfect=Imperfect(shapes=(beams,)), held=frozenset())
+    coarse = coarser(scene, 2)
+    start = Minimum("far", coarse.nothing(), np.inf, coarse.displacement(coarse.nothing()))
+    _, end = estimate_smoothness(scene, start, np.random.default_rng(0), lambda *_: None)
+    assert end.bin == (2 if is_common else 1)

@@ -58,6 +58,7 @@ from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.rivals import compare_rivals, transmission_of
 from napari_shadowinv.fitting.search import (
     SMALL_PX,
+    SPACING_WITH_NUMBERS,
     Minimum,
     Start,
     estimate_smoothness,
@@ -89,6 +90,7 @@ _DARKEST = 1e-3  # of a beam's mean
 _MAX_RIVAL_CHI2 = 25.0  # a fit that ended further away is no start for a rival
 _SPACING_OF_SAMPLES = 1 / 3  # px
 _CHECKED = 2  # samples of an instrument that are solved, too
+_SAMPLES_OF_BEAMS = 24  # at least, where each image has a beam of its own
 # Before a field has been found, they would take its place.
 _HELD_IN_SEARCH = frozenset({"gamma", "blur", "other_field"})
 
@@ -392,11 +394,17 @@ def _find_openness(
     """Draw samples around the best unknowns."""
 
     def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:
-        middle = best.coarsen(scene, _SPACING_OF_SAMPLES)
+        # What rays that are far apart add would tell fields from what resembles them.
+        is_dense = scene.imperfect.resembles_fields
+        middle = best.coarsen(scene, SPACING_WITH_NUMBERS if is_dense else _SPACING_OF_SAMPLES)
         return Posterior(middle, start.unknowns, rng, lambda: on_step("samples", best.value), modes)
 
     posterior = posterior_with(scene, best, None if data.single else copy(best.modes))
-    samples = posterior.draw_samples(options.samples if options.samples > 1 else 0)
+    count = options.samples if options.samples > 1 else 0
+    if count and "beam_between" in scene.imperfect.keys:
+        # A few directions hold most of the error, which a few samples find by chance only.
+        count = max(count, _SAMPLES_OF_BEAMS)
+    samples = posterior.draw_samples(count)
     is_solved = options.sampling == "resolve"
     if is_solved:
         checked, solved = samples, posterior.solve(samples)

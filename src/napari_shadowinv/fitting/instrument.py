@@ -244,6 +244,14 @@ class Imperfect:
         """The imperfections that change how images respond to a field, not the light before it."""
         return self.keys & _OF_RESPONSE
 
+    @property
+    def resembles_fields(self) -> bool:
+        """Whether numbers change images so nearly as fields do that small errors tell them apart.
+
+        Fields can replace beams of their own for each image, but not a beam that all share.
+        """
+        return bool(self.of_response) or "beam_between" in self.keys
+
     def only(self, images: list[int]) -> Imperfect:
         """Return what concerns some of the images."""
         if self.other_strengths is None:

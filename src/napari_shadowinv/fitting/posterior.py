@@ -35,7 +35,7 @@ from napari_shadowinv.fitting.descent import Preconditioner, finer, settle
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.inversion.samples import Pairs
+from napari_shadowinv.inversion.samples import Pairs, stratified_numbers
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.poisson import border_mean
 
@@ -159,19 +159,26 @@ class Posterior:
         """
         if tolerance is None:
             tolerance = _IN_VALLEY if self._scales.has_rough_numbers else _CLOSELY
-        draws = [self._draw() for _ in range(count)]
+        spread = self.scene.spread
+        # Each moves the whole field: a few samples have it spread as evenly as many.
+        normal = stratified_numbers(self._rng, count, 0 if spread is None else len(spread))
+        root = np.sqrt(count / max(count - 1, 1))
+        draws = [self._draw(root * numbers) for numbers in normal]
         changes = self._changes([slope for _, slope in draws], tolerance)
         return [
             replace(causes, change=change.plus(causes.change))
             for (causes, _), change in zip(draws, changes, strict=True)
         ]
 
-    def _draw(self) -> tuple[Sample, Unknowns]:
-        """Noise, the force of the prior and held numbers, drawn for a sample, and their slope."""
+    def _draw(self, normal: FloatArray) -> tuple[Sample, Unknowns]:
+        """Noise, the force of the prior and held numbers, drawn for a sample, and their slope.
+
+        `normal` are normal numbers for those of the instrument whose spread is known.
+        """
         noise = self._rng.normal(size=self.scene.images.shape)
         numbers, residuals = self._unknowns.zeros(), noise
         if self.scene.held:
-            numbers = self._draw_held()
+            numbers = self._draw_held(normal)
             residuals = noise - self._linear.push(numbers)
         force = self.scene.prior.draw(self._unknowns, self._rng)
         return Sample(numbers, noise, force), self._linear.pull(residuals).plus(force)
@@ -219,13 +226,12 @@ class Posterior:
             solved.append(replace(sample, change=end.like(end.flat() - base.flat())))
         return solved
 
-    def _draw_held(self) -> Unknowns:
+    def _draw_held(self, normal: FloatArray) -> Unknowns:
         """Random numbers of the instrument: as uncertain as the scene says, or as stated."""
         scene, numbers = self.scene, self._unknowns.zeros()
         if scene.spread is not None:
             units = np.stack([unit.flat() for unit in scene.response_units()])
-            drawn = scene.spread @ self._rng.normal(size=len(units))
-            return numbers.like(np.einsum("n,nx->x", drawn, units))
+            return numbers.like(np.einsum("n,nx->x", scene.spread @ normal, units))
         for part in scene.imperfect.parts:
             if part.key in scene.held:
                 block = part.of(numbers.common, numbers.separate)

@@ -37,8 +37,8 @@ _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go o
 _COARSE_SPACING, _MIDDLE_SPACING = 1 / 3, 0.25
 _BLURRED, _SPACING_OF_BLURRED = 2.0, 0.5  # px: so wide a blur hides how far apart rays are
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
-# With an instrument's numbers, an error of the model far below the noise changes the field.
-_SPACING_WITH_NUMBERS = 0.1  # px
+# With numbers that resemble fields, an error of the model far below the noise changes the field.
+SPACING_WITH_NUMBERS = 0.1  # px
 SMALL_PX = 80  # shorter side of images with too few pixels for an instrument's numbers
 _MOST_RECORDED = 300_000  # pixels of all images
 _ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share they may still change
@@ -223,7 +223,7 @@ def estimate_smoothness(
     end = _with_likely_numbers(scene, end)
     if is_fixed:
         end = settle_minimum(scene, end, on_step)
-        if not response:
+        if not scene.imperfect.resembles_fields:
             return scene, end
     else:
         # How rough a field is hardly depends on numbers that all images share.
@@ -238,8 +238,10 @@ def estimate_smoothness(
             scene = replace(scene, smoothness=smoothness)
             end = settle_minimum(scene, end, on_step, is_rough=True)
         scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness, held=free)
-    if response and scene.images.size <= _MOST_RECORDED and not is_near:
-        # In larger pixels fine structure is lost by which a blur differs from a smooth object.
+    is_small = scene.images.size <= _MOST_RECORDED
+    if scene.imperfect.resembles_fields and is_small and not is_near:
+        # In larger pixels fine structure is lost by which a blur differs from a smooth object, and
+        # by which a field that replaces the beams would move the structure of the object.
         end = in_recorded_pixels(scene, end)
     least_gain = COARSE_GAIN if is_near else _LAST_GAIN
     end = settle_minimum(scene, end, on_step, least_gain=least_gain)
@@ -347,8 +349,8 @@ def refine_minimum(
     """
     unknowns, steps = _in_smaller_pixels(scene, minimum), 0
     modes = minimum.modes if minimum.bin == scene.bin else SoftModes()
-    has_dense_rays = bool(scene.imperfect.of_response) and not is_near
-    usual = [_SPACING_WITH_NUMBERS] if has_dense_rays else list(_SPACINGS)
+    has_dense_rays = scene.imperfect.resembles_fields and not is_near
+    usual = [SPACING_WITH_NUMBERS] if has_dense_rays else list(_SPACINGS)
     denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))
     scene = replace(scene, spacing=denser.pop(0))
