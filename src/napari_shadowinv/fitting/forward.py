@@ -651,7 +651,7 @@ class Linear:
 
     @cached_property
     def _entering(self) -> list[_Entering]:
-        return self.scene._entering(self.unknowns, self.scene._lights(self.unknowns))
+        return self.scene._entering(self.unknowns, list(self.scene._lights(self.unknowns)))
 
     @cached_property
     def _strengths(self) -> FloatArray:

@@ -251,9 +251,9 @@ def _by_borders(shot: FloatArray, source: FloatArray, usable: BoolArray, beam: B
         [-complete_block_means(each, cell) / level for each in np.gradient(smooth)]
         for smooth in (ndimage.gaussian_filter(plane, cell / 2) for plane in (source, shot))
     ]
-    rows, columns = np.indices(lit.shape)
+    down, right = np.indices(lit.shape)
     depths = np.minimum(
-        np.minimum(rows, columns), np.minimum(lit.shape[0] - rows, lit.shape[1] - columns) - 1
+        np.minimum(down, right), np.minimum(lit.shape[0] - down, lit.shape[1] - right) - 1
     )
     places = np.argwhere(lit & (depths < max(_DEPTHS)))
     places = places[np.argsort(depths[tuple(places.T)], kind="stable")]
