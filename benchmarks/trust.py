@@ -6,8 +6,9 @@ Images are made by formulae and areas (`exact_shots.py`) and by random numbers o
 package's forward model is not used, except by its own samples and tutorials, which are measured
 as they are. 96 px, 1,000 counts a pixel unless said.
 
-- An answer *stands* if its verdict is "determined" or "depends on the beam". It is *silent* if it
-  stands while the field (L2) is off by more than 5 % and three times the total that it states.
+- An answer *stands* if its verdict is "determined" or "depends on the beam" or "the detector". It
+  is *silent* if it stands while the field (L2) is off by more than 5 % and three times the total
+  that it states.
 - It is *refused* if it neither stands nor is "too uncertain".
 - It *cries* if it does not stand and states more than three times its true error.
 
@@ -71,7 +72,7 @@ from napari_shadowinv.analysis import EnclosedCurrent, LineProfile
 SIDE, COUNTS = 96, 1000.0
 MIDDLE = (SIDE - 1) / 2
 MAX_ERROR, MAX_TOTALS = 0.05, 3.0
-STANDING = "determined", "depends on the beam"
+STANDING = "determined", "depends on the beam", "depends on the detector"
 ENERGIES = 14.7, 30.0, 70.0  # MeV
 PROTON_MASS = 938.272  # MeV
 CELLS, FOLDED_CELLS = 6, 14  # a pixel on each axis

@@ -193,6 +193,7 @@ class Verdict(StrEnum):
 
     DETERMINED = "determined"
     CONDITIONAL = "depends on the beam"
+    DETECTOR = "depends on the detector"
     SEVERAL = "one of several"
     AMBIGUOUS = "one image cannot tell"
     UNCERTAIN = "too uncertain"
@@ -202,8 +203,9 @@ class Verdict(StrEnum):
     @property
     def level(self) -> Level:
         """How far a result with this verdict can be trusted, if it has no warnings."""
-        levels = {Verdict.DETERMINED: Level.SOUND, Verdict.CONDITIONAL: Level.CONDITIONAL}
-        return levels.get(self, Level.DOUBTFUL)
+        if self in (Verdict.CONDITIONAL, Verdict.DETECTOR):
+            return Level.CONDITIONAL
+        return Level.SOUND if self is Verdict.DETERMINED else Level.DOUBTFUL
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,22 @@ def test_an_instrument_without_numbers_changes_no_bit(assumed: Fit) -> None:
         assert (other.verdict, other.report.total) == (assumed.verdict, assumed.report.total)
 
 
+def test_a_detector_of_which_nothing_is_stated_is_in_the_error() -> None:
+    """Unfolded images of a dark level of 10 % are explained by a field that is as much too weak."""
+    weak = bump(0.4, 8, (23, 29))
+    clean = np.stack([counted(lambda y, x, a=a: a * weak(y, x), SIZE) for a in STRENGTHS])
+    images = noisy(list(0.9 * clean + 0.1), NOISE)
+    keywords = {"source": np.ones(SIZE)}
+    blind = fitted(images, None, **keywords)
+    off = distance(blind.fields[0].displacement, on_pixels(weak, SIZE))
+    assert blind.report.total > off / 3 > blind.report.parts["noise"]
+    assert blind.report.parts.keys() >= {"background", "gamma"}
+    stated = fitted(images, Instrument(**EXACT_BEAM), **keywords)
+    counts = fitted(np.round(1000 * images), None, source=np.full(SIZE, 1000), noise="poisson")
+    for result in (stated, counts):
+        assert not {"background", "gamma"} & result.report.parts.keys()
+
+
 def test_one_image_keeps_its_field_and_gets_larger_errors() -> None:
     """It cannot tell the instrument from the object."""
     image = shots()[1]

@@ -86,7 +86,16 @@ def assess(
         verdict=Verdict.UNCERTAIN,
         explanation="",
         report=FitReport(
-            0.0, 1, ended, {}, total, beam=beam, parts=parts, sides=SIDES, beam_rms=0.05
+            0.0,
+            1,
+            ended,
+            {},
+            total,
+            beam=beam,
+            parts=parts,
+            sides=SIDES,
+            beam_rms=0.05,
+            numbers={key: [[0.0, 0.01]] for key in parts if instrument.has_numbers},
         ),
         options=options,
         instrument=instrument,
@@ -222,6 +231,26 @@ def test_a_beam_that_was_assumed_is_a_condition(share: float, expected: Verdict)
         # 1 % × √(0.05² - 0.02²) / 0.1, and √(0.02² + 0.2²)
         assert why.startswith("peak |d| 1.000")
         assert "if the beam is even to 0.4 %; ± 0.02 (field 20 %) if it is 5 % uneven" in why
+
+
+def test_a_detector_that_was_assumed_is_a_condition() -> None:
+    parts = {"background": 0.08, "gamma": 0.06, "noise": 0.03}
+    errors = {"parts": parts, "total": float(np.hypot(0.1, 0.03))}
+    verdict, why = assess(**GOOD | errors)
+    assert verdict is Verdict.DETECTOR
+    # 0.4 = √(0.05² - 0.03²) / 0.1
+    assert "if the detector is exact to 2 % of background and 0.02 of gamma; " in why
+    assert "(field 10 %) if it is off by 5 % of background and 0.05 of gamma (assumed)" in why
+    stated = {"instrument": Instrument(background=0.08, gamma=0.06)}
+    assert assess(**GOOD | errors | stated)[0] is Verdict.UNCERTAIN
+
+
+def test_beam_and_detector_that_were_assumed_are_one_condition() -> None:
+    both = of_assumed_beam(0.02, 0.2)
+    both |= {"parts": both["parts"] | {"gamma": 0.06}, "total": float(np.hypot(0.2, 0.0632))}
+    verdict, why = assess(**GOOD | both)
+    assert verdict is Verdict.CONDITIONAL
+    assert "if they are off by 5 % and 0.05 of gamma (assumed); record a reference, and" in why
 
 
 @pytest.mark.parametrize(

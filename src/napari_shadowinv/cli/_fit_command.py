@@ -58,12 +58,12 @@ Columns: file, setup, energy (MeV) or wavelength (m), strength, brightness, psf,
 noise; exclude (yes to skip the image); shot, for shadowinv batch.
 
 [bold]Verdict[/bold]
-Each result states whether its field can be trusted: "determined", "depends on the beam" (which
-nobody recorded or stated), "one of several", "one image cannot tell", "too uncertain", "reaches
-the edge" or "does not fit".
+Each result states whether its field can be trusted: "determined", "depends on the beam" or "the
+detector" (which nobody recorded or stated), "one of several", "one image cannot tell", "too
+uncertain", "reaches the edge" or "does not fit".
 
 [bold]Exit codes[/bold]
-0 the field is determined, or depends on the beam; 2 invalid input, nothing written;
+0 the field is determined, or depends on beam or detector; 2 invalid input, nothing written;
 3 result written, but with another verdict, or an image left out is not explained;
 130 cancelled.
 """

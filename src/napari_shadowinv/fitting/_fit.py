@@ -30,6 +30,7 @@ from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import (
+    ASSUMED,
     EXACT,
     Imperfect,
     numbers_in_units,
@@ -276,9 +277,9 @@ def fit(
         amplification = max(noise_amplification(pattern.correlation) * least, 1.0)
         potentials = None
         if errors is not None:
-            potentials = sampled_potentials(
-                scene, samples, openness.by_beam, data.size, options.seed
-            )
+            of_beam = () if openness.by_beam is None else openness.by_beam.changes
+            shifts = [*of_beam, *openness.assumed.values()]
+            potentials = sampled_potentials(scene, samples, shifts, data.size, options.seed)
             amplified = _amplify_noise(errors, openness.by_part, amplification)
             ratio = product(amplified.ravel(), amplified.ravel()) / product(
                 errors.ravel(), errors.ravel()
@@ -372,6 +373,7 @@ class _Openness:
 
     `posterior` is that of counts; `pairs` compares samples with those that are solved in full;
     `errors`, `by_part` and `by_beam` are those of the displacement, `sensitivities` shares of it.
+    `assumed` are the likely changes by a detector of which nothing was stated.
     """
 
     posterior: Posterior | None
@@ -380,6 +382,7 @@ class _Openness:
     errors: FloatArray | None
     by_part: dict[str, FloatArray]
     by_beam: BeamShifts | None
+    assumed: dict[str, Unknowns]
     sensitivities: dict[str, float]
 
 
@@ -419,12 +422,24 @@ def _find_openness(
     if errors is not None and not by_part:
         by_part = {"noise": errors}
     by_beam = shifts_by_beam(data, scene, posterior, samples, options)
-    sensitivities = {}
+    sensitivities, assumed = {}, {}
     if samples:
         tested = replace(scene, imperfect=_tested_instrument(data, best))
         response = posterior_with(tested, _adapt(best, tested.imperfect, EXACT))
         exact = None if scene.imperfect.parts else posterior
-        sensitivities = response.sensitivities(np.random.default_rng(options.seed), exact)
+        responses = response.responses(np.random.default_rng(options.seed), exact)
+        moves = response.scene.displacement
+        sensitivities = {
+            key: largest_share(moves(change), moves(best.unknowns))
+            for key, (change, _) in responses.items()
+        }
+        # Counts are those of a detector that is linear and has no dark level.
+        if not (data.counted or data.instrument.has_numbers):
+            assumed = {
+                key: change.like(size * change.flat())
+                for key, (change, size) in responses.items()
+                if key in ASSUMED
+            }
     return _Openness(
         posterior if data.counted else None,  # its Jacobians are large
         samples,
@@ -432,6 +447,7 @@ def _find_openness(
         errors=errors,
         by_part=by_part,
         by_beam=by_beam,
+        assumed=assumed,
         sensitivities=sensitivities,
     )
 
@@ -614,6 +630,9 @@ def _result(
     errors, by_beam, by_part = openness.errors, openness.by_beam, openness.by_part
     if errors is not None and by_beam is not None:
         by_part, errors = {**by_part, "beam": by_beam.errors}, np.hypot(errors, by_beam.errors)
+    for key, change in openness.assumed.items():
+        by_part = {**by_part, key: displacement_errors(scene, [change], data.size)}
+        errors = None if errors is None else np.hypot(errors, by_part[key])
     counts = scene.ray_counts(unknowns)
     units = data.units[:, None, None]
     used = scene.weights[:, :height, :width] > 0

@@ -352,6 +352,9 @@ class Imperfect:
 
 EXACT = Imperfect()
 
+ASSUMED = frozenset({"background", "gamma"})
+"""Imperfections that errors include, of their tested sizes, where no detector was stated."""
+
 TITLES = {each.key: each.title for each in IMPERFECTIONS} | {
     "beam": "beam",
     "beam_between": "beam between energies",

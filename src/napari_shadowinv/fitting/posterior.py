@@ -42,7 +42,7 @@ from napari_shadowinv.physics.poisson import border_mean
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
 # Fields and numbers of an instrument that explain an image alike are found last of all.
 _IN_VALLEY = 1e-4
-_MOVED_BY_BEAMS = 0.01
+_MOVED_BY_BEAMS = _MOVED_BY_NUMBERS = 0.01
 _RESPONSE, _RESPONSE_SEED = 0.01, 2  # of fields to numbers of an instrument
 _REFITTED = 0.02
 _MOST_STEPS = 600
@@ -307,30 +307,44 @@ class Posterior:
             rest = rest.plus(moved.like(-effects[key].flat()))
         return {"noise": rest, **effects}
 
-    def sensitivities(
+    def responses(
         self, rng: np.random.Generator, exact: Posterior | None = None
-    ) -> dict[str, float]:
-        """Return how far each imperfection would move the displacement, as a share of it (r.m.s.).
+    ) -> dict[str, tuple[Unknowns, float]]:
+        """Return the response to each imperfection, of smooth fields to a random one, and its size.
 
-        By one standard deviation; of smooth fields by a random one. `exact` has the same scene and
-        unknowns without the instrument, whose numbers are 0 here.
+        `exact` has the same scene and unknowns without the instrument, whose numbers are 0 here.
+
+        The response is to one standard deviation, the size the r.m.s. number that prior and images
+        make likely. With the notation of `effects`, images show one by s standard deviations, where
+        s² = |B|² - BᵀJH⁻¹JᵀB, and ask for g / s, with g the objective's slope along it and its
+        response: so its mean is g / (1 + s²), its variance 1 / (1 + s²).
         """
         respond = exact or self._held
         none = respond._unknowns.zeros()
-        displacements = self.scene.displacement(self._unknowns)
-        pulls = {}
-        for part in self.scene.imperfect.parts:
+        # Without the instrument that is fitted, residuals ask for anything.
+        scene, counts = self.scene, self._counts
+        slope = scene.value_and_gradient(self._unknowns, counts)[1] if exact else none
+        pulls, squares, slopes = {}, [], []
+        for part in scene.imperfect.parts:
             numbers = self._unknowns.zeros()
-            size = part.places.stop - part.places.start
+            width = part.places.stop - part.places.start
             block = part.of(numbers.common, numbers.separate)
-            block[...] = rng.normal(size=size) if size > 1 else 1.0
-            pull = self._linear.pull(-self._linear.push(numbers))
+            block[...] = rng.normal(size=width) if width > 1 else 1.0
+            pushed = self._linear.push(numbers)
+            pull = self._linear.pull(-pushed)
             pulls[part.key] = pull._replace(common=none.common, separate=none.separate)
-        changes = respond._changes(list(pulls.values()), _ROUGHLY)
-        return {
-            key: largest_share(self.scene.displacement(change), displacements)
-            for key, change in zip(pulls, changes, strict=True)
-        }
+            squares.append(product(pushed.ravel(), pushed.ravel()))
+            along = part.of(slope.common, slope.separate)
+            slopes.append(float((block * along).sum()) if exact else 0.0)
+        slope = slope._replace(common=none.common, separate=none.separate)
+        changes = respond._changes(list(pulls.values()), _MOVED_BY_NUMBERS)
+        responses = {}
+        for key, change, square, along in zip(pulls, changes, squares, slopes, strict=True):
+            flat = change.flat()
+            shown = max(square - product(pulls[key].flat(), flat), 0.0)
+            mean = (along + product(slope.flat(), flat)) / (1 + shown)
+            responses[key] = change, float(np.sqrt(mean**2 + 1 / (1 + shown)))
+        return responses
 
     @property
     def _held(self) -> Posterior:
@@ -563,7 +577,7 @@ class BeamShifts:
     """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
 
     `by_percent` is for beams that vary by 1 %. `errors` is for beams that vary as far as is stated
-    or assumed, of which `changes` are random examples.
+    or assumed, which `changes` times independent normal numbers add up to.
     """
 
     by_percent: FloatArray
@@ -600,20 +614,21 @@ def shifts_by_beam(
     if not variation:
         return BeamShifts(by_percent, 0 * by_percent)
     scale = 100 * variation
-    scaled = tuple(change.like(scale * change.flat()) for change in changes)
+    each = scale / np.sqrt(len(changes))
+    scaled = tuple(change.like(each * change.flat()) for change in changes)
     return BeamShifts(by_percent, scale * by_percent, scaled)
 
 
 def sampled_potentials(
     scene: Scene,
     samples: Sequence[Sample],
-    by_beam: BeamShifts | None,
+    shifts: Sequence[Unknowns],
     size: tuple[int, int],
     seed: int,
 ) -> FloatArray:
     """Return random changes of each field's potential, px², that its total error allows.
 
-    Those by a beam that is not fitted are random combinations of the changes of `by_beam`.
+    Those by what is not fitted are random combinations of `shifts`.
 
     Parameters
     ----------
@@ -621,8 +636,8 @@ def sampled_potentials(
         In recorded pixels.
     samples : sequence of Sample
         The posterior's.
-    by_beam : BeamShifts or None
-        Changes by the beam.
+    shifts : sequence of Unknowns
+        Independent changes of one standard deviation each.
     size : tuple of int
         Height H and width W of the images.
     seed : int
@@ -634,11 +649,9 @@ def sampled_potentials(
         Their mean over the border is 0.
     """
     changes = [potentials_of(scene, sample.change, size) for sample in samples]
-    shifts = () if by_beam is None else by_beam.changes
     if shifts:
         moves = np.stack([potentials_of(scene, shift, size) for shift in shifts])
         draws = np.random.default_rng([seed, _BEAM_SEED]).normal(size=(len(samples), len(shifts)))
-        draws /= np.sqrt(len(shifts))
         changes = [
             change + np.einsum("s,smyx->myx", drawn, moves)
             for change, drawn in zip(changes, draws, strict=True)

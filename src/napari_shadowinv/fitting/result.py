@@ -32,9 +32,9 @@ from napari_shadowinv.facts import (
     verdict_fact,
     with_error,
 )
-from napari_shadowinv.fitting.instrument import TITLES, number_text
+from napari_shadowinv.fitting.instrument import ASSUMED, TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
-from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
+from napari_shadowinv.inversion.imperfections import IMPERFECTIONS, Imperfection
 from napari_shadowinv.inversion.variables import FIT_VARIABLES, belongs, dataset_from_field
 from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
@@ -48,7 +48,7 @@ from napari_shadowinv.physics.significance import (
 from napari_shadowinv.physics.units import (
     FLUX_DENSITY,
     PIXEL,
-    BeamCondition,
+    Condition,
     PeakError,
     ShownField,
     label,
@@ -263,7 +263,14 @@ class FitReport:
     def causes(self) -> list[str]:
         """The parts in a few words, the largest first."""
         titles = TITLES if self.beam is None else {**TITLES, "beam": self.beam.name}
+        titles |= {each.key: f"assumed {each.name(each.tested)}" for each, _ in self.assumed}
         return [titles[key] for key, part in self.parts.items() if part > 0]
+
+    @property
+    def assumed(self) -> list[tuple[Imperfection, float]]:
+        """Imperfections of tested sizes, and their parts, where no detector was stated."""
+        keys = (self.parts.keys() & ASSUMED) - self.numbers.keys()
+        return [(each, self.parts[each.key]) for each in IMPERFECTIONS if each.key in keys]
 
 
 @dataclass(frozen=True, repr=False)
@@ -424,7 +431,7 @@ class Fit(Summarised):
         """The peaks of the fields, the verdict and the warnings in one line."""
         level = Level.DOUBTFUL if self.cautions else self.verdict.level
         texts = []
-        if self.verdict is not Verdict.CONDITIONAL:  # whose explanation is the peak
+        if self.verdict.level is not Level.CONDITIONAL:  # whose explanation is the peak
             peaks = (self._shown_peak(field, self.setup) for field in self.fields)
             texts = [shown.short_peak_text(error) for shown, error in peaks]
         texts += [self.explanation, *in_headline(self.warnings)]
@@ -488,36 +495,44 @@ class Fit(Summarised):
         cause = cause if by_energy > share else self.report.error_name
         return PeakError(float(np.hypot(share, by_energy)), cause)
 
-    def beam_condition(self, share: float) -> BeamCondition | None:
-        """Return the condition on a beam that was assumed; None if that is not all that it takes.
+    def condition(self, share: float, *, beam_unknown: bool) -> Condition | None:
+        """Return the condition on what was assumed; None if that is not all that it takes.
 
         Parameters
         ----------
         share : float
             Largest total of the displacement (r.m.s.).
+        beam_unknown : bool
+            Whether the beam is fitted without a source.
         """
         report, beam, field = self.report, self.report.beam, self.fields[0]
-        if beam is not None and beam.assumed:
-            variation, left_open = beam.variation, beam.share
-            by_beam = 100 * beam.sensitivity * variation  # the images exclude part of it
-        elif "beam" in report.parts and self.instrument.beam_rms is None:
-            variation, by_beam = report.beam_rms, report.parts["beam"]
-            left_open = by_beam
-        else:
+        if not report.total > 0:
             return None
-        rest = math.sqrt(max(report.total**2 - left_open**2, 0.0))
+        of_beam = []
+        if beam is not None and beam.assumed:
+            effect = 100 * beam.sensitivity * beam.variation  # the images exclude part of it
+            of_beam = [("%", 100 * beam.variation, effect, beam.share)]
+        elif "beam" in report.parts and self.instrument.beam_rms is None and not beam_unknown:
+            of_beam = [("%", 100 * report.beam_rms, *2 * (report.parts["beam"],))]
+        of_detector = [
+            (f"{each.unit} of {each.title}".strip(), each.factor * each.tested, *2 * (part,))
+            for each, part in report.assumed
+        ]
+        subjects = {
+            "reference" if report.recorded else "beam": of_beam,
+            "detector": of_detector,
+            "beam and detector": of_beam + of_detector,
+        }
         (shown,) = shown_fields([field.displacement], None, mask=self.used)
         at_peak = field.error_at(*shown.peak)
         scale = at_peak / report.total
-        condition = BeamCondition.within(
-            share,
-            (rest, scale * rest),
-            [("%", 100 * variation, by_beam, scale * by_beam)],
-            recorded=report.recorded,
-        )
-        return condition and condition._replace(
-            peak_if_uneven=at_peak, field_if_uneven=report.total
-        )
+        for subject, assumed in subjects.items():
+            rest = math.sqrt(max(report.total**2 - sum(left**2 for *_, left in assumed), 0.0))
+            effects = [(unit, size, effect, scale * effect) for unit, size, effect, _ in assumed]
+            condition = Condition.within(share, (rest, scale * rest), effects, subject=subject)
+            if condition:
+                return condition._replace(peak_if_off=at_peak, field_if_off=report.total)
+        return None
 
     @property
     def _origins(self) -> tuple[ImageOrigin, ...]:

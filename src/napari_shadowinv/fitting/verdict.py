@@ -193,6 +193,7 @@ def assess_verdict(
     is_small = min(used.shape) < SMALL_PX
     # That of one image, or of a recorded source, is a linear response.
     numbers = {key for key, share in parts.items() if share} - {"noise", "edge"}
+    numbers -= {each.key for each, _ in report.assumed}
     is_fitted = fit.instrument.has_numbers or report.beam is None
     is_unsure = bool(numbers) and is_fitted and (is_small or _UNDERESTIMATED & numbers)
     safety = 1.0
@@ -203,7 +204,7 @@ def assess_verdict(
     elif is_unsure:
         fitted = sum(parts[key] ** 2 for key in numbers) / total**2
         safety = float(np.sqrt(1 + (_SAFETY**2 - 1) * min(fitted, 1.0)))
-    condition = None if beam_unknown else fit.beam_condition(max_error / safety)
+    condition = fit.condition(max_error / safety, beam_unknown=beam_unknown)
     if not condition and safety * total > max_error:
         ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
         text = f"errors of {total:.1%} of the displacement (r.m.s.): {ranking}; "
@@ -235,7 +236,9 @@ def assess_verdict(
         setup, field = fit.setup, fit.fields[0]
         deflector = deflector_titles()[field.name]
         (shown,) = shown_fields([field.displacement], setup, deflector, mask=used)
-        return Verdict.CONDITIONAL, shown.conditional_text(condition)
+        is_detector = condition.subject == "detector"
+        verdict = Verdict.DETECTOR if is_detector else Verdict.CONDITIONAL
+        return verdict, shown.conditional_text(condition)
     unchecked = "" if np.isfinite(total) else "; error bars were not worked out"
     if pattern.correlation > 0:
         unchecked += (

@@ -352,7 +352,7 @@ def invert(
         by_errors = [errors.beam_caution(), errors.edge_caution(options.max_error)]
     by_accuracy: list[Caution | None] = []
     is_asked = "accuracy" in options.model_fields_set
-    if errors is not None and errors.beam_condition(options.max_error) is None:
+    if errors is not None and errors.condition(options.max_error) is None:
         is_asked |= errors.share > options.max_error
     if finest and is_asked and errors is not None and quality.warnings == prepared.warnings:
         why = "with the most sites placed unless more are given"

@@ -12,7 +12,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent, round_down, to_figures
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.physics.edge import edge_doubt
-from napari_shadowinv.physics.units import BeamCondition, PeakError
+from napari_shadowinv.physics.units import Condition, PeakError
 
 SHARE_OF_NOISE = 0.2
 """Of the noise: smaller errors by the discretisation do not matter."""
@@ -210,7 +210,7 @@ class Errors:
         beam = None if self.beam_basis in _UNMEASURED else self.beam
         return replace(self, beam=beam, effects=effects, assumed="")
 
-    def beam_condition(self, share: float) -> BeamCondition | None:
+    def condition(self, share: float) -> Condition | None:
         """Return the condition on the assumed parts; None if a small total takes more than that.
 
         Parameters
@@ -226,11 +226,12 @@ class Errors:
         if shift := self.effects.get(self.assumed):
             sizes.append(("px", self.sizes[self.assumed], shift))
         measured = self._measured.total
-        return BeamCondition.within(
+        is_reference = bool(shift) or self.beam_basis == "reference"
+        return Condition.within(
             share,
             (measured.rms / self.rms, measured.at_peak / self.peak),
             [(unit, n, e.rms / self.rms, e.at_peak / self.peak) for unit, n, e in sizes],
-            recorded=bool(shift) or self.beam_basis == "reference",
+            subject="reference" if is_reference else "beam",
         )
 
     def measured_text(self, subject: str) -> str:

@@ -309,7 +309,7 @@ class Inversion(Summarised):
         text = f"errors of {errors.share_text} of the {self._subject(errors)} (r.m.s.)"
         if errors.share <= max_error:
             return Assessment(Verdict.DETERMINED, f"{text}, limited by {errors.limited_by}")
-        if condition := errors.beam_condition(max_error):
+        if condition := errors.condition(max_error):
             (field,) = shown_fields([self.displacement], setup, mask=self.lit)
             return Assessment(Verdict.CONDITIONAL, field.conditional_text(condition))
         parts = [errors.measured_text(self._subject(errors)), errors.measure_next(max_error)]

@@ -56,15 +56,25 @@ def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> t
     return 10.0**-power, _PREFIXES[power]
 
 
-class BeamCondition(NamedTuple):
-    """Errors of a field that depend on what nobody measured of its beam, as shares of the field."""
+# If known to that, if off by that, and what to do.
+_CONDITIONS = {
+    "beam": "the beam is even to {}|it is {} uneven|record a reference",
+    "reference": "beam and reference agree to {}|they differ by {}|compare two references",
+    "detector": "the detector is exact to {}|it is off by {}|state the instrument",
+    "beam and detector": "beam and detector are exact to {}|they are off by {}|record a reference, "
+    "and state the instrument",
+}
 
-    agreement: str  # of beam and source, that leaves the field determined
+
+class Condition(NamedTuple):
+    """Errors of a field that depend on what nobody measured, as shares of the field."""
+
+    agreement: str  # of what was not measured, that leaves the field determined
     difference: str  # that is assumed
-    peak_if_even: float
-    peak_if_uneven: float
-    field_if_uneven: float  # r.m.s.
-    recorded: bool  # whether the source is a reference of another exposure
+    peak_if_exact: float
+    peak_if_off: float
+    field_if_off: float  # r.m.s.
+    subject: str  # what was not measured, of `_CONDITIONS`
 
     @classmethod
     def within(
@@ -73,8 +83,8 @@ class BeamCondition(NamedTuple):
         rest: tuple[float, float],
         assumed: Collection[tuple[str, float, float, float]],
         *,
-        recorded: bool,
-    ) -> BeamCondition | None:
+        subject: str,
+    ) -> Condition | None:
         """Return the condition for a total error of the field (r.m.s.) of at most `largest`.
 
         `rest` are the errors of field and peak by all that was measured; `assumed` has the unit of
@@ -93,7 +103,7 @@ class BeamCondition(NamedTuple):
         )
         reduced = np.multiply(peaks, known) / sizes
         at_peak = math.hypot(rest[1], *reduced), math.hypot(rest[1], *peaks)
-        return cls(agreement, difference, *at_peak, math.hypot(rest[0], by_assumed), recorded)
+        return cls(agreement, difference, *at_peak, math.hypot(rest[0], by_assumed), subject)
 
 
 class PeakError(NamedTuple):
@@ -135,21 +145,15 @@ class ShownField:
         share = error.share if error else 0.0
         return f"peak {self.symbol} {with_error(self.largest, share * self.largest)} {self.unit}"
 
-    def conditional_text(self, condition: BeamCondition) -> str:
-        """Write the largest magnitude with its errors by an even and by the assumed beam."""
-        peak = self.short_peak_text(PeakError(condition.peak_if_even, ""))
-        otherwise = (
-            f"± {to_figures(condition.peak_if_uneven * self.largest)} "
-            f"(field {percent(condition.field_if_uneven)})"
-        )
-        if condition.recorded:
-            return (
-                f"{peak} if beam and reference agree to {condition.agreement}; {otherwise} if they "
-                f"differ by {condition.difference} (assumed); compare two references"
-            )
+    def conditional_text(self, condition: Condition) -> str:
+        """Write the largest magnitude with its errors by what is exact and by what is assumed."""
+        peak = self.short_peak_text(PeakError(condition.peak_if_exact, ""))
+        exact, off, remedy = _CONDITIONS[condition.subject].split("|")
         return (
-            f"{peak} if the beam is even to {condition.agreement}; {otherwise} if it is "
-            f"{condition.difference} uneven (assumed); record a reference"
+            f"{peak} if {exact.format(condition.agreement)}; "
+            f"± {to_figures(condition.peak_if_off * self.largest)} "
+            f"(field {percent(condition.field_if_off)}) "
+            f"if {off.format(condition.difference)} (assumed); {remedy}"
         )
 
     def peak_text(self, error: PeakError | None = None) -> str:
