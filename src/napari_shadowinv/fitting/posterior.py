@@ -334,8 +334,8 @@ class Posterior:
             pull = self._linear.pull(-pushed)
             pulls[part.key] = pull._replace(common=none.common, separate=none.separate)
             squares.append(product(pushed.ravel(), pushed.ravel()))
-            along = part.of(slope.common, slope.separate)
-            slopes.append(float((block * along).sum()) if exact else 0.0)
+            of_part = part.of(slope.common, slope.separate)
+            slopes.append(float((block * of_part).sum()) if exact else 0.0)
         slope = slope._replace(common=none.common, separate=none.separate)
         changes = respond._changes(list(pulls.values()), _MOVED_BY_NUMBERS)
         responses = {}
