@@ -652,6 +652,7 @@ def sampled_potentials(
     if shifts:
         moves = np.stack([potentials_of(scene, shift, size) for shift in shifts])
         draws = np.random.default_rng([seed, _BEAM_SEED]).normal(size=(len(samples), len(shifts)))
+        draws /= np.sqrt((draws**2).mean(axis=0))  # of few samples it would differ by chance
         changes = [
             change + np.einsum("s,smyx->myx", drawn, moves)
             for change, drawn in zip(changes, draws, strict=True)
