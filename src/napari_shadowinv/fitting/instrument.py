@@ -246,10 +246,7 @@ class Imperfect:
 
     @property
     def resembles_fields(self) -> bool:
-        """Whether numbers change images so nearly as fields do that small errors tell them apart.
-
-        Fields can replace beams of their own for each image, but not a beam that all share.
-        """
+        """Whether fields can replace numbers nearly: beams of each image, but not a common one."""
         return bool(self.of_response) or "beam_between" in self.keys
 
     def only(self, images: list[int]) -> Imperfect:

@@ -171,10 +171,7 @@ class Posterior:
         ]
 
     def _draw(self, normal: FloatArray) -> tuple[Sample, Unknowns]:
-        """Noise, the force of the prior and held numbers, drawn for a sample, and their slope.
-
-        `normal` are normal numbers for those of the instrument whose spread is known.
-        """
+        """Noise, the prior's force and held numbers (by `normal` ones) of a sample; their slope."""
         noise = self._rng.normal(size=self.scene.images.shape)
         numbers, residuals = self._unknowns.zeros(), noise
         if self.scene.held:

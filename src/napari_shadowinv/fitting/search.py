@@ -241,7 +241,7 @@ def estimate_smoothness(
     is_small = scene.images.size <= _MOST_RECORDED
     if scene.imperfect.resembles_fields and is_small and not is_near:
         # In larger pixels fine structure is lost by which a blur differs from a smooth object, and
-        # by which a field that replaces the beams would move the structure of the object.
+        # which a field that replaces the beams would move.
         end = in_recorded_pixels(scene, end)
     least_gain = COARSE_GAIN if is_near else _LAST_GAIN
     end = settle_minimum(scene, end, on_step, least_gain=least_gain)

@@ -78,9 +78,9 @@ _LOST = 0.01  # of the rays
 # Of 60 fits on 96 px, the r.m.s. ratio of error to total was 1.0, with a transmission 1.3; of 60 on
 # 64 px the largest was 3.9, of one on 200 px with a blur 3.0.
 # Of 14 with an unknown beam it was up to 3.2 where momenta are close; of beams that differ between
-# energies the r.m.s. ratio was 1.4 on folds and 1.8 to 3.1 on weak rings.
+# energies the r.m.s. ratio was 1.2, of weak rings 1.4.
 _UNDERESTIMATED = {"blur", "gamma", "absorption"}
-_SAFETY, _SAFETY_BETWEEN = 2.0, 3.0
+_SAFETY = 2.0
 _MEASURE = "measure the {}, or add an image at another energy, which shows more of it"
 _ADVICE = {
     "noise": "average shots, or take images at energies that differ more",
@@ -197,9 +197,7 @@ def assess_verdict(
     is_fitted = fit.instrument.has_numbers or report.beam is None
     is_unsure = bool(numbers) and is_fitted and (is_small or _UNDERESTIMATED & numbers)
     safety = 1.0
-    if fit.instrument.beam_between and not single:
-        safety = _SAFETY_BETWEEN
-    elif beam_unknown:
+    if beam_unknown or (fit.instrument.beam_between and not single):
         safety = _SAFETY
     elif is_unsure:
         fitted = sum(parts[key] ** 2 for key in numbers) / total**2

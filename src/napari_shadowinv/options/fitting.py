@@ -91,7 +91,8 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
         default=6,
         ge=0,
         le=1000,
-        description="Number of random fields for the error bars; 0 for no error bars.",
+        description="Number of random fields for the error bars, at least 24 where the beams of "
+        "energies differ; 0 for no error bars.",
     )
     sampling: Literal["linear", "resolve"] = Field(
         default="linear",

@@ -139,7 +139,6 @@ def _magnitude_error(field: FittedField, in_units: ShownField) -> FloatArray | N
 
 _PANELS_PER_IMAGE = 3  # image, prediction, residual
 _MAX_LEFT_OUT_ROWS = 6  # of images; more start a second column
-_PAGE_ASPECT = 1.6
 
 
 def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figure:
