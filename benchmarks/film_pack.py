@@ -40,10 +40,10 @@ from napari_shadowinv import FitOptions, Recipe
 from napari_shadowinv.film import move_corners, straighten_film, write_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.film_doses import FilmDoses
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import read_pack, run_film, run_fit
 from napari_shadowinv.preprocessing import Bin
+from napari_shadowinv.shot import Shot
 from simulated_pack import Truth, simulate
 
 HEAD = (
@@ -165,7 +165,7 @@ def fitted(
     With an `align` other than "none" films may be shifted by about `spread` px of the scan.
     """
     shots = [
-        FitShot(image=plane, setup=setup, mask=mask, source="unknown")
+        Shot(image=plane, setup=setup, mask=mask, source="unknown")
         for plane, mask, setup in zip(images.planes, images.masks, images.setups, strict=True)
     ]
     options = FitOptions(align=align, align_spread=spread / binned)

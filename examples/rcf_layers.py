@@ -24,7 +24,7 @@ import tifffile
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from napari_shadowinv import InversionOptions, Radiograph, invert
+from napari_shadowinv import InversionOptions, Shot, invert
 from napari_shadowinv.film import Calibration, dose
 from napari_shadowinv.preprocessing import low_pass_source
 
@@ -57,7 +57,7 @@ for layer, (energy, top, left) in LAYERS.items():
     scan = tifffile.imread(options.folder / f"RCF_18{layer}.tif")
     scan = scan[top : top + HEIGHT, left : left + WIDTH]
     found = dose(scan, calibration, background=unexposed)
-    doses[layer] = Radiograph(found.dose).bin_pixels(factor).image / factor**2
+    doses[layer] = Shot(found.dose).bin_pixels(factor).image / factor**2
     outside[layer] = float(found.outside.mean())
     print(
         f"{layer}, {energy} MeV: {doses[layer].min():.1f} to {doses[layer].max():.0f} Gy, "

@@ -24,8 +24,9 @@ from napari_shadowinv.inversion.budget import FLUX_ERRORS
 from napari_shadowinv.io import store_columns
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.preprocessing import STEPS, Radiograph
+from napari_shadowinv.preprocessing import STEPS
 from napari_shadowinv.preprocessing.steps import Step, choices_of
+from napari_shadowinv.shot import Shot
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "napari_shadowinv"
@@ -66,7 +67,7 @@ def test_the_filter_is_a_step(names):
     assert "median" not in STEPS
     image = np.ones((20, 20))
     image[9, 9] = 50.0
-    np.testing.assert_array_equal(step.apply(Radiograph(image)).image, 1.0)
+    np.testing.assert_array_equal(step.apply(Shot(image)).image, 1.0)
 
 
 def test_the_product_has_a_band(names):

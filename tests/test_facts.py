@@ -28,7 +28,7 @@ from napari_shadowinv.cli._summary import fact_rows as table_rows
 from napari_shadowinv.facts import Headline, Level, Verdict, percent, to_figures, with_error
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.physics.units import shown_fields
-from napari_shadowinv.preprocessing import Radiograph
+from napari_shadowinv.shot import Shot
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def results_of(image, inversion):
         Caution("other", f"doubt {number} of <script> & co, {'very ' * 60}long")
         for number in range(9)
     )
-    radiograph = Radiograph(image, path=Path("<b>.tif"), mask=image > 0)
+    radiograph = Shot(image, path=Path("<b>.tif"), mask=image > 0)
     products = analyse(inversion, ["contrast"])
     return [inversion, doubtful, fit([image], noise=0.01, options=hasty), radiograph, *products]
 
@@ -130,10 +130,10 @@ def test_a_file_or_its_content_is_no_image_yet(function, image, tmp_path):
     for path in (file, str(file)):
         with pytest.raises(InputError, match=r"is the file .*shot.npy.*read\(.*\)\.image"):
             function(path)
-    with pytest.raises(InputError, match=r"source is a Radiograph, .* give its \.image"):
+    with pytest.raises(InputError, match=r"source is a Shot, .* give its \.image"):
         function(image, source=read(file))
     if function is invert:
-        with pytest.raises(InputError, match=r"image is a Radiograph, .* give its \.image"):
+        with pytest.raises(InputError, match=r"image is a Shot, .* give its \.image"):
             function(read(file))
 
 

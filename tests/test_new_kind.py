@@ -23,7 +23,6 @@ from napari_shadowinv import (
     stack_statistics,
 )
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read, read_radiograph, write
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -33,6 +32,7 @@ from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.pipeline.fit_run import compared_fields, refinement_choices, run_refinement
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.shot import Shot
 
 SHAPE = (40, 44)
 RATIO = (8 / 12) ** 2
@@ -107,7 +107,7 @@ def test_refinement_fits_the_field_of_a_new_kind(setups, images):
 
 
 def test_fit_scales_images_by_a_new_kind(setups, images, tmp_path):
-    shots = [FitShot(image, setup=s) for image, s in zip(images, setups, strict=True)]
+    shots = [Shot(image, setup=s) for image, s in zip(images, setups, strict=True)]
     recipe = Recipe(fit=FitChoices(options=HASTY))
     result = run_fit(recipe, shots)
     np.testing.assert_allclose(result.strengths, [[1.0], [RATIO]])

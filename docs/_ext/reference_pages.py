@@ -36,7 +36,7 @@ TASKS: dict[str, tuple[str, ...]] = {
         "Caution",
         "plan_sites",
     ),
-    "Apply a recipe to a file": ("read", "Radiograph", "Recipe", "run", "write"),
+    "Apply a recipe to a file": ("read", "Shot", "Recipe", "run", "write"),
     "Repeat a result from its provenance": ("rerun", "Rerun"),
     "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
     "Estimate the error of a field": (
@@ -47,7 +47,7 @@ TASKS: dict[str, tuple[str, ...]] = {
         "Maximum",
     ),
     "Measure currents, profiles and maps of a result": ("analyse",),
-    "Fit one or several images, also where rays cross": ("fit", "FitShot", "FitOptions", "Fit"),
+    "Fit one or several images, also where rays cross": ("fit", "Shot", "FitOptions", "Fit"),
     "Invert many shots": (
         "run_stack",
         "RunOptions",

@@ -3,7 +3,7 @@ from ._system.progress import Progress
 from .analysis import analyse
 from .cautions import Caution
 from .errors import FileFormatError, InputError, InversionCancelled
-from .fitting import Fit, FitShot, fit
+from .fitting import Fit, fit
 from .inversion import Inversion, Report, invert, plan_sites
 from .inversion.error_bars import Maximum, Uncertainty, uncertainty
 from .io import read, write
@@ -18,7 +18,8 @@ from .physics.tracing import TracedImage, trace
 from .pipeline import run
 from .pipeline.rerun import Rerun, rerun
 from .pipeline.run_options import RunOptions, WatchOptions
-from .preprocessing import Radiograph, Recipe
+from .preprocessing import Recipe
+from .shot import Shot
 from .stack import invert_stack, run_stack, stack_statistics, watch_stack
 
 __version__: str
@@ -30,7 +31,6 @@ __all__ = [
     "FileFormatError",
     "Fit",
     "FitOptions",
-    "FitShot",
     "InputError",
     "Instrument",
     "Inversion",
@@ -40,11 +40,11 @@ __all__ = [
     "OpticalSetup",
     "Progress",
     "ProtonSetup",
-    "Radiograph",
     "Recipe",
     "Report",
     "Rerun",
     "RunOptions",
+    "Shot",
     "TraceOptions",
     "TracedImage",
     "Uncertainty",

@@ -91,7 +91,7 @@ class ImageOrigin(Origin):
         Values of this image; None where the recipe counts. An image to invert was divided by its
         brightness.
     measured : bool
-        Whether the source of an image of a fit was recorded, as `FitShot.measured`.
+        Whether the source of an image of a fit was recorded, as `Shot.measured`.
     notes : tuple of str
         Notes of the steps, for people.
     warnings : tuple of Caution

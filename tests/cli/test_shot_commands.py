@@ -49,11 +49,11 @@ from napari_shadowinv.preprocessing import (
     Crop,
     HotPixelFilter,
     LowPassFilter,
-    Radiograph,
     Recipe,
     UniformEstimate,
 )
 from napari_shadowinv.provenance import ImageOrigin, Provenance
+from napari_shadowinv.shot import Shot
 
 BLOB = gaussian_blob((24, 32), 6.0, 4.0, (10, 18))
 
@@ -98,9 +98,7 @@ def refused(folder: Path) -> Callable[..., None]:
     return run
 
 
-def prepared(
-    image: str, source: str | None = None, mask: str | None = None, **flags: Any
-) -> Radiograph:
+def prepared(image: str, source: str | None = None, mask: str | None = None, **flags: Any) -> Shot:
     """Return a shot and its source after the steps that flags ask for."""
     recipe = recipe_of(flags, Recipe(mask=None if mask is None else Path(mask)))
     return collect_inputs(recipe, image, source=source).prepare()

@@ -13,12 +13,13 @@ from helpers.fit_images import Displacement, bump, counted, distance, noisy, on_
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitShot, compare, fit
+from napari_shadowinv.fitting import Fit, compare, fit
 from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.plotting import fit_figure
+from napari_shadowinv.shot import Shot
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
@@ -242,11 +243,11 @@ def test_a_start_at_the_truth_is_taken() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
     y, x = np.indices(SIZE) - np.array([22, 29])[:, None, None]
     truth = 0.4 * 8**2 * np.exp(-(y**2 + x**2) / 2 / 8**2)
-    result = fit(FitShot(image[0], start=truth), noise=0.02, options=PLAIN)
+    result = fit(Shot(image[0], start=truth), noise=0.02, options=PLAIN)
     assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
     for wrong in (truth[1:], np.full(SIZE, np.nan)):
         with pytest.raises(InputError, match="start has shape"):
-            fit(FitShot(image[0], start=wrong), noise=0.02, options=PLAIN)
+            fit(Shot(image[0], start=wrong), noise=0.02, options=PLAIN)
 
 
 def test_a_mask_of_all_images_is_the_mask_of_each() -> None:
@@ -255,7 +256,7 @@ def test_a_mask_of_all_images_is_the_mask_of_each() -> None:
     shots = np.array(shots_of(WEAK))
     shots[:, hole] = 1e6
     by_all = fit(shots, strengths=STRENGTHS, noise=NOISE, mask=~hole, options=HASTY)
-    each = [FitShot(s, strength=(k,), mask=~hole) for s, k in zip(shots, STRENGTHS, strict=True)]
+    each = [Shot(s, strength=(k,), mask=~hole) for s, k in zip(shots, STRENGTHS, strict=True)]
     by_each = fit(each, noise=NOISE, options=HASTY)
     assert_array_equal(by_all.mask, np.broadcast_to(~hole, shots.shape))
     assert_array_equal(by_all.fields[0].potential, by_each.fields[0].potential)

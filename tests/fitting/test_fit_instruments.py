@@ -13,8 +13,9 @@ from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitShot, fit
+from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.options import FitOptions
+from napari_shadowinv.shot import Shot
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
@@ -221,7 +222,7 @@ def test_fiducials_hold_the_field_where_noise_does_not() -> None:
     displaced = truth[:, *places] + np.random.default_rng(6).normal(0, 0.03, (2, 25))
     fiducials = np.column_stack([*places, *displaced, np.full(25, 0.03)])
     fields = [
-        fitted(FitShot(image[0], fiducials=table), strengths=None, noise=0.3).fields[0].displacement
+        fitted(Shot(image[0], fiducials=table), strengths=None, noise=0.3).fields[0].displacement
         for table in (None, fiducials)
     ]
     missed = [np.sqrt(((field[:, *places] - displaced) ** 2).mean()) for field in fields]

@@ -18,11 +18,11 @@ from napari_shadowinv.fitting.measurements import (
     strengths_of,
 )
 from napari_shadowinv.fitting.references import smooth_references
-from napari_shadowinv.fitting.shots import FitShot, point_spread
+from napari_shadowinv.fitting.shots import point_spread
 from napari_shadowinv.inversion.noise import estimated_noise
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.preprocessing import Radiograph
+from napari_shadowinv.shot import Shot
 
 SIZE = (40, 51)
 
@@ -42,7 +42,7 @@ def given(**changes: Any) -> FitData:
     usual |= changes
     planes = usual.pop("images")
     if "fiducials" in usual:
-        planes = [FitShot(planes[0], fiducials=usual.pop("fiducials")), *planes[1:]]
+        planes = [Shot(planes[0], fiducials=usual.pop("fiducials")), *planes[1:]]
     return collect_data(planes, **usual)
 
 
@@ -412,8 +412,8 @@ def test_what_is_known_of_an_image_precedes_what_is_known_of_all() -> None:
     beam, mask = np.full(SIZE, 5.0), np.ones(SIZE, bool)
     mask[3:6, 4:9] = False
     shots = [
-        FitShot(first, strength=(1.0,), source=beam, brightness=1.0, mask=mask),
-        FitShot(second, strength=(0.6,), source=beam, brightness=2.0, psf=0.5, noise=0.3),
+        Shot(first, strength=(1.0,), source=beam, brightness=1.0, mask=mask),
+        Shot(second, strength=(0.6,), source=beam, brightness=2.0, psf=0.5, noise=0.3),
     ]
     data = collect_data(shots, noise=0.1, psf=0.2, options=FitOptions())
     masks = [mask, np.ones(SIZE, bool)]
@@ -430,10 +430,10 @@ def test_radiographs_have_setup_source_and_mask_and_a_dict_names() -> None:
     setups = protons(14.7), protons(6)
     beam, mask = np.full(SIZE, 5.0), np.eye(*SIZE) == 0
     shots = [
-        Radiograph(image, setup, source=beam, mask=mask)
+        Shot(image, setup, source=beam, mask=mask)
         for image, setup in zip(images(), setups, strict=True)
     ]
-    data = collect_data({"fast": shots[0], "slow": FitShot(shots[1])}, options=FitOptions())
+    data = collect_data({"fast": shots[0], "slow": Shot(shots[1])}, options=FitOptions())
     assert data.names == ("fast", "slow")
     assert data.setups == setups
     np.testing.assert_array_equal(data.scene.weights[1, : SIZE[0], : SIZE[1]] > 0, mask)
@@ -461,9 +461,7 @@ def test_images_that_are_known_differently_are_refused(
     first: dict[str, Any], second: dict[str, Any], message: str
 ) -> None:
     keywords = {} if "strength" in first else {"strengths": [1, 0.6]}
-    shots = [
-        FitShot(image, **known) for image, known in zip(images(), (first, second), strict=True)
-    ]
+    shots = [Shot(image, **known) for image, known in zip(images(), (first, second), strict=True)]
     with pytest.raises(InputError, match=re.escape(message)):
         collect_data(shots, options=FitOptions(), **keywords)
 
@@ -479,11 +477,11 @@ def test_what_is_known_of_each_and_of_all_is_refused(
     known: dict[str, Any], keywords: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(InputError, match=message):
-        collect_data(FitShot(images()[0], **known), options=FitOptions(), **keywords)
+        collect_data(Shot(images()[0], **known), options=FitOptions(), **keywords)
 
 
 def test_a_file_is_not_read() -> None:
     with pytest.raises(
         InputError, match=r"received the file a\.tif: read it first, or use run_fit"
     ):
-        collect_data([FitShot(Path("a.tif"))], options=FitOptions())
+        collect_data([Shot(Path("a.tif"))], options=FitOptions())

@@ -9,9 +9,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.fitting.forward import Linear
 from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.shot import Shot
 
 __all__ = [
     "Displacement",
@@ -111,7 +111,7 @@ def distance(found: FloatArray, truth: FloatArray) -> float:
     return float(np.linalg.norm(found - truth) / np.linalg.norm(truth))
 
 
-def of_each(shots: Sequence[FitShot], attribute: str) -> list[Any]:
+def of_each(shots: Sequence[Shot], attribute: str) -> list[Any]:
     """What is known of each image."""
     return [getattr(shot, attribute) for shot in shots]
 

@@ -37,10 +37,10 @@ from napari_shadowinv.preprocessing import (
     ESTIMATES,
     LowPassFilter,
     PolynomialEstimate,
-    Radiograph,
     Recipe,
     polynomial_source,
 )
+from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import invert_stack, run_stack
 from napari_shadowinv.transport.solvers import solve
 
@@ -657,7 +657,7 @@ def test_each_estimate_of_a_source_is_a_beam_that_nobody_measured(method, tmp_pa
     estimate = ESTIMATES[method]()
     bare = np.hypot(*(np.indices(image.shape) - 31.5)) > 20 if estimate.uses_mask else None
     recipe = Recipe(source=estimate, setup=setup, options=InversionOptions(n_sites=400))
-    shot = run(recipe, Radiograph(image, source_mask=bare)).errors
+    shot = run(recipe, Shot(image, source_mask=bare)).errors
     store = run_stack(image[None], tmp_path / "s.shadowinv.zarr", recipe, source_mask=bare)
     of_stack = json.loads(str(store.report.values[0]))["errors"]
     if method == "kriged":

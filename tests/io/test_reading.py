@@ -17,7 +17,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read, read_dataset, read_radiograph, read_toml
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.images import film_warnings
-from napari_shadowinv.preprocessing import Radiograph
+from napari_shadowinv.shot import Shot
 
 RAMP = np.arange(6 * 9).reshape(6, 9)
 
@@ -268,7 +268,7 @@ def test_toml_mistakes_name_file_and_line(tmp_path: Path) -> None:
 def test_bins_sum_counts_and_widen_pixels(proton_setup: Any) -> None:
     mask = np.ones((6, 9), bool)
     mask[0, 0] = False
-    shot = Radiograph(RAMP.astype(float), setup=proton_setup, mask=mask, source=np.ones((6, 9)))
+    shot = Shot(RAMP.astype(float), setup=proton_setup, mask=mask, source=np.ones((6, 9)))
     binned = shot.bin_pixels(2)
     assert binned.image.shape == (3, 4)
     assert binned.image.sum() == RAMP[:6, :8].sum()

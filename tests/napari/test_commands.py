@@ -10,10 +10,10 @@ from napari.components import ViewerModel
 
 from helpers.shifted_pair import shifted_pair
 from napari_shadowinv import (
-    FitShot,
     InputError,
     InversionOptions,
     ProtonSetup,
+    Shot,
     add_inversion,
     fit,
     invert,
@@ -124,7 +124,7 @@ def test_an_inversion_is_refined_from_any_of_its_layers(
         role_of(entries): (data, entries) for data, entries, _ in commands.refine(arrows, viewer)
     }
     data, keywords = by_role["field"]
-    image = FitShot(
+    image = Shot(
         inversion.image,
         setup=proton_setup,
         source=inversion.source,

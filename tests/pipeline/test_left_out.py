@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from napari_shadowinv import FitOptions, InputError, ProtonSetup
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import run_leave_one_out
 from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.shot import Shot
 
 SHAPE = (56, 64)
 NOISE = 0.02
@@ -27,10 +27,10 @@ PLAIN = FitOptions(samples=0, spacing=0.2)
 RECIPE = Recipe(fit=FitChoices(noise=NOISE, options=PLAIN))
 
 
-def shots_of(factors: tuple[float, ...], **changes: Any) -> list[FitShot]:
+def shots_of(factors: tuple[float, ...], **changes: Any) -> list[Shot]:
     noise = np.random.default_rng(5).normal(0, NOISE, (5, *SHAPE))
     return [
-        FitShot(synthetic_image(factor * strength * TRUTH) + plane, setup, **changes)
+        Shot(synthetic_image(factor * strength * TRUTH) + plane, setup, **changes)
         for factor, strength, setup, plane in zip(factors, STRENGTHS, SETUPS, noise, strict=False)
     ]
 
@@ -51,6 +51,6 @@ def test_nothing_depends_on_the_order_of_images_or_on_threads() -> None:
 def test_leave_one_out_refuses_too_few_or_unordered_images() -> None:
     with pytest.raises(InputError, match="received 2 images: leaving one out needs 3"):
         run_leave_one_out(RECIPE, shots_of(FACTORS)[:2])
-    bare = [FitShot(shot.image) for shot in shots_of(FACTORS)]
+    bare = [Shot(shot.image) for shot in shots_of(FACTORS)]
     with pytest.raises(InputError, match="neither strengths nor setups"):
         run_leave_one_out(RECIPE, bare)

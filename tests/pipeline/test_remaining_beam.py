@@ -12,7 +12,8 @@ from napari_shadowinv import Inversion
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.pipeline import run
-from napari_shadowinv.preprocessing import Radiograph, Recipe
+from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.shot import Shot
 
 SIDE, RAYS = 96, 4  # rays along a pixel
 Y, X = np.indices((SIDE, SIDE), dtype=float)
@@ -53,7 +54,7 @@ def test_what_is_taken_from_an_object_in_an_exact_beam_is_in_the_total(recipe: A
 
 
 def test_a_flat_reference_does_not_excuse_a_filter() -> None:
-    recorded = Radiograph(shot(np.ones((SIDE, SIDE))), source=np.ones((SIDE, SIDE)))
+    recorded = Shot(shot(np.ones((SIDE, SIDE))), source=np.ones((SIDE, SIDE)))
     found = run(Recipe(**HIGH_PASS), recorded)
     assert 0.6 < told_over_true(found) < 1.7
     assert found.errors is not None

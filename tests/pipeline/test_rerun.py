@@ -17,7 +17,6 @@ import tifffile
 from napari_shadowinv import FitOptions, InputError, InversionOptions, ProtonSetup, rerun, run_stack
 from napari_shadowinv.errors import FileFormatError, InversionCancelled
 from napari_shadowinv.film_doses import FilmDoses
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read_dataset, write
 from napari_shadowinv.io.store import read_stack
 from napari_shadowinv.options import FitChoices
@@ -37,6 +36,7 @@ from napari_shadowinv.pipeline.rerun import provenance_of
 from napari_shadowinv.pipeline.shot_table import shot_rows
 from napari_shadowinv.preprocessing import Crop, Dark, LowPassFilter, Recipe
 from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.shot import Shot
 from simulated_pack import simulate
 
 SHAPE = (40, 48)
@@ -75,10 +75,10 @@ def record(folder: Path) -> list[Path]:
     return paths
 
 
-def fit_shots(paths: list[Path]) -> list[FitShot]:
+def fit_shots(paths: list[Path]) -> list[Shot]:
     source, mask = Path("beam.npy"), Path("mask.tif")
     return [
-        FitShot(path, setup, source=source, mask=mask)
+        Shot(path, setup, source=source, mask=mask)
         for path, setup in zip(paths, SETUPS, strict=False)
     ]
 

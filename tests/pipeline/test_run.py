@@ -43,7 +43,6 @@ from napari_shadowinv.preprocessing import (
     LowPassFilter,
     MeasuredSource,
     PolynomialEstimate,
-    Radiograph,
     Recipe,
     Rotate,
     Step,
@@ -52,6 +51,7 @@ from napari_shadowinv.preprocessing import (
     remove_background,
 )
 from napari_shadowinv.provenance import MaskOrigin
+from napari_shadowinv.shot import Shot
 
 SHAPE = (40, 52)
 OPTIONS = InversionOptions(n_sites=400)
@@ -134,7 +134,7 @@ def test_the_matrix_says_where_pixels_came_from(steps: tuple[Step, ...]) -> None
     recipe = Recipe(steps=steps, setup=paper_setup())
     matrix = recipe.matrix(SHAPE)
     for axis, plane in enumerate(np.indices(SHAPE, dtype=float)):
-        moved = recipe.move(Radiograph(plane, setup=paper_setup()))
+        moved = recipe.move(Shot(plane, setup=paper_setup()))
         assert moved.shape == recipe.shape_after(SHAPE)
         share = abs(np.linalg.det(matrix))  # pixels of the image in one of the result
         y, x = np.indices(moved.shape)
@@ -156,7 +156,7 @@ def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step,
         recipe = Recipe(steps=steps, source=estimate, setup=setup, options=OPTIONS)
         inversion = run(recipe, image)
         uncropped = run(Recipe(source=estimate, setup=setup, options=OPTIONS), image).source
-        moved = recipe.move(Radiograph(uncropped))
+        moved = recipe.move(Shot(uncropped))
         used = inversion.mask if moved.mask is None else inversion.mask & moved.mask
         ratio = inversion.source[used] / moved.image[used]
         # The source sees the same solid angle, up to the curvature within rotated pixels.

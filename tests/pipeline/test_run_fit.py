@@ -12,7 +12,6 @@ import tifffile
 from helpers.fit_images import of_each
 from napari_shadowinv import Fit, InputError, Instrument, ProtonSetup, fit, rerun
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io import read, write
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -28,6 +27,7 @@ from napari_shadowinv.preprocessing import (
     low_pass_source,
 )
 from napari_shadowinv.provenance import Origin
+from napari_shadowinv.shot import Shot
 
 SHAPE = (84, 92)
 SETUPS = [
@@ -65,14 +65,14 @@ def test_run_fit_equals_a_fit_of_the_prepared_images(images: list[FloatArray]) -
     source = np.full(SHAPE, 1.0)
     choices = FitChoices(noise=0.04, source_size=1e-5, brightness="free", options=HASTY)
     shots = [
-        FitShot(image, setup, source=source, mask=mask)
+        Shot(image, setup, source=source, mask=mask)
         for image, setup in zip(images, SETUPS, strict=True)
     ]
     result = run_fit(Recipe(steps=STEPS, fit=choices), shots)
     after = [setup.model_copy(update={"pixel_size": 2e-5}) for setup in SETUPS]
     spread = 1e-5 * (1 - 1 / SETUPS[0].magnification) / 2e-5
     by_hand = fit(
-        [FitShot(binned(image), mask=binned(mask) == 4) for image in images],
+        [Shot(binned(image), mask=binned(mask) == 4) for image in images],
         setups=after,
         source=np.full((40, 40), 4.0),
         noise=0.04,
@@ -92,8 +92,8 @@ def test_provenance_is_complete_and_survives_its_file(
         tifffile.imwrite(path, image.astype(np.float32))
     mask = np.random.default_rng(1).random(SHAPE) > 0.1
     shots = [
-        FitShot(paths[0], SETUPS[0], mask=mask, noise="poisson", brightness=1.0),
-        FitShot(paths[1], SETUPS[1], mask=mask, noise="poisson", brightness=1.5, psf=0.5),
+        Shot(paths[0], SETUPS[0], mask=mask, noise="poisson", brightness=1.0),
+        Shot(paths[1], SETUPS[1], mask=mask, noise="poisson", brightness=1.5, psf=0.5),
     ]
     recipe = Recipe(steps=(Crop(y=(0, 40), x=(0, 48)),), fit=FitChoices(options=HASTY))
     shots[0] = replace(shots[0], fiducials=[[5, 6, 0.1, 0.2, 0.5]])
@@ -119,7 +119,7 @@ def test_provenance_is_complete_and_survives_its_file(
 def test_provenance_too_large_for_an_attribute_is_omitted() -> None:
     rng = np.random.default_rng(2)
     shots = [
-        FitShot(rng.normal(10, 1, (400, 400)), mask=rng.random((400, 400)) > 0.4, strength=(k,))
+        Shot(rng.normal(10, 1, (400, 400)), mask=rng.random((400, 400)) > 0.4, strength=(k,))
         for k in (1.0, 2.0, 3.0)
     ]
     rows = np.column_stack([rng.uniform(0, 390, (900, 2)), np.zeros((900, 2)), np.ones(900)])
@@ -135,7 +135,7 @@ def test_provenance_too_large_for_an_attribute_is_omitted() -> None:
 
 def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[FloatArray]) -> None:
     recipe = Recipe(steps=STEPS, source=LowPassEstimate(width=20))
-    inputs = collect_fit_inputs(recipe, [FitShot(image, strength=(1.0,)) for image in images])
+    inputs = collect_fit_inputs(recipe, [Shot(image, strength=(1.0,)) for image in images])
     expected = [low_pass_source(binned(image), width=20) for image in images]
     np.testing.assert_allclose(of_each(inputs.images, "source"), expected)
     assert inputs.provenance.recipe.source == LowPassEstimate(width=20)
@@ -143,12 +143,12 @@ def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[Floa
 
 def test_an_unknown_beam_takes_no_source(images: list[FloatArray]) -> None:
     unknown = Recipe(fit=FitChoices(beam="unknown"))
-    inputs = collect_fit_inputs(unknown, [FitShot(image, strength=(1.0,)) for image in images])
+    inputs = collect_fit_inputs(unknown, [Shot(image, strength=(1.0,)) for image in images])
     assert inputs.keywords["source"] == "unknown"
-    said = collect_fit_inputs(Recipe(), [FitShot(image, source="unknown") for image in images])
+    said = collect_fit_inputs(Recipe(), [Shot(image, source="unknown") for image in images])
     assert said.choices.beam == "unknown"
     with pytest.raises(InputError, match="has no unknown source"):
-        collect_fit_inputs(Recipe(), [FitShot(images[0], source="unknown"), FitShot(images[1])])
+        collect_fit_inputs(Recipe(), [Shot(images[0], source="unknown"), Shot(images[1])])
     both = unknown.model_copy(update={"source": LowPassEstimate()})
     with pytest.raises(InputError, match="a source and a fit with an unknown beam"):
         collect_fit_inputs(both, [images[0]])
@@ -172,9 +172,7 @@ def test_its_section_survives_a_file(tmp_path: Path, choices: FitChoices) -> Non
 def test_fit_warns_of_broken_pixels_in_an_image(images: list[FloatArray], tmp_path: Path) -> None:
     second = images[1].copy()
     second[20, 30] = 40.0
-    shots = [
-        FitShot(image, setup) for image, setup in zip((images[0], second), SETUPS, strict=True)
-    ]
+    shots = [Shot(image, setup) for image, setup in zip((images[0], second), SETUPS, strict=True)]
     result = run_fit(Recipe(fit=FitChoices(noise=0.02, options=HASTY)), shots)
     (caution,) = result.warnings
     assert caution.code == "hot-pixels"
@@ -188,7 +186,7 @@ def test_a_fit_takes_the_instrument_of_its_recipe(images: list[FloatArray]) -> N
     instrument = Instrument(background=0.05)
     choices = FitChoices(noise=0.04, options=HASTY.model_copy(update={"samples": 2}))
     shots = [
-        FitShot(image, setup, source=np.ones(SHAPE))
+        Shot(image, setup, source=np.ones(SHAPE))
         for image, setup in zip(images, SETUPS, strict=True)
     ]
     result = run_fit(Recipe(instrument=instrument, fit=choices), shots)
@@ -208,7 +206,7 @@ def test_a_source_declared_as_an_estimate_is_one_after_a_repeat(
     are_fitted: dict[bool, bool] = {}
     for measured in (True, False):
         shots = [
-            FitShot(file, setup, source=tmp_path / "beam.npy", measured=measured)
+            Shot(file, setup, source=tmp_path / "beam.npy", measured=measured)
             for file, setup in zip(files, SETUPS, strict=True)
         ]
         result = run_fit(Recipe(fit=choices), shots)

@@ -13,7 +13,6 @@ from napari_shadowinv.preprocessing import (
     Bin,
     Crop,
     Dark,
-    Radiograph,
     Recipe,
     ReferencePair,
     image_checks,
@@ -26,6 +25,7 @@ from napari_shadowinv.preprocessing.image_checks import (
     mask_dark,
     mask_gaps,
 )
+from napari_shadowinv.shot import Shot
 
 SHAPE = (160, 160)
 COUNTS = 300
@@ -395,14 +395,14 @@ def test_dark_is_a_number_or_a_file_in_every_notation():
 )
 def test_dark_says_why_it_cannot_be_subtracted(level, message):
     with pytest.raises(InputError, match=message):
-        Dark(level=level).apply(Radiograph(np.full((8, 8), 400.0)))
+        Dark(level=level).apply(Shot(np.full((8, 8), 400.0)))
 
 
 def test_dark_is_compared_with_usable_pixels_only():
     image, mask = np.full((8, 8), 400.0), np.ones((8, 8), bool)
     image[0], mask[0] = 1e5, False
     with pytest.raises(InputError, match="not below the image's mean of 400"):
-        Dark(level=500.0).apply(Radiograph(image, mask=mask))
+        Dark(level=500.0).apply(Shot(image, mask=mask))
 
 
 def test_dark_frame_of_another_size_is_refused(tmp_path):

@@ -11,13 +11,9 @@ from napari_shadowinv import InputError, Instrument, InversionOptions, Recipe, i
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.pipeline import run
-from napari_shadowinv.preprocessing import (
-    Radiograph,
-    kriged_source,
-    polynomial_source,
-    uniform_source,
-)
+from napari_shadowinv.preprocessing import kriged_source, polynomial_source, uniform_source
 from napari_shadowinv.preprocessing.kriging import kriged_prior
+from napari_shadowinv.shot import Shot
 
 SIDE, MARGIN = 128, 17
 Y, X = np.indices((SIDE, SIDE)) / SIDE - 0.5
@@ -241,7 +237,7 @@ def test_an_image_of_the_beam_alone_leaves_its_prediction_as_it_is():
 def test_the_report_names_a_mask_that_leaves_a_halo():
     image, _ = traced_shot(0, 0.09)
     recipe = Recipe(source={"method": "kriged"}, options={"n_sites": 300})
-    result = run(recipe, Radiograph(image, source_mask=np.hypot(Y, X) > 0.28))
+    result = run(recipe, Shot(image, source_mask=np.hypot(Y, X) > 0.28))
     assert any("next to the source mask" in each.text for each in result.report.warnings)
 
 
@@ -264,7 +260,7 @@ def shot_of_a_blob():
     blob = phantoms.gaussian_blob((SIDE, SIDE), 0.002 * SIDE**2, 0.06 * SIDE)
     rng = np.random.default_rng(3)
     image = rng.poisson(1000 * synthetic_image(blob.displacement, beam(0.25, rng)))
-    return Radiograph(image.astype(float), source_mask=BARE), blob.displacement
+    return Shot(image.astype(float), source_mask=BARE), blob.displacement
 
 
 def test_an_inversion_takes_the_conditional_variance_as_the_error_of_its_beam():
@@ -274,7 +270,7 @@ def test_an_inversion_takes_the_conditional_variance_as_the_error_of_its_beam():
     assert any("measured outside the object" in part for part in result.errors.parts)
     error = np.sqrt(((result.displacement - displacement) ** 2).sum(axis=0).mean())
     assert error < 2 * result.errors.total.rms < 0.5 * result.errors.rms
-    uniform = run(Recipe(options={"n_sites": 2500}), Radiograph(shot.image))
+    uniform = run(Recipe(options={"n_sites": 2500}), Shot(shot.image))
     assert np.square(uniform.displacement - displacement).mean() > 4 * error**2
 
 

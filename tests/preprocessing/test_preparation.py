@@ -11,10 +11,10 @@ from napari_shadowinv.preprocessing import (
     Estimate,
     InterpolatedEstimate,
     PolynomialEstimate,
-    Radiograph,
     Recipe,
     estimate_source,
 )
+from napari_shadowinv.shot import Shot
 
 SHAPE = (120, 160)
 
@@ -27,7 +27,7 @@ def outside(radius: float, centre: tuple[float, float] = (60, 80)) -> np.ndarray
 
 def check(estimate: Estimate, mask: np.ndarray | None, source_mask: np.ndarray | None) -> None:
     """Check a recipe with an estimate against a shot with masks."""
-    shot = Radiograph(np.ones(SHAPE), mask=mask, source_mask=source_mask)
+    shot = Shot(np.ones(SHAPE), mask=mask, source_mask=source_mask)
     Recipe(source=estimate).check(shot)
 
 
@@ -87,8 +87,8 @@ def test_a_source_dark_behind_the_source_mask_is_reported() -> None:
     for image, count in ((np.maximum(120.0 - x, 15), 1), (np.full(SHAPE, 100.0), 0)):
         cautions: list[Caution] = []
         estimate = PolynomialEstimate(degree=1)
-        shot = Radiograph(image, mask=DEAD, source_mask=x < 100)
+        shot = Shot(image, mask=DEAD, source_mask=x < 100)
         estimate_source(estimate, shot, on_caution=cautions.append)
         assert len(cautions) == count
         # Nor where nothing of it is inverted.
-        estimate_source(estimate, Radiograph(image, mask=x < 100))
+        estimate_source(estimate, Shot(image, mask=x < 100))

@@ -21,7 +21,6 @@ from helpers.store_content import content
 from napari_shadowinv import InputError, Recipe, RunOptions, run_stack, synthetic_image
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._batch import exit_unless_reliable
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.io import read
 from napari_shadowinv.io.store import DONE, StackStore
@@ -30,6 +29,7 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import run_fit, write_recipe
 from napari_shadowinv.preprocessing import Bin
+from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import invert_stack
 
 SHAPE = (48, 48)
@@ -213,7 +213,7 @@ def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> No
     assert store["name"].values.tolist() == ["s0", "s1"]
     for index in range(2):
         shots = [
-            FitShot(folder / f"{name}{index}.tif", setup)
+            Shot(folder / f"{name}{index}.tif", setup)
             for name, setup in zip(("low", "high"), SETUPS, strict=True)
         ]
         alone = run_fit(recipe, shots)

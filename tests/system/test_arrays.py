@@ -27,11 +27,11 @@ from napari_shadowinv import (
     uncertainty,
 )
 from napari_shadowinv._system.arrays import block_sums, coordinate_spacing, order_by_value
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing.estimates import uniform_source
+from napari_shadowinv.shot import Shot
 
 OPTIONS = InversionOptions(n_sites=300)
 SETUP = OpticalSetup(
@@ -71,7 +71,7 @@ INVERT: dict[str, Callable[..., Any]] = {
     "fit": lambda image, mask=None: _measured(image, mask),
     "fit a list": lambda image, mask=None: _measured([image], mask),
     "run_fit": lambda image, mask=None: _measured(
-        **collect_fit_inputs(Recipe(), [FitShot(image, mask=mask)]).keywords
+        **collect_fit_inputs(Recipe(), [Shot(image, mask=mask)]).keywords
     ),
 }
 

@@ -31,14 +31,15 @@ if TYPE_CHECKING:
 
     import napari
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Radiograph, Step
+    from napari_shadowinv.preprocessing import Step
+    from napari_shadowinv.shot import Shot
 
 
 @dataclass(frozen=True)
 class _Selection:
     """The image on which a command works."""
 
-    shot: Radiograph
+    shot: Shot
     name: str
     frame: Frame
     setup: Setup | None

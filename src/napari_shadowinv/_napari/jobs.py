@@ -20,14 +20,15 @@ from napari_shadowinv._napari.layers import LayerData, result_layers
 from napari_shadowinv._napari.shots import load_radiograph
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitShot
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache, run_fit, run_refinement
 from napari_shadowinv.pipeline.fit_run import refinement_choices
 from napari_shadowinv.pipeline.inversion_run import run
-from napari_shadowinv.preprocessing import Radiograph, Recipe
+from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.shot import Shot
 
 # Twice what two fast cores take for two to four images of 64² to 400² px without crossing rays.
 # Crossing rays, or a search for the cause of a misfit, multiply the time by 1.9 to 4.
@@ -202,17 +203,14 @@ class InversionJob(ImageJob):
 
     task = "inversion"
 
-    shot: Radiograph
-    source: Radiograph | None = None
+    shot: Shot
     cache: Cache | None = None
     preview: bool = False
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Inversion:
-        source = None if self.source is None else load_radiograph(self.source, "the source")
         return run(
             self.recipe,
-            load_radiograph(self.shot, "the image"),
-            source=source,
+            load_radiograph(self.shot, "the image", "the source"),
             on_progress=on_progress,
             should_stop=should_stop,
             cache=self.cache,
@@ -227,7 +225,7 @@ class InversionJob(ImageJob):
         mask = self.shot.source_mask
         for _, keywords, _ in layer_data:
             if role_of(keywords) == about.SOURCE and mask is not None:
-                masked = Radiograph(mask.astype(float), source_mask=mask)
+                masked = Shot(mask.astype(float), source_mask=mask)
                 keywords["metadata"][KEY]["source_mask"] = self.recipe.move(masked).source_mask
         if self.preview:
             layer_data = [layer for layer in layer_data if role_of(layer[1]) in _PREVIEW_ROLES]
@@ -244,7 +242,7 @@ class FitJob(ImageJob):
     task = "fit"
     pace: ClassVar[float | None] = None  # time of the last fit relative to its estimate
 
-    shots: tuple[FitShot, ...]
+    shots: tuple[Shot, ...]
     names: tuple[str, ...]  # of the images
 
     @property
@@ -259,8 +257,7 @@ class FitJob(ImageJob):
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the images after the steps."""
-        image: Any = self.shots[0].image
-        return self.recipe.shape_after(image.image.shape)
+        return self.recipe.shape_after(self.shots[0].shape)
 
     @cached_property
     def progress(self) -> FitProgress:
@@ -285,17 +282,11 @@ class FitJob(ImageJob):
     def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         """Load the images, apply the recipe's steps, and fit."""
         names = [f"'{name}'" for name in self.names]
-        shots = [_load(shot, name) for shot, name in zip(self.shots, names, strict=True)]
+        shots = [
+            replace(load_radiograph(shot, name, f"the source of {name}"), name=name)
+            for shot, name in zip(self.shots, names, strict=True)
+        ]
         return run_fit(self.recipe, shots, on_progress=on_progress, should_stop=should_stop)
-
-
-def _load(shot: FitShot, name: str) -> FitShot:
-    image, source = shot.image, shot.source
-    if isinstance(image, Radiograph):
-        image = load_radiograph(image, name)
-    if isinstance(source, Radiograph):
-        source = load_radiograph(source, f"the source of {name}")
-    return replace(shot, image=image, source=source, name=name)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -102,10 +102,10 @@ def _read_content(path: Path, array: str) -> list[Any]:
     from napari_shadowinv._napari.shots import frame_layers, radiograph_layers
     from napari_shadowinv.io import read
     from napari_shadowinv.io.frames import FRAMES_FORMAT
-    from napari_shadowinv.preprocessing import Radiograph
+    from napari_shadowinv.shot import Shot
 
     content = read(path)
-    if isinstance(content, Radiograph):
+    if isinstance(content, Shot):
         for caution in content.warnings:
             show_caution(f"{path.name}: {caution.text}")
         return radiograph_layers(content, array)

@@ -18,7 +18,7 @@ from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.setup import setup_from_dict
 from napari_shadowinv.physics.units import intensity_limits
-from napari_shadowinv.preprocessing import Radiograph
+from napari_shadowinv.shot import Shot
 
 _SHAPE = (200, 200)
 _COUNTS = 400.0  # per pixel: 5 % noise
@@ -71,7 +71,7 @@ def two_energies() -> LayerData:
     for seed, (setup, level) in enumerate(zip(setups, _FILMS.values(), strict=True)):
         # Fields displace in inverse proportion to the momentum.
         image = _counts_image(truth * first.momentum / setup.momentum, level * beam, seed)
-        layers += radiograph_layers(Radiograph(image, setup=setup), f"{setup.energy:g} MeV")
+        layers += radiograph_layers(Shot(image, setup=setup), f"{setup.energy:g} MeV")
     return layers
 
 
@@ -113,7 +113,7 @@ def _proton_shot(
     # Pixels that no ray can reach, behind an obstacle, are dark in both.
     lit = (light > 0) | (synthetic_image(phantom.displacement, light) > 0)
     mask = None if lit.all() else lit
-    shot = Radiograph(image, setup=phantoms.paper_setup(), source=source, mask=mask)
+    shot = Shot(image, setup=phantoms.paper_setup(), source=source, mask=mask)
     return radiograph_layers(shot, name)
 
 

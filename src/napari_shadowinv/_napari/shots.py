@@ -22,7 +22,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.physics.units import intensity_limits
-from napari_shadowinv.preprocessing import Radiograph
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     import xarray
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 
-def radiograph_layers(shot: Radiograph, name: str = "") -> LayerData:
+def radiograph_layers(shot: Shot, name: str = "") -> LayerData:
     """Describe an image, above its undisturbed beam and its mask of unusable pixels."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
@@ -86,7 +86,7 @@ def shot_layer(
     return data, keywords, "image"
 
 
-def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
+def _facts(shot: Shot, origin: str) -> dict[str, Any]:
     """Return the metadata of a file for its layers."""
     return {
         "setup_origin": None if shot.setup is None else f"{about.CAME_WITH} {origin}",
@@ -96,17 +96,17 @@ def _facts(shot: Radiograph, origin: str) -> dict[str, Any]:
     }
 
 
-def _frame(shot: Radiograph) -> Frame:
+def _frame(shot: Shot) -> Frame:
     """Return the frame of the object plane, also if a file contains only the pixel size."""
     side = dict(shot.metadata.get("geometry") or {}).get("pixel_size")
     return frame_for(shot.image.shape, shot.setup, pixel_size=side)
 
 
-def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> Radiograph:
+def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> Shot:
     """Return a layer's image or a plane of a stack, perhaps lazy, as a radiograph with its file."""
     metadata = metadata_of(layer)
     path = metadata.get("path") or layer.source.path
-    shot = Radiograph(image, warnings=tuple(metadata.get("warnings", ())))
+    shot = Shot(image, warnings=tuple(metadata.get("warnings", ())))
     if metadata.get("result") is not None:
         return shot  # processed images differ from their file
     paths = metadata.get("paths", ())
@@ -120,7 +120,7 @@ def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> Radiograp
 
 def source_of_shot(
     layer: Any, data: Any, image: Any, *, plane: int | None = None, of: int | None = None
-) -> Radiograph:
+) -> Shot:
     """Return a layer's data as the source of an image layer, or of files (None).
 
     `plane` is the image's in its stack, `of` the source's. A file of another shot, or of more
@@ -138,14 +138,17 @@ def source_of_shot(
     return replace(beam, image=on_image, path=None, metadata={})
 
 
-def load_radiograph(shot: Radiograph, name: str) -> Radiograph:
-    """Return the radiograph with its image in memory, and the checksum of its file."""
+def load_radiograph(shot: Shot, name: str, source_name: str = "") -> Shot:
+    """Return a shot with its image and source in memory, and the checksums of their files."""
     from napari_shadowinv.pipeline.inversion_run import plane_of
 
     metadata = dict(shot.metadata)
     if shot.path is not None and "sha256" not in metadata and shot.path.is_file():
         metadata["sha256"] = sha256(shot.path)
-    return replace(shot, image=plane_of(shot.image, name), metadata=metadata)
+    source = shot.source
+    if isinstance(source, Shot):
+        source = load_radiograph(source, source_name)
+    return replace(shot, image=plane_of(shot.image, name), source=source, metadata=metadata)
 
 
 def stack_layers(paths: Sequence[Path], name: str = "") -> LayerData:
@@ -200,7 +203,7 @@ def lazy_stack(
     return array.stack(planes)  # type: ignore[no-untyped-call]
 
 
-def _first_readable(paths: Sequence[Path]) -> tuple[Radiograph, int]:
+def _first_readable(paths: Sequence[Path]) -> tuple[Shot, int]:
     messages: list[str] = []
     for index, path in enumerate(paths):
         try:

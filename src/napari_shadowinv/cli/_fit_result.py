@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     import xarray
     from rich.table import Table
 
-    from napari_shadowinv.fitting import Fit, FitShot
+    from napari_shadowinv.fitting import Fit
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.provenance import Provenance
+    from napari_shadowinv.shot import Shot
 
 
 def compare_fields(
-    recipe: Recipe, shots: Sequence[FitShot], quiet: bool, *, written: str | None
+    recipe: Recipe, shots: Sequence[Shot], quiet: bool, *, written: str | None
 ) -> Fit:
     """Fit several choices of fields and print how likely each is; return the one to write."""
     from napari_shadowinv.pipeline import run_comparison

@@ -16,7 +16,7 @@ from napari_shadowinv.cli import _summary
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.physics.beam import setup_warnings
 from napari_shadowinv.physics.setup import Setup, beam_quantities
-from napari_shadowinv.preprocessing import Radiograph
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     import xarray
@@ -63,12 +63,12 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     if form.name not in ("npy", "mat", "cpsa", "text", "hdf5") and "result" not in form.holds:
         return _picture_rows(path, form)
     content = read(path, variable=variable)
-    return _radiograph_rows(content) if isinstance(content, Radiograph) else _result_rows(content)
+    return _radiograph_rows(content) if isinstance(content, Shot) else _result_rows(content)
 
 
-def _frame_rows(frames: Radiograph | xarray.Dataset, array: str | None) -> _summary.Rows:
+def _frame_rows(frames: Shot | xarray.Dataset, array: str | None) -> _summary.Rows:
     """Describe many images by their names and the first."""
-    assert not isinstance(frames, Radiograph)
+    assert not isinstance(frames, Shot)
     names, images = frames["name"].values, frames["image"]
     return [
         ("kind", f"{len(names)} frames, {names[0]} to {names[-1]}"),
@@ -95,7 +95,7 @@ def _picture_rows(path: Path, form: Format) -> _summary.Rows:
     return [*rows, *[("warning", caution.text) for caution in warnings]]
 
 
-def _radiograph_rows(shot: Radiograph) -> _summary.Rows:
+def _radiograph_rows(shot: Shot) -> _summary.Rows:
     names = {
         "text": "numbers as text",
         "pradformat": "pradformat radiograph",

@@ -18,7 +18,8 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
 from napari_shadowinv.options import FitChoices, InversionOptions
-from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
+from napari_shadowinv.preprocessing import MeasuredSource, Recipe
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -220,7 +221,7 @@ def fit_recipe(
     return recipe.model_copy(update={"fit": recipe.fit or FitChoices()})
 
 
-def setup_for(path: Path | None, shot: Radiograph, recipe: Recipe) -> Setup | None:
+def setup_for(path: Path | None, shot: Shot, recipe: Recipe) -> Setup | None:
     """Read a setup, and complete it with the geometry in the image's file."""
     from napari_shadowinv.pipeline.files import setup_from
 

@@ -36,7 +36,8 @@ from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.formats import IMAGE_WRITERS, NETCDF_SUFFIX, PNG, RESULT, TIFF, kind_of
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
-from napari_shadowinv.preprocessing import MeasuredSource, Radiograph
+from napari_shadowinv.preprocessing import MeasuredSource
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     import xarray
@@ -161,12 +162,13 @@ def invert(
     shot = read_part(image, channel, variable)
     chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
     _inputs.check_setup(result, chosen.setup)
-    beam, measured = None, chosen.source
+    measured = chosen.source
     if isinstance(measured, MeasuredSource) and measured != MeasuredSource():
         # In its own file or in the image's; the channel is that of both.
         beam = read_part(measured.file or image, channel, measured.variable)
+        shot = replace(shot, source=beam)
     printed = warn_of_setups([(chosen.setup or shot.setup, shot.shape)])
-    inversion = invert_shot(chosen, shot, beam, quiet)
+    inversion = invert_shot(chosen, shot, quiet)
     failed = _inputs.write_result(inversion, [str(image)], result, figure, overwrite)
     if save_recipe is not None:
         write_recipe(save_recipe, chosen, overwrite=overwrite)
@@ -385,7 +387,7 @@ def demo(
     grain = np.random.default_rng(0).normal(size=image.shape)
     image = image + noise * image.mean() * grain
     # The simulated beam is known: it is flat.
-    shot = Radiograph(image, source=np.ones(image.shape))
+    shot = Shot(image, source=np.ones(image.shape))
     inversion = invert_shot(chosen.model_copy(update={"setup": setup}), shot)
     poisson = displacement_from_potential(poisson_invert(image))
     fields = {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}

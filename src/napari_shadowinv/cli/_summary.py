@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.facts import Fact, Headline
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Radiograph
     from napari_shadowinv.provenance import Provenance
+    from napari_shadowinv.shot import Shot
 
 Rows = list[tuple[str, ...]]
 """Name, value, and the level of trust of a headline."""
@@ -85,7 +85,7 @@ def written_rows(paths: Iterable[Path], failed: Collection[Path] = ()) -> Rows:
 
 
 def setup_text(
-    setup: Setup | None, shot: Radiograph | None = None, shape: tuple[int, ...] | None = None
+    setup: Setup | None, shot: Shot | None = None, shape: tuple[int, ...] | None = None
 ) -> str:
     """Describe the setup in a line, or name the values that are missing for SI units."""
     if setup is not None:

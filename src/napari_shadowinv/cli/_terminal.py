@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from napari_shadowinv.fitting import LeaveOneOut
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Radiograph, Recipe
+    from napari_shadowinv.preprocessing import Recipe
+    from napari_shadowinv.shot import Shot
 
 EXIT_MISTAKE = 2
 EXIT_NOT_CONVERGED = 3
@@ -82,15 +83,13 @@ def say_on_stderr(text: str, style: str = "bold red") -> None:
     Console(stderr=True).print(line, soft_wrap=True, highlight=False)
 
 
-def invert_shot(
-    recipe: Recipe, shot: Radiograph, source: Radiograph | None = None, quiet: bool = False
-) -> Inversion:
+def invert_shot(recipe: Recipe, shot: Shot, quiet: bool = False) -> Inversion:
     """Apply a recipe to a shot; errors name the file."""
     from napari_shadowinv.pipeline import run
 
     with work_callbacks(quiet) as callbacks:
         try:
-            return run(recipe, shot, source=source, **callbacks)
+            return run(recipe, shot, **callbacks)
         except InputError as error:
             if shot.path is None:
                 raise

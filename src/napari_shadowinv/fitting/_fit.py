@@ -7,10 +7,9 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import count
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._system.machine import available_threads
@@ -68,16 +67,15 @@ from napari_shadowinv.fitting.search import (
     search,
     settle_minimum,
 )
-from napari_shadowinv.fitting.shots import Images, list_shots
+from napari_shadowinv.fitting.shots import Shots, list_shots
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.fitting.verdict import MISFIT_CHI2, assess_verdict, hidden_contrast
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.inversion.samples import Pairs
-from napari_shadowinv.options import FitOptions, Instrument, InversionOptions, KindOfNoise
+from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
 from napari_shadowinv.physics.edge import edge_changes, edge_sides
 from napari_shadowinv.physics.forward import jacobian_determinant
-from napari_shadowinv.physics.setup import Setup
 
 _FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
 _FROM_NEAR = ((4, 2.0), (2, 2.0), (2, 1.0))
@@ -97,16 +95,9 @@ _HELD_IN_SEARCH = frozenset({"gamma", "blur", "other_field"})
 
 
 def fit(
-    images: Images,
+    shots: Shots,
     *,
-    strengths: ArrayLike | None = None,
-    setups: Sequence[Setup] | None = None,
     fields: Sequence[str] = ("B",),
-    source: ArrayLike | Literal["unknown"] | None = None,
-    noise: ArrayLike | KindOfNoise | None = None,
-    psf: Any = 0.0,
-    mask: ArrayLike | None = None,
-    brightness: ArrayLike | Literal["known", "free"] = "known",
     instrument: Instrument | None = None,
     options: FitOptions | None = None,
     on_progress: OnProgress | None = None,
@@ -120,34 +111,13 @@ def fit(
 
     Parameters
     ----------
-    images : array_like of shape (L, H, W) or (H, W), mapping, or sequence of FitShot
-        Images on one grid of pixels in the object plane: an array, a list of them, or a dict
-        whose keys name the images in messages; masked arrays where pixels cannot be used. A
-        `FitShot` is an image with all that is known of it, such as its mask, its own noise, its
-        name, fiducials, or a field to start from; a `Radiograph` has its setup, source and mask.
-    strengths : array_like, shape (L,) or (L, M), optional
-        Displacement of each image by each field, relative to the first image.
-    setups : sequence of Setup, optional
-        The experiment of each image, from which the strengths follow.
+    shots : Shot, array_like of shape (H, W), or sequence of them
+        Images on one grid of pixels in the object plane, each with all that is known of it.
+        Several need setups, or strengths. Without a source the beam is uniform, with the mean of
+        each image; an unknown one is smooth, the same for all images but for its brightness.
+        The brightness is fitted in any case where the instrument leaves beam or transmission open.
     fields : sequence of {"B", "E", "plasma", "phase"}, default ("B",)
         Cause of the deflection. Two fields need images of at least two energies.
-    source : array_like or "unknown", optional
-        The undisturbed beam, (H, W) or one for each image, in the units of the images; or
-        "unknown": a smooth beam is fitted, the same for all images but for its brightness. Default:
-        uniform, with the mean of each image.
-    noise : array_like, "poisson" or "proportional", optional
-        Standard deviation of the noise: one number, one an image, or one a pixel. "poisson" if
-        the images are counts; "proportional" if it is a share of each pixel, as on film,
-        which is estimated. Default: estimated from differences of neighbouring pixels, the same in
-        all of them.
-    psf : float or array_like, default 0
-        Standard deviation in px of the point spread, or a kernel with odd sides; one, or one for
-        each image. See `point_spread`.
-    mask : array_like of bool, shape (H, W) or (L, H, W), optional
-        True where a pixel can be used, in all images or in each.
-    brightness : "known", "free" or array_like, default "known"
-        Brightness of each image relative to the source: factors, or "free" to fit them.
-        Fitted in any case where the instrument leaves beam or transmission open.
     instrument : Instrument, optional
         How well beam, detector and alignment are known. What is stated is fitted together with the
         fields; what the images leave open of it enters the error bars. One image does not determine
@@ -172,30 +142,19 @@ def fit(
 
     Examples
     --------
-    >>> from napari_shadowinv import synthetic_image
+    >>> from napari_shadowinv import Shot, synthetic_image
     >>> from napari_shadowinv.physics.phantoms import gaussian_blob
     >>> truth = gaussian_blob((64, 64), 40.0, 9.0).displacement
-    >>> shots = [synthetic_image(truth), synthetic_image(0.6 * truth)]
-    >>> found = fit(shots, strengths=[1, 0.6], noise=0.02, options=FitOptions(samples=0))
+    >>> fast = Shot(synthetic_image(0.6 * truth), strength=0.6, noise=0.02)
+    >>> slow = Shot(synthetic_image(truth), strength=1, noise=0.02)
+    >>> found = fit([slow, fast], options=FitOptions(samples=0))
     >>> bool(np.abs(found.fields[0].displacement - truth).max() < 0.2)
     True
     """
     options = as_model(FitOptions, options, "options")
     seconds: dict[str, float] = {}
     rng = np.random.default_rng(options.seed)
-    data = collect_data(
-        images,
-        strengths=strengths,
-        setups=setups,
-        fields=fields,
-        source=source,
-        noise=noise,
-        psf=psf,
-        mask=mask,
-        brightness=brightness,
-        instrument=instrument,
-        options=options,
-    )
+    data = collect_data(shots, fields=fields, instrument=instrument, options=options)
     ensure_compiled(on_progress, should_stop)
     scene = data.scene
     on_step = report_steps("fit", on_progress, should_stop)
@@ -322,18 +281,20 @@ def report_steps(
 
 
 def compare(
-    images: Images,
+    shots: Shots,
     *,
     choices: Sequence[Sequence[str]] = (("B",), ("E",), ("B", "E")),
+    instrument: Instrument | None = None,
     options: FitOptions | None = None,
-    **keywords: Any,
+    on_progress: OnProgress | None = None,
+    should_stop: ShouldStop | None = None,
 ) -> tuple[Fit, ...]:
     """Fit several choices of fields to the same images, to see which explains them.
 
     Parameters
     ----------
-    images, options, **keywords
-        As for `fit`, with `setups`.
+    shots, instrument, options, on_progress, should_stop
+        As for `fit`; each shot has its setup.
     choices : sequence of sequence of str, default B alone, E alone, both
         Possible causes of the deflection.
 
@@ -348,16 +309,24 @@ def compare(
     InputError
         As `fit`, and if no setups are given.
     """
-    shots = list_shots(images)
-    has_setups = keywords.get("setups") is not None or any(shot.setup for shot in shots)
-    has_strengths = "strengths" in keywords or any(shot.strength for shot in shots)
-    if not has_setups or has_strengths or "fields" in keywords:
+    listed = list_shots(shots)
+    if any(shot.setup is None or shot.strength is not None for shot in listed):
         raise InputError(
-            "comparing fields needs the setup of each image, and neither fields nor strengths: "
-            "how much each field displaces follows from the setups"
+            "comparing fields needs the setup of each image, and no strengths: how much each field "
+            "displaces follows from the setups"
         )
     with_evidence = as_model(FitOptions, options, "options").model_copy(update={"evidence": True})
-    fits = [fit(images, fields=choice, options=with_evidence, **keywords) for choice in choices]
+    fits = [
+        fit(
+            listed,
+            fields=choice,
+            instrument=instrument,
+            options=with_evidence,
+            on_progress=on_progress,
+            should_stop=should_stop,
+        )
+        for choice in choices
+    ]
     least = max(each.report.log_evidence for each in fits) - _DECIDES
 
     def rank(one: Fit) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from napari_shadowinv.fitting.search import (
     search,
     settle_minimum,
 )
-from napari_shadowinv.fitting.shots import Images
+from napari_shadowinv.fitting.shots import Shots
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions, Instrument
 
@@ -59,12 +59,12 @@ _T = TypeVar("_T")
 
 
 def leave_one_out(
-    images: Images,
+    shots: Shots,
     *,
+    fields: Sequence[str] = ("B",),
     options: FitOptions | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
-    **keywords: Any,
 ) -> LeaveOneOut:
     """Predict each of several images from a fit of the others, to see whether one field fits all.
 
@@ -75,7 +75,7 @@ def leave_one_out(
 
     Parameters
     ----------
-    images, options, **keywords
+    shots, fields, options
         As for `fit`, with three images or more, and without fiducials or a field to start from.
         The instrument counts as exact.
     on_progress, should_stop : callable, optional
@@ -94,7 +94,7 @@ def leave_one_out(
     """
     options = as_model(FitOptions, options, "options")
     exact = Instrument(beam_rms=0.0)
-    data = collect_data(images, options=options, **{**keywords, "instrument": exact})
+    data = collect_data(shots, fields=fields, instrument=exact, options=options)
     check_count(len(data.units))
     if data.scene.fiducials is not None or data.start is not None:
         raise InputError(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,11 +17,14 @@ from scipy.ndimage import uniform_filter
 from napari_shadowinv._system.arrays import (
     SQUARE_PIXELS,
     as_numbers,
+    check_mask,
+    check_plane,
+    check_shape,
     check_usable,
     join_masks,
-    mask_of_each,
     plain_array,
-    unpack_planes,
+    unpack_array,
+    unpack_mask,
 )
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
@@ -32,12 +35,13 @@ from napari_shadowinv.fitting.instrument import Around, imperfect_instrument
 from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.fitting.references import smooth_references
 from napari_shadowinv.fitting.shots import (
-    Images,
     NearField,
-    join_shots,
+    Shots,
+    common_values,
     list_shots,
     names_of,
     value_of_first,
+    values_of,
 )
 from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
 from napari_shadowinv.inversion.noise import estimated_noise, measure_correlation
@@ -48,11 +52,11 @@ from napari_shadowinv.options import (
     BeamPrior,
     FitOptions,
     Instrument,
-    KindOfNoise,
 )
 from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import Setup, deflector_titles
+from napari_shadowinv.shot import Shot
 
 _MIN_SIGMA_PX = 1e-6  # of a fiducial; the square of less overflows
 _BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide
@@ -132,69 +136,48 @@ class FitData:
 
 
 def collect_data(
-    images: Images,
+    shots: Shots,
     *,
-    strengths: ArrayLike | None = None,
-    setups: Sequence[Setup] | None = None,
     fields: Sequence[str] = ("B",),
-    source: ArrayLike | Literal["unknown"] | None = None,
-    noise: ArrayLike | KindOfNoise | None = None,
-    psf: Any = 0.0,
-    mask: ArrayLike | None = None,
-    brightness: ArrayLike | Literal["known", "free"] = "known",
     instrument: Instrument | None = None,
     options: FitOptions,
 ) -> FitData:
     """Check the inputs of a fit; see `fit` for their forms."""
     instrument = as_model(Instrument, instrument, "instrument")
-    shots = list_shots(images)
-    planes: Any = images
-    if shots:
-        of_all = {
-            "strengths": strengths,
-            "setups": setups,
-            "source": source,
-            "mask": mask,
-            "brightness": brightness,
-            "noise": noise,
-            "psf": psf,
-        }
-        joined = join_shots(shots, of_all)
-        planes = [shot.image for shot in shots]
-        strengths, setups, source, mask, brightness, noise, psf = (joined[key] for key in of_all)
-    planes, exposed = unpack_planes(planes, "images")
-    data = _checked_images(planes)
-    exposed = mask_of_each(exposed, data)
-    if not isinstance(source, str):
-        source, lit = unpack_planes(source, "source")
-        exposed = join_masks(exposed, mask_of_each(lit, data))
-    count, height, width = data.shape
-    names = names_of(shots) or tuple(f"image {k + 1}" for k in range(count))
-    used = _checked_mask(mask, exposed, data, names)
-    matrix = strengths_of(setups, fields, count, names) if strengths is None else strengths
-    matrix = _checked_strengths(matrix, count)
-    if strengths is not None and setups is not None:
-        raise InputError("received both strengths and setups, expected one of them")
-    if count == 1 and isinstance(source, str) and not options.ambiguous:
+    shots = list_shots(shots)
+    count, names = len(shots), names_of(shots)
+    data, recorded, used = _checked_planes(shots, names)
+    height, width = data.shape[1:]
+    unknown = shots[0].beam_unknown
+    is_uniform = recorded is None and not unknown
+    is_assumed = is_uniform or not all(shot.measured for shot in shots)
+    setups, strengths = values_of(shots, "setup"), values_of(shots, "strength")
+    if strengths is None:
+        matrix = strengths_of(setups, fields, count, names)
+    else:
+        matrix, setups = _checked_strengths(strengths), None
+    matrix = _relative_strengths(matrix)
+    if count == 1 and unknown and not options.ambiguous:
         raise InputError(
             "received one image and an unknown source: one image cannot tell the beam from the "
             "object; give the source or an image of another energy, or allow an ambiguous fit, "
             "one of many",
             option="ambiguous",
         )
-    free_brightness, factors = _checked_brightness(brightness, count)
-    recorded = _checked_source(source, data, used)
+    free_brightness, factors = _checked_brightness(values_of(shots, "brightness"), count)
+    if recorded is None:
+        recorded = np.ones(data.shape) * _means(data, used)[:, None, None]
     if free_brightness:
         factors = _means(data, used) / _means(recorded, used)
     recorded = factors[:, None, None] * recorded
     _refuse_other_units(_means(data, used) / _means(recorded, used), names)
     _refuse_what_is_given_twice(data, recorded, used, matrix, names)
+    noise = _common_noise(values_of(shots, "noise"))
     beams, deviations, match, remaining = _relative_noise(
         data, recorded, used, noise, instrument, names
     )
     shapes = [beam / beam.mean() for beam in beams]
     units = _means(beams, used)
-    unknown = isinstance(source, str)
     scaled = np.where(used, data / units[:, None, None], 0.0)
     weights = np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0)
 
@@ -205,7 +188,6 @@ def collect_data(
     size = height + fill[1][1], width + fill[2][1]
     around = (pad, pad + fill[1][1]), (pad, pad + fill[2][1])
     is_common = all(np.allclose(beam, shapes[0], rtol=_SAME, atol=0) for beam in shapes[1:])
-    is_assumed = source is None or not all(shot.measured for shot in shots)
     spread = np.linalg.norm(matrix, axis=1)
     single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
     prior = instrument.beam_of(measured=not is_assumed, source=shapes[0])
@@ -224,7 +206,7 @@ def collect_data(
         other_strengths=other_strengths,
     )
     # Of a detector that is not linear, an assumed source does not have the image's mean.
-    is_dimmed = source is None and instrument.gamma > 0
+    is_dimmed = is_uniform and instrument.gamma > 0
     # A beam of another shape, or behind an object that absorbs, does not have its source's.
     is_dimmed |= not single and (bool(imperfect.shapes) or instrument.absorption > 0)
     shift = instrument.registration or 0.0
@@ -237,7 +219,7 @@ def collect_data(
         weights=np.pad(weights, fill),
         strengths=matrix,
         beams=np.pad(beams / units[:, None, None], ((0, 0), *around), mode="edge"),
-        psf=check_point_spread(psf, count, size),
+        psf=[_checked_point_spread(shot.psf, size) for shot in shots],
         smoothness=np.tile(smoothness, (matrix.shape[1], 1)),
         pad=pad,
         tie=_FREE_TIE if free else 30.0,
@@ -265,7 +247,7 @@ def collect_data(
         common=is_common,
         instrument=instrument,
         beam=prior,
-        setups=None if setups is None else tuple(setups),
+        setups=setups,
         names=names if any(shot.name for shot in shots) else None,
         start=_checked_start(near.potential if near else start, (height, width)),
         near=near,
@@ -470,43 +452,29 @@ def match_noise(
     return NoiseMatch(factors, expected, correlation, is_estimated, is_hidden)
 
 
-def _checked_images(images: ArrayLike) -> FloatArray:
-    shapes = [np.shape(plane) for plane in images] if isinstance(images, list) else []
-    shape = (len(shapes), *max(shapes)) if shapes else np.shape(images)
-    count = shape[0] if len(shape) > 2 else 1
-    needed = _BYTES_PER_PIXEL + count * _BYTES_PER_PIXEL_AND_IMAGE
-    check_memory(shape[-2:], needed, "a fit")
-    try:
-        data = np.array(images, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            "images are no stack of numbers: expected planes of the same height and width"
-        ) from error
-    data = data[None] if data.ndim == 2 else data
-    if data.ndim != 3 or not len(data):
-        raise InputError(
-            f"images have shape {data.shape}: expected (images, height, width), or one plane"
-        )
-    if min(data.shape[1:]) < _SMALLEST_SIDE:
-        raise InputError(
-            f"images have shape {data.shape[1:]}: expected {_SMALLEST_SIDE} pixels or more each way"
-        )
-    return data
-
-
-def _checked_mask(
-    mask: ArrayLike | None, exposed: BoolArray | None, data: FloatArray, names: Sequence[str]
-) -> BoolArray:
-    if mask is None:
-        used = np.ones(data.shape, bool)
-    else:
-        mask, valid = unpack_planes(mask, "mask")
-        used = as_numbers("mask", mask) != 0
-        if valid is not None:
-            used &= valid
-        used = _like_images("mask", used, data)
-    if exposed is not None:
-        used = used & exposed
+def _checked_planes(
+    shots: Sequence[Shot], names: Sequence[str]
+) -> tuple[FloatArray, FloatArray | None, BoolArray]:
+    """Return images, sources if there are any, and usable pixels, each of shape (L, H, W)."""
+    common_values(names, [shot.beam_unknown or None for shot in shots], "unknown source")
+    sources = common_values(names, [None if s.beam_unknown else s.source for s in shots], "source")
+    images: list[AnyArray] = []
+    masks: list[BoolArray] = []
+    for shot, name in zip(shots, names, strict=True):
+        image, exposed = unpack_array(shot.image, name)
+        images.append(check_plane(image, name, _SMALLEST_SIDE))
+        check_shape(name, images[-1].shape, images[0].shape, names[0])
+        mask = check_mask(unpack_mask(shot.mask), images[0].shape, name)
+        masks.append(join_masks(mask, exposed))
+    needed = _BYTES_PER_PIXEL + len(shots) * _BYTES_PER_PIXEL_AND_IMAGE
+    check_memory(images[0].shape, needed, "a fit")
+    data = np.array(images, dtype=np.float64)
+    beams = None
+    if sources is not None:
+        unpacked = [unpack_array(source, "source") for source in sources]
+        masks = [join_masks(mask, lit) for mask, (_, lit) in zip(masks, unpacked, strict=True)]
+        beams = np.array([_checked_source(beam, data.shape[1:]) for beam, _ in unpacked])
+    used = np.array(masks)
     for name, image, plane in zip(names, data, used, strict=True):
         bad = int((~np.isfinite(image) & plane).sum())
         if bad:
@@ -519,27 +487,46 @@ def _checked_mask(
             raise InputError(f"{name} has {plane.mean():.1%} of its pixels in use: unmask some")
         if not image[plane].mean() > 0:
             raise InputError(f"{name} has no flux: expected a beam; check its background")
-    return used
+    return data, beams, used
 
 
-def _like_images(name: str, values: AnyArray, data: FloatArray) -> AnyArray:
-    """Return values for each image, from as many or from a plane for all of them."""
-    if values.shape not in (data.shape, data.shape[1:]):
+def _checked_source(source: Any, shape: tuple[int, ...]) -> FloatArray:
+    if isinstance(source, str):
+        raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
+    beam = as_numbers("source", check_plane(source, "source"))
+    check_shape("source", beam.shape, shape)
+    if not np.isfinite(beam).all() or beam.min() < 0 or not beam.any():
         raise InputError(
-            f"{name} has shape {values.shape}: expected {data.shape[1:]} or {data.shape}, like the "
-            "images"
+            "source has pixels that are negative or not finite, or no flux: expected a beam"
         )
-    return np.broadcast_to(values, data.shape)
+    return beam
 
 
-def _checked_strengths(strengths: ArrayLike, count: int) -> FloatArray:
-    matrix = as_numbers("strengths", strengths)
-    matrix = matrix[:, None] if matrix.ndim == 1 else matrix
-    if matrix.ndim != 2 or len(matrix) != count or not np.isfinite(matrix).all():
+def _common_noise(noises: Sequence[Any] | None) -> Any:
+    """Return the kind of noise of all images, their standard deviations, or None."""
+    if noises is None:
+        return None
+    kinds = {repr(noise) if isinstance(noise, str) else "a number" for noise in noises}
+    if len(kinds) > 1:
         raise InputError(
-            f"strengths have shape {matrix.shape}: expected a finite number for each of {count} "
-            "images, and each field"
+            f"noise is {' in some images and '.join(sorted(kinds))} in others: give the same "
+            "for all, or numbers"
         )
+    return noises[0] if isinstance(noises[0], str) else noises
+
+
+def _checked_strengths(strengths: Sequence[tuple[float, ...]]) -> FloatArray:
+    """Return strengths of images that have one for each field, shape (L, M)."""
+    if len(set(map(len, strengths))) > 1:
+        raise InputError(
+            f"strengths are {', '.join(map(str, strengths))}: expected one number for each field "
+            "in all images"
+        )
+    return np.array(strengths)
+
+
+def _relative_strengths(matrix: FloatArray) -> FloatArray:
+    """Return strengths relative to those of the first image; refuse what determines no field."""
     if not matrix[0].all():
         raise InputError(
             f"strengths of the first image are {matrix[0].tolist()}: all fields must act in it"
@@ -592,13 +579,16 @@ def _are_alike(first: FloatArray, second: FloatArray) -> bool:
     )
 
 
-def _checked_brightness(brightness: ArrayLike | str, count: int) -> tuple[bool, FloatArray]:
-    if isinstance(brightness, str):
-        if brightness not in ("known", "free"):
-            raise InputError(
-                f"brightness is {brightness!r}: expected 'known', 'free' or a number for each image"
-            )
-        return brightness == "free", np.ones(count)
+def _checked_brightness(brightness: Sequence[Any] | None, count: int) -> tuple[bool, FloatArray]:
+    if brightness is None:
+        return False, np.ones(count)
+    if all(isinstance(each, str) and each == "free" for each in brightness):
+        return True, np.ones(count)
+    if any(isinstance(each, str) for each in brightness):
+        raise InputError(
+            f"brightness is {', '.join(map(repr, brightness))}: expected a number for each image, "
+            "or 'free' for all"
+        )
     factors = as_numbers("brightness", brightness)
     if factors.shape != (count,) or not (np.isfinite(factors) & (factors > 0)).all():
         raise InputError(
@@ -640,19 +630,6 @@ def _refuse_other_units(brightness: FloatArray, names: Sequence[str]) -> None:
             )
 
 
-def _checked_source(source: Any, data: FloatArray, used: BoolArray) -> FloatArray:
-    if source is None or isinstance(source, str):
-        if source not in (None, "unknown"):
-            raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
-        return np.asarray(np.ones(data.shape) * _means(data, used)[:, None, None])
-    beams = _like_images("source", as_numbers("source", source), data)
-    if not np.isfinite(beams).all() or beams.min() < 0 or not beams.any():
-        raise InputError(
-            "source has pixels that are negative or not finite, or no flux: expected a beam"
-        )
-    return np.array(beams)
-
-
 def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
     """Standard deviation of each pixel's noise."""
     if isinstance(noise, str):
@@ -671,17 +648,15 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
     if noise is None:
         levels = np.array(list(map(estimated_noise, data, used)))
         return np.asarray(np.ones(data.shape) * levels[:, None, None])
-    sigma = as_numbers("noise", noise)
-    if not sigma.size or not np.isfinite(sigma).all() or sigma.min() <= 0:
-        raise InputError("noise is not positive everywhere: expected standard deviations")
-    if sigma.shape == (len(data),):
-        sigma = sigma[:, None, None]
-    if sigma.shape not in ((), (len(data), 1, 1), data.shape[1:], data.shape):
-        raise InputError(
-            f"noise has shape {sigma.shape}: expected one number, one an image, or an array like "
-            "the images"
-        )
-    return np.array(np.broadcast_to(sigma, data.shape))
+    sigmas = [as_numbers("noise", each) for each in noise]
+    for sigma in sigmas:
+        if not sigma.size or not np.isfinite(sigma).all() or sigma.min() <= 0:
+            raise InputError("noise is not positive everywhere: expected standard deviations")
+        if sigma.shape not in ((), data.shape[1:]):
+            raise InputError(
+                f"noise has shape {sigma.shape}: expected one number, or an array like the image"
+            )
+    return np.array([np.broadcast_to(sigma, data.shape[1:]) for sigma in sigmas])
 
 
 def _refuse_hopeless_noise(deviations: FloatArray, used: BoolArray, names: Sequence[str]) -> None:
@@ -738,28 +713,15 @@ def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fi
     return Fiducials(places + 0.5, displacements, errors)
 
 
-def check_point_spread(psf: Any, count: int, size: tuple[int, int]) -> list[float | FloatArray]:
-    """Return a standard deviation in px or a normalised kernel for each of `count` images."""
-    try:
-        alone = np.array(psf, dtype=np.float64).ndim in (0, 2)
-    except (TypeError, ValueError):  # widths and kernels, or kernels of several sizes
-        alone = not isinstance(psf, Sequence) or isinstance(psf, str)
-    each = [psf] * count if alone else list(psf)
-    if len(each) != count:
-        raise InputError(f"psf has {len(each)} entries: expected one, or one for each of {count}")
-    kernels: list[float | FloatArray] = []
-    for blur in each:
-        values = as_numbers("psf", blur)
-        if not values.size or not np.isfinite(values).all() or values.min() < 0:
-            raise InputError(f"psf is {blur}: expected a standard deviation in px or a kernel")
-        if values.ndim == 0:
-            if float(values) > min(size) / 8:
-                raise InputError(
-                    f"psf is {float(values):g} px: expected less than an eighth of a side"
-                )
-            kernels.append(float(values))
-            continue
-        if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:
-            raise InputError(f"psf has shape {values.shape}: expected a kernel with odd sides")
-        kernels.append(values / values.sum())
-    return kernels
+def _checked_point_spread(psf: Any, size: tuple[int, int]) -> float | FloatArray:
+    """Return a standard deviation in px, 0 for None, or a normalised kernel."""
+    values = as_numbers("psf", 0.0 if psf is None else psf)
+    if not values.size or not np.isfinite(values).all() or values.min() < 0:
+        raise InputError(f"psf is {psf}: expected a standard deviation in px or a kernel")
+    if values.ndim == 0:
+        if float(values) > min(size) / 8:
+            raise InputError(f"psf is {float(values):g} px: expected less than an eighth of a side")
+        return float(values)
+    if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:
+        raise InputError(f"psf has shape {values.shape}: expected a kernel with odd sides")
+    return np.asarray(values / values.sum())

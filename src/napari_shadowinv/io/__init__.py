@@ -2,7 +2,7 @@
 
 - read an image or a result: `read`; only one of them: `read_radiograph`, `read_dataset`
 - the tracks of a scan of CR-39: `read_tracks`
-- an image with its metadata: `Radiograph`; sum its pixels: `Radiograph.bin_pixels`
+- an image with its metadata: `Shot`; sum its pixels: `Shot.bin_pixels`
 - write a result or an image: `write`; check the path beforehand: `check_output`
 - results of many shots in one store: `read_stack`; recognise its folder: `is_stack`
 - write a file of your own, whole or not at all: `replacing`

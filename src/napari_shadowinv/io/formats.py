@@ -31,7 +31,7 @@ _EXCERPT_BYTES = 64  # they show the kind of a file without a mark
 class Format:
     """A format of files; functions are named as ``module:name``, of this package."""
 
-    name: str  # also ``Radiograph.metadata["kind"]``
+    name: str  # also ``Shot.metadata["kind"]``
     suffixes: tuple[str, ...]  # in lower case, the usual one first
     title: str = ""  # in messages and the command's help; empty if it cannot be read
     marks: tuple[tuple[int, bytes], ...] = ()  # where its files hold which bytes; one is enough

@@ -33,7 +33,7 @@ from napari_shadowinv.io.formats import FORMATS, RADIOGRAPH_SUFFIXES, format_of
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.preprocessing import Radiograph
+    from napari_shadowinv.shot import Shot
 
 _GLOB = re.compile(r"[*?\[]")
 FRAMES_FORMAT = "shadowinv frames"
@@ -190,7 +190,7 @@ def _frames_of_file(path: Path, variable: str | None = None) -> list[Frame]:
     ]
 
 
-def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], Radiograph]) -> xarray.Dataset:
+def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], Shot]) -> xarray.Dataset:
     """Describe frames as a dataset whose images dask reads on demand.
 
     Parameters
@@ -232,13 +232,11 @@ def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], Radiograph]) ->
     )
 
 
-def _read_block(
-    read: Callable[[Frame], Radiograph], frame: Frame, shape: tuple[int, ...]
-) -> AnyArray:
+def _read_block(read: Callable[[Frame], Shot], frame: Frame, shape: tuple[int, ...]) -> AnyArray:
     image = read(frame).image
     if image.shape != shape:
         raise FileFormatError(
             f"{frame.name} has {' × '.join(map(str, image.shape))} pixels, the first frame "
             f"{' × '.join(map(str, shape))}: expected images of one size; leave it out"
         )
-    return image[np.newaxis]
+    return np.asarray(image[np.newaxis])

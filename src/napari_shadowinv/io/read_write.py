@@ -40,7 +40,7 @@ from napari_shadowinv.io.hdf5 import (
 )
 from napari_shadowinv.io.images import film_warnings, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
-from napari_shadowinv.preprocessing import Radiograph
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     import xarray
@@ -60,7 +60,7 @@ _DISTANCES = {"source_object_distance", "object_image_distance"}
 
 def read(
     path: str | Path, *, channel: str | int | None = None, variable: str | None = None
-) -> Radiograph | xarray.Dataset:
+) -> Shot | xarray.Dataset:
     """Read an image or a result, or many images lazily.
 
     Parameters
@@ -81,7 +81,7 @@ def read(
 
     Returns
     -------
-    Radiograph or xarray.Dataset
+    Shot or xarray.Dataset
         A dataset for a result or an inversion; a dataset with the variable ``image``
         (shot, y, x) for many images, which dask reads one by one; a radiograph for all else.
 
@@ -97,9 +97,7 @@ def read(
 
 
 @as_file_errors
-def _read(
-    path: Path, channel: str | int | None, variable: str | None
-) -> Radiograph | xarray.Dataset:
+def _read(path: Path, channel: str | int | None, variable: str | None) -> Shot | xarray.Dataset:
     if is_stack(path):
         return read_stack(path)
     frames = find_frames(path, variable)
@@ -108,19 +106,19 @@ def _read(
     return _read_file(frames[0].path, channel, frames[0].variable)
 
 
-def read_frame(frame: Frame, *, channel: str | int | None = None) -> Radiograph:
+def read_frame(frame: Frame, *, channel: str | int | None = None) -> Shot:
     """Read one of the frames that a path stands for, with the errors of `read_radiograph`."""
     if frame.number is None:
         return read_radiograph(frame.path, channel=channel, variable=frame.variable)
     content = _read_file(frame.path, channel, frame.variable, frame.number)
-    assert isinstance(content, Radiograph)
+    assert isinstance(content, Shot)
     return content
 
 
 @as_file_errors
 def _read_file(
     path: Path, channel: str | int | None, variable: str | None, number: int | None = None
-) -> Radiograph | xarray.Dataset:
+) -> Shot | xarray.Dataset:
     file_format = format_of(path)
     if variable is not None and not file_format.named_reader:
         raise InputError(
@@ -157,7 +155,7 @@ def _read_file(
 
 def _as_radiograph(
     name: str | Path, array: AnyArray, facts: dict[str, Any], channel: str | int | None
-) -> Radiograph:
+) -> Shot:
     """Return what a reader gave as a radiograph, with one of its channels."""
     image = to_grey(array, channel, name)
     if not np.isfinite(image).any():
@@ -167,7 +165,7 @@ def _as_radiograph(
     if array.ndim == 3 and channel is not None:
         facts["channel"] = channel
     source, mask = facts.pop("source", None), facts.pop("mask", None)
-    return Radiograph(
+    return Shot(
         image=image,
         metadata=facts,
         source=None if source is None else np.ascontiguousarray(source, dtype=np.float64),
@@ -191,11 +189,11 @@ def _complete_setup(path: Path, geometry: dict[str, Any]) -> Setup | None:
 
 def read_radiograph(
     path: str | Path, *, channel: str | int | None = None, variable: str | None = None
-) -> Radiograph:
+) -> Shot:
     """Read one image, as by `read`; a result or many images raise a `FileFormatError`, too."""
     path, variable = split_address(path, variable)
     content = read_stack(path) if is_stack(path) else _read_file(path, channel, variable)
-    if not isinstance(content, Radiograph):
+    if not isinstance(content, Shot):
         if ResultKind.of(content.attrs) is ResultKind.FILM_DOSES:
             raise FileFormatError(
                 f"{path} is a film pack: expected one image; write its layers to files first"
@@ -213,7 +211,7 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
     `FileFormatError` if the file holds an image.
     """
     content = read(path) if is_stack(path) or "result" in format_of(path).holds else None
-    if content is None or isinstance(content, Radiograph):
+    if content is None or isinstance(content, Shot):
         raise FileFormatError(
             f"{path} is an image: expected the result of an inversion, .shadowinv or pradformat"
         )

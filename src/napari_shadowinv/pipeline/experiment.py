@@ -25,7 +25,7 @@ from napari_shadowinv._system.validation import as_model, check_instance, sugges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict, percent
-from napari_shadowinv.fitting import Fit, FitShot, fit
+from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.fitting.compilation import ensure_compiled as ensure_fit_compiled
 from napari_shadowinv.fitting.shots import NearField
 from napari_shadowinv.inversion import invert
@@ -44,6 +44,7 @@ from napari_shadowinv.pipeline.experiment_result import (
     PlannedShot,
 )
 from napari_shadowinv.pipeline.experiment_shots import ExperimentInputs, ShotSimulator
+from napari_shadowinv.shot import shots_of
 
 _MIN_SIDE_PX = 32
 _MIN_DISPLACEMENT_PX = 1e-6
@@ -409,22 +410,24 @@ def _fitted(
 ) -> _Retrieved:
     inputs, shots = simulator.inputs, simulator.draw(number)
     options, setups = inputs.options, inputs.setups
-    images = [
-        FitShot(image, setup=setup, psf=psf, measured=options.is_recorded)
-        for image, setup, psf in zip(shots.images, setups, inputs.psf, strict=True)
-    ]
-    if near is not None:
-        start = NearField(potential_from_displacement(simulator.truth), near.fields[0].smoothness)
-        images[0] = replace(images[0], start=start)
     noise: Any = "poisson"
     if shots.source is not None and shots.source_noise:  # by the counts of image and reference
         means = gaussian_filter(shots.images, (0, 1.0, 1.0))
         noise = np.sqrt(np.maximum(means, 1.0) + shots.source * shots.source_noise)
+    images = shots_of(
+        shots.images,
+        setup=setups,
+        source=shots.source,
+        psf=inputs.psf,
+        noise=noise,
+        measured=options.is_recorded,
+    )
+    if near is not None:
+        start = NearField(potential_from_displacement(simulator.truth), near.fields[0].smoothness)
+        images[0] = replace(images[0], start=start)
     result = fit(
         images,
-        source=shots.source,
         fields=_fields_of(inputs),
-        noise=noise,
         instrument=inputs.fitted_instrument,
         options=FitOptions(
             samples=_ERROR_SAMPLES if near is None else 0, max_error=options.max_error, threads=1

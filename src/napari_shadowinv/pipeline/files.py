@@ -18,7 +18,8 @@ from napari_shadowinv._system.validation import map_paths, validate
 from napari_shadowinv.io import read_radiograph, read_toml
 from napari_shadowinv.io.files import write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
-from napari_shadowinv.preprocessing import Radiograph, Recipe
+from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.shot import Shot
 
 _PIXEL_SIZES = {"pixel_size", "detector_pixel_size"}
 
@@ -49,7 +50,7 @@ def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None
     write_toml(path, content, overwrite)
 
 
-def read_part(path: Path, channel: str | None = None, variable: str | None = None) -> Radiograph:
+def read_part(path: Path, channel: str | None = None, variable: str | None = None) -> Shot:
     """Read an image, and record the part of its file that it comes from."""
     shot = read_radiograph(path, channel=channel, variable=variable)
     parts = (("channel", channel), ("variable", variable))

@@ -20,8 +20,8 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, FitShot, compare, fit, point_spread
-from napari_shadowinv.fitting.shots import common_values, value_of_first
+from napari_shadowinv.fitting import Fit, compare, fit, point_spread
+from napari_shadowinv.fitting.shots import common_values, value_of_first, values_of
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.normalise import mask_unlit
 from napari_shadowinv.io.files import name_of, sha256, text_of
@@ -30,18 +30,13 @@ from napari_shadowinv.physics.beam import setup_warnings
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import Setup, beam_quantities, deflector_titles, setup_from_dict
 from napari_shadowinv.pipeline.files import read_part, setup_from
-from napari_shadowinv.pipeline.inversion_run import Inputs, Shot, collect_inputs, radiograph_of
+from napari_shadowinv.pipeline.inversion_run import AnyShot, Inputs, collect_inputs, load_shot
 from napari_shadowinv.pipeline.shot_table import ShotRow, fiducials_from
-from napari_shadowinv.preprocessing import (
-    FIT_STEPS,
-    Radiograph,
-    Recipe,
-    UniformEstimate,
-    estimate_source,
-)
+from napari_shadowinv.preprocessing import FIT_STEPS, Recipe, UniformEstimate, estimate_source
 from napari_shadowinv.preprocessing.alignment import measure_shift
 from napari_shadowinv.preprocessing.image_checks import image_warnings
 from napari_shadowinv.provenance import Origin, Provenance, index_masks
+from napari_shadowinv.shot import Shot
 
 # Numbers of an image, in rows of a table, shots and provenances.
 NUMBERS = ("strength", "brightness", "psf", "noise")
@@ -84,18 +79,18 @@ def run_refinement(
     if errors is not None and errors.beam is not None:
         beam = BeamPrior(rms=errors.beam_variation, length=errors.beam_scale)
         instrument = instrument.with_beam(beam)
-    image = FitShot(
+    shot = Shot(
         inversion.image,
         setup=setup,
         source=inversion.source,
         mask=inversion.mask,
         start=inversion.potential,
+        noise=choices.noise,
+        psf=choices.psf,
     )
     result = fit(
-        [image],
+        shot,
         fields=choices.fields or usual_fields(None if setup is None else [setup]),
-        noise=choices.noise,
-        psf=choices.psf or 0.0,
         instrument=instrument,
         options=choices.options,
         on_progress=on_progress,
@@ -125,23 +120,14 @@ class FitInputs:
 
     Attributes
     ----------
-    recorded : tuple of FitShot
-        The images as recorded.
-    shots : tuple of Radiograph
-        The images after the recipe's steps, with setup, source and mask, on one grid of pixels.
-    names : tuple of str
-        Names of the images in messages.
+    shots : tuple of Shot
+        The images after the recipe's steps, with all that is known of them, on one grid of pixels.
     provenance : Provenance
         Origin of all inputs, and the recipe.
-    fiducials : ndarray or None
-        Known displacements in the first image.
     """
 
-    recorded: tuple[FitShot, ...]
-    shots: tuple[Radiograph, ...]
-    names: tuple[str, ...]
+    shots: tuple[Shot, ...]
     provenance: Provenance
-    fiducials: FloatArray | None
 
     @property
     def choices(self) -> FitChoices:
@@ -157,58 +143,17 @@ class FitInputs:
     @cached_property
     def setups(self) -> tuple[Setup, ...] | None:
         """The setups of all images after the steps; None if there are none."""
-        return common_values(self.names, [shot.setup for shot in self.shots], "setup")
-
-    def only(self, numbers: Sequence[int]) -> FitInputs:
-        """Return the inputs of a fit of some of the images, in this order; no fiducials."""
-        images = tuple(self.provenance.images[k] for k in numbers)
-        return FitInputs(
-            tuple(self.recorded[k] for k in numbers),
-            tuple(self.shots[k] for k in numbers),
-            tuple(self.names[k] for k in numbers),
-            self.provenance.model_copy(update={"images": images}),
-            None,
-        )
-
-    @property
-    def images(self) -> list[FitShot]:
-        """The images after the steps, with all that is known of them."""
-        is_known = self.choices.beam == "known"
-        may_be_measured = self.provenance.recipe.estimate is None
-        images = [
-            FitShot(
-                shot.image,
-                setup=shot.setup,
-                source=shot.source if is_known else None,
-                mask=shot.mask,
-                strength=recorded.strength,
-                brightness=recorded.brightness,
-                psf=self._point_spread(k),
-                noise=recorded.noise,
-                name=self.names[k],
-                measured=may_be_measured and recorded.measured,
-            )
-            for k, (recorded, shot) in enumerate(zip(self.recorded, self.shots, strict=True))
-        ]
-        images[0] = replace(images[0], fiducials=self.fiducials, start=self.recorded[0].start)
-        return images
-
-    @property
-    def keywords(self) -> dict[str, Any]:
-        """Keywords of `fit` and `compare`, except fields."""
-        return {
-            "images": self.images,
-            "source": "unknown" if self.choices.beam == "unknown" else None,
-            "noise": self.choices.noise,
-            "brightness": self.choices.brightness,
-            "instrument": self.provenance.recipe.instrument,
-            "options": self.choices.options,
-        }
+        return values_of(self.shots, "setup")
 
     def run(self, on_progress: OnProgress | None, should_stop: ShouldStop | None) -> Fit:
         """Fit the fields to the images."""
         result = fit(
-            **self.keywords, fields=self.fields, on_progress=on_progress, should_stop=should_stop
+            self.shots,
+            fields=self.fields,
+            instrument=self.provenance.recipe.instrument,
+            options=self.choices.options,
+            on_progress=on_progress,
+            should_stop=should_stop,
         )
         return self.with_provenance(result)
 
@@ -220,23 +165,10 @@ class FitInputs:
         provenance = self.provenance.model_copy(update={"recipe": recipe})
         return replace(result, setups=self.setups or (), provenance=provenance)
 
-    def _point_spread(self, k: int) -> float:
-        """Standard deviation of an image's point spread in px."""
-        choices, setup, psf = self.choices, self.shots[k].setup, self.recorded[k].psf
-        if psf is not None or (choices.source_size is None and choices.resolution is None):
-            return psf if psf is not None else choices.psf or 0.0
-        if setup is None:
-            raise InputError(
-                f"{self.names[k]} has no setup, and source size and resolution are in m: give the "
-                "setup, or the point spread in px",
-                option="psf",
-            )
-        return point_spread(setup, choices.source_size or 0.0, choices.resolution or 0.0)
-
 
 def run_fit(
     recipe: Recipe,
-    shots: Sequence[FitShot | Shot],
+    shots: Sequence[AnyShot],
     *,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
@@ -247,7 +179,7 @@ def run_fit(
     ----------
     recipe : Recipe
         Steps and options; without a section `fit` the defaults apply.
-    shots : sequence of FitShot, Radiograph, array_like or path
+    shots : sequence of Shot, array_like or path
         The images, of one size after the steps.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.fit`.
@@ -271,7 +203,7 @@ def run_fit(
 
 def run_comparison(
     recipe: Recipe,
-    shots: Sequence[FitShot | Shot],
+    shots: Sequence[AnyShot],
     *,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
@@ -279,8 +211,10 @@ def run_comparison(
     """Fit each of the `compared_fields`, otherwise as `run_fit`; the likeliest comes first."""
     inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
     fits = compare(
-        **inputs.keywords,
+        inputs.shots,
         choices=compared_fields(inputs.setups),
+        instrument=recipe.instrument,
+        options=inputs.choices.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -288,25 +222,23 @@ def run_comparison(
 
 
 def collect_fit_inputs(
-    recipe: Recipe, shots: Sequence[FitShot | Shot], *, should_stop: ShouldStop | None = None
+    recipe: Recipe, shots: Sequence[AnyShot], *, should_stop: ShouldStop | None = None
 ) -> FitInputs:
     """Collect the inputs of a fit: read files, apply the steps, and fill in defaults."""
-    recorded = tuple(entry if isinstance(entry, FitShot) else FitShot(entry) for entry in shots)
+    recorded = [shot if isinstance(shot, Shot) else Shot(shot) for shot in shots]
     if not recorded:
         raise InputError("received no image: expected one or several of one object")
     choices = recipe.fit or FitChoices()
     check_fit(recipe)
-    names = tuple(_shot_name(image, k) for k, image in enumerate(recorded))
+    names = [_shot_name(shot, k) for k, shot in enumerate(recorded)]
     by_default = choices.beam == "unknown"
-    flags = [
-        image.beam_unknown or (by_default and image.source is None) or None for image in recorded
-    ]
+    flags = [shot.beam_unknown or (by_default and shot.source is None) or None for shot in recorded]
     unknown = common_values(names, flags, "unknown source") is not None
     collected = [
-        _collect_image(recipe, image, name, unknown=unknown)
-        for image, name in zip(recorded, names, strict=True)
+        _collect_image(recipe, shot, name, unknown=unknown)
+        for shot, name in zip(recorded, names, strict=True)
     ]
-    ready: list[Radiograph] = []
+    ready: list[Shot] = []
     for inputs, name in zip(collected, names, strict=True):
         shot = _prepare_image(inputs, name, should_stop)
         if ready and shot.shape != ready[0].shape:
@@ -331,7 +263,35 @@ def collect_fit_inputs(
         fiducials=origin,
         fiducial_rows=None if table is None else table.tolist(),
     )
-    return FitInputs(recorded, tuple(ready), names, provenance.shorten(), table)
+    complete = [
+        _with_choices(shot, recorded[k], choices, names[k], unknown) for k, shot in enumerate(ready)
+    ]
+    complete[0] = replace(complete[0], fiducials=table)
+    return FitInputs(tuple(complete), provenance.shorten())
+
+
+def _with_choices(
+    shot: Shot, recorded: Shot, choices: FitChoices, name: str, unknown: bool
+) -> Shot:
+    """Return a shot after the steps with what is known of it, or else of all images."""
+    psf = shot.psf
+    if psf is None and (choices.source_size is not None or choices.resolution is not None):
+        if shot.setup is None:
+            raise InputError(
+                f"{name} has no setup, and source size and resolution are in m: give the setup, or "
+                "the point spread in px",
+                option="psf",
+            )
+        psf = point_spread(shot.setup, choices.source_size or 0.0, choices.resolution or 0.0)
+    free = "free" if choices.brightness == "free" else None
+    return replace(
+        shot,
+        source="unknown" if unknown else shot.source,
+        brightness=free if recorded.brightness is None else recorded.brightness,
+        psf=choices.psf if psf is None else psf,
+        noise=choices.noise if shot.noise is None else shot.noise,
+        name=name,
+    )
 
 
 def check_fit(recipe: Recipe) -> None:
@@ -348,35 +308,26 @@ def check_fit(recipe: Recipe) -> None:
         )
 
 
-def _shot_name(shot: FitShot, k: int) -> str:
-    if shot.name:
-        return shot.name
-    image = shot.image
-    path = image.path if isinstance(image, Radiograph) else image
-    return str(path) if isinstance(path, (str, Path)) else f"image {k + 1}"
+def _shot_name(shot: Shot, k: int) -> str:
+    path = shot.image if isinstance(shot.image, (str, Path)) else shot.path
+    return shot.name or (f"image {k + 1}" if path is None else str(path))
 
 
-def _collect_image(recipe: Recipe, shot: FitShot, name: str, *, unknown: bool) -> Inputs:
-    """Collect an image as recorded, with its source and masks."""
-    image: Any = shot.image
-    source: Any = None if shot.beam_unknown else shot.source
-    masks = {"mask": shot.mask, "source_mask": shot.source_mask}
-    files = {key: Path(mask) for key, mask in masks.items() if isinstance(mask, (str, Path))}
-    arrays: Any = {key: mask for key, mask in masks.items() if key not in files}
-    shot_recipe = recipe.model_copy(
-        update={**files, "setup": shot.setup or recipe.setup, "fit": None}
-    )
+def _collect_image(recipe: Recipe, shot: Shot, name: str, *, unknown: bool) -> Inputs:
+    """Collect an image as recorded, with its source and masks; its brightness is fitted."""
+    changes = {"setup": shot.setup or recipe.setup, "fit": None}
+    shot = replace(shot, source=None if shot.beam_unknown else shot.source, brightness=None)
     try:
-        if unknown and isinstance(image, (Radiograph, str, Path)):
-            image = replace(radiograph_of(image, "the image"), source=None)
-        inputs = collect_inputs(shot_recipe, image, source=source, **arrays)
+        if unknown:
+            shot = replace(load_shot(shot, "the image"), source=None)
+        inputs = collect_inputs(recipe.model_copy(update=changes), shot)
         inputs.recipe.check(inputs.shot)
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
     return inputs
 
 
-def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Radiograph:
+def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Shot:
     """Apply the steps to an image, and estimate its source if the recipe does so."""
     try:
         shot = inputs.prepare(should_stop)
@@ -395,7 +346,9 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
             recorded = inputs.shot.shape
             positioned = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))
             source = estimate_source(positioned, shot, should_stop, doubts.append)
-        return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
+        measured = shot.measured and estimate is None
+        warnings = (*shot.warnings, *doubts)
+        return replace(shot, source=source, measured=measured, warnings=warnings)
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
 
@@ -429,7 +382,7 @@ def _read_fiducials(fiducials: ArrayLike | Path | None) -> tuple[FloatArray | No
 
 
 def _image_origins(
-    recorded: Sequence[FitShot], collected: Sequence[Inputs], ready: Sequence[Radiograph]
+    recorded: Sequence[Shot], collected: Sequence[Inputs], ready: Sequence[Shot]
 ) -> dict[str, Any]:
     origins, masks = [], []
     for row, inputs, shot in zip(recorded, collected, ready, strict=True):
@@ -449,7 +402,7 @@ def read_row_images(
     *,
     channel: str | None = None,
     variable: str | None = None,
-) -> tuple[FitShot, ...]:
+) -> tuple[Shot, ...]:
     """Read the images of rows, whose energies or wavelengths complete the setups.
 
     Parameters
@@ -463,17 +416,17 @@ def read_row_images(
     """
     images = []
     for row in rows:
-        shot = read_part(row.file, channel, variable)
+        recorded = read_part(row.file, channel, variable)
         source: Any = row.source
         if isinstance(source, Path):
             source = read_part(source, channel)
-        setup = row_setup(row, shot, recipe)
         numbers = {name: getattr(row, name) for name in NUMBERS}
-        images.append(FitShot(shot, setup=setup, source=source, mask=row.mask, **numbers))
+        known = Shot(row.file, row_setup(row, recorded, recipe), source, row.mask, **numbers)
+        images.append(known.completed_by(recorded))
     return tuple(images)
 
 
-def row_setup(row: ShotRow, shot: Radiograph, recipe: Recipe) -> Setup | None:
+def row_setup(row: ShotRow, shot: Shot, recipe: Recipe) -> Setup | None:
     """Return the setup of an image from its row, the recipe, or its file, in this order.
 
     An `InputError` is raised if the row has an energy or a wavelength, no strength, and there is no

@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -44,7 +44,6 @@ from napari_shadowinv.pipeline.remaining_beam import after_steps
 from napari_shadowinv.preprocessing import (
     Estimate,
     MeasuredSource,
-    Radiograph,
     Recipe,
     UniformEstimate,
     estimate_source,
@@ -53,6 +52,7 @@ from napari_shadowinv.preprocessing import (
 )
 from napari_shadowinv.preprocessing.estimates import IsotropicEstimate, centre_within
 from napari_shadowinv.provenance import ImageOrigin, MaskOrigin, Origin, Provenance, index_masks
+from napari_shadowinv.shot import Shot
 from napari_shadowinv.transport.sites import SitePlan
 
 
@@ -181,7 +181,7 @@ PREVIEW_SITES = 5_000
 PREVIEW_PIXELS = 10_000
 _BYTES_PER_PIXEL = 24  # of an image and copies that steps make; an inversion needs more
 
-Shot = Radiograph | ArrayLike | str | Path
+AnyShot = Shot | ArrayLike | str | Path
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,28 +192,25 @@ class Inputs:
     ----------
     recipe : Recipe
         With the setup and the kind of source of this shot.
-    shot : Radiograph
+    shot : Shot
         The shot as recorded, with its source and masks.
     provenance : Provenance
         Origin of all inputs.
     """
 
     recipe: Recipe
-    shot: Radiograph
+    shot: Shot
     provenance: Provenance
 
-    def prepare(self, should_stop: ShouldStop | None = None) -> Radiograph:
+    def prepare(self, should_stop: ShouldStop | None = None) -> Shot:
         """Return the shot after the recipe's steps; see `Recipe.prepare`."""
         return self.recipe.prepare(self.shot, should_stop)
 
 
 def run(
     recipe: Recipe,
-    shot: Shot,
+    shot: AnyShot,
     *,
-    source: Shot | None = None,
-    mask: ArrayLike | None = None,
-    source_mask: ArrayLike | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
     cache: Cache | None = None,
@@ -225,14 +222,9 @@ def run(
     ----------
     recipe : Recipe
         Steps and options.
-    shot : Radiograph, array_like of shape (H, W), or path
-        The image, with its metadata.
-    source : Radiograph, array_like of shape (H, W), or path, optional
-        The undisturbed beam. Default: from the recipe, or from the shot's file.
-    mask : array_like of bool, shape (H, W), optional
-        True where a pixel of the shot can be used. Default: as for `source`.
-    source_mask : array_like of bool, shape (H, W), optional
-        True where the object is not. Default: from the recipe.
+    shot : Shot, array_like of shape (H, W), or path
+        The image, and what is known of it beside the recipe. The recipe's setup and measured source
+        precede those of the image's file; a pixel is used where all masks are true.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.invert`.
     cache : Cache, optional
@@ -266,7 +258,7 @@ def run(
     report = Reporter(on_progress, should_stop)
     clock = time.perf_counter()
     report("prepare", 0, None, "image and source")
-    inputs = collect_inputs(recipe, shot, source=source, mask=mask, source_mask=source_mask)
+    inputs = collect_inputs(recipe, shot)
     inputs.recipe.check(inputs.shot)
     ready = inputs.prepare(should_stop)
     return run_prepared(
@@ -282,7 +274,7 @@ def run(
 
 def run_prepared(
     inputs: Inputs,
-    shot: Radiograph,
+    shot: Shot,
     *,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
@@ -297,7 +289,7 @@ def run_prepared(
     ----------
     inputs : Inputs
         The shot as recorded and its recipe.
-    shot : Radiograph
+    shot : Shot
         The shot after the recipe's steps.
     start : Inversion, optional
         As for `napari_shadowinv.invert`.
@@ -372,7 +364,7 @@ def run_prepared(
 
 def _source(
     inputs: Inputs,
-    shot: Radiograph,
+    shot: Shot,
     report: Reporter,
     cache: Cache,
     doubts: list[Caution],
@@ -396,9 +388,7 @@ def _source(
     return estimate_source(estimate, shot, report.should_stop, doubts.append, by=cached)
 
 
-def _remaining_source(
-    inputs: Inputs, shot: Radiograph, should_stop: ShouldStop | None
-) -> FloatArray:
+def _remaining_source(inputs: Inputs, shot: Shot, should_stop: ShouldStop | None) -> FloatArray:
     """Return the source of a shot with another beam, quickly; flat if its error is stated."""
     estimate = inputs.recipe.estimate
     if estimate is None or inputs.recipe.instrument.beam_rms is not None:
@@ -409,31 +399,23 @@ def _remaining_source(
     return estimate_source(estimate, shot, should_stop, lambda caution: None, by=by)
 
 
-def collect_inputs(
-    recipe: Recipe,
-    shot: Shot,
-    *,
-    source: Shot | None = None,
-    mask: ArrayLike | None = None,
-    source_mask: ArrayLike | None = None,
-) -> Inputs:
+def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     """Collect the inputs of a recipe: read files, and fill in defaults of the shot."""
-    radiograph = radiograph_of(shot, "the image")
-    setup = radiograph.setup if recipe.setup is None else recipe.setup
-    beam, kind = None, recipe.source
-    if source is not None:
-        beam = radiograph_of(source, "the source")
-    elif isinstance(kind, MeasuredSource) and (file := _source_file(kind, radiograph)) is not None:
-        beam = read_radiograph(file, variable=kind.variable)
-    elif radiograph.source is not None and recipe.estimate is None:
-        beam = replace(radiograph, image=radiograph.source, source=None, mask=None)
+    given = shot if isinstance(shot, Shot) else Shot(shot)
+    loaded = load_shot(given, "the image")
+    setup = loaded.setup if recipe.setup is None else recipe.setup
+    beam = _beam_of(recipe, loaded)
     if setup is not None:
-        check_spacing(shot, "the image", setup.pixel_sizes)
-        check_spacing(source, "the source", setup.pixel_sizes)
-    usable = _mask(mask, recipe.mask, "mask", radiograph) or _Mask(radiograph.mask, None)
-    usable = _without_missing(_without_masked(usable, shot, source), radiograph, beam)
-    bare = _mask(source_mask, recipe.source_mask, "source mask", radiograph)
-    bare = bare or _Mask(radiograph.source_mask, None)
+        check_spacing(given.image, "the image", setup.pixel_sizes)
+        check_spacing(given.source, "the source", setup.pixel_sizes)
+    usable = _mask((loaded.mask, recipe.mask), "mask", loaded.shape)
+    is_array = not isinstance(given.source, Shot | str | Path | None)
+    lit = beam.mask if is_array and beam is not None and not loaded.has_own_source else None
+    if lit is not None:
+        usable = _Mask(join_masks(usable.pixels, lit), None)
+    usable = _without_missing(usable, loaded, beam)
+    bare = _mask((loaded.source_mask, recipe.source_mask), "source mask", loaded.shape)
+    kind = recipe.source
     if kind is None:
         kind = UniformEstimate() if beam is None else MeasuredSource()
     elif isinstance(kind, MeasuredSource):
@@ -441,22 +423,25 @@ def collect_inputs(
     resolved = recipe.model_copy(
         update={"source": kind, "mask": None, "source_mask": None, "setup": setup}
     )
-    dark = _dark_frame(recipe, radiograph)
+    dark = _dark_frame(recipe, loaded)
     if dark is not None:
         origin = _origin(dark)
         resolved = resolved.with_dark_file(join_address(origin.file, origin.variable))
     origin = ImageOrigin(
-        **dict(_origin(radiograph)),
+        **dict(_origin(loaded)),
         source=None if beam is None else _origin(beam),
         dark=None if dark is None else _origin(dark),
+        brightness=loaded.brightness,
     )
     masks = index_masks([origin], [(usable.origin, bare.origin)])
     provenance = Provenance(kind="inversion", recipe=resolved, **masks).shorten()
     complete = replace(
-        radiograph,
+        loaded,
+        image=loaded.image if loaded.brightness is None else loaded.image / loaded.brightness,
+        brightness=None,
         source=None if beam is None else beam.image,
         setup=resolved.setup,
-        warnings=(*radiograph.warnings, *(() if beam is None else beam.warnings)),
+        warnings=(*loaded.warnings, *(() if beam is None else beam.warnings)),
         mask=usable.pixels,
         source_mask=bare.pixels,
         dark=None if dark is None else dark.image,
@@ -464,7 +449,33 @@ def collect_inputs(
     return Inputs(resolved, complete, provenance)
 
 
-def _dark_frame(recipe: Recipe, shot: Radiograph) -> Radiograph | None:
+def load_shot(shot: AnyShot, name: str) -> Shot:
+    """Return a shot with its image in memory, and with what its file tells beside what is known."""
+    given = shot if isinstance(shot, Shot) else Shot(shot)
+    if isinstance(given.image, (str, Path)):
+        return given.completed_by(read_radiograph(Path(given.image)))
+    values, usable = unpack_array(given.image, name)
+    mask = given.mask if usable is None else join_masks(_pixels(given.mask, "mask"), usable)
+    return replace(given, image=plane_of(values, name), mask=mask)
+
+
+def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
+    """Return the source of a shot: its own, that of the recipe, or that in the image's file."""
+    if shot.beam_unknown:
+        raise InputError(
+            "the source is 'unknown', which only a fit can find: give an image of it, or none"
+        )
+    kind = recipe.source
+    if shot.source is not None and not shot.has_own_source:
+        return load_shot(shot.source, "the source")
+    if isinstance(kind, MeasuredSource) and (file := _source_file(kind, shot)) is not None:
+        return read_radiograph(file, variable=kind.variable)
+    if shot.source is not None and recipe.estimate is None:
+        return replace(shot, image=shot.source, source=None, mask=None)
+    return None
+
+
+def _dark_frame(recipe: Recipe, shot: Shot) -> Shot | None:
     """Read the dark frame that the recipe subtracts, if it names a file."""
     file = recipe.dark_file
     if file is None:
@@ -477,7 +488,7 @@ def _dark_frame(recipe: Recipe, shot: Radiograph) -> Radiograph | None:
     return frame
 
 
-def _source_file(kind: MeasuredSource, shot: Radiograph) -> Path | None:
+def _source_file(kind: MeasuredSource, shot: Shot) -> Path | None:
     """Return the file of a measured source; a variable alone refers to the shot's file."""
     return kind.file if kind.file is not None or kind.variable is None else shot.path
 
@@ -499,34 +510,33 @@ class _Mask:
         return packed.model_copy(update=file_origin)
 
 
-def _mask(values: ArrayLike | None, file: Path | None, name: str, shot: Radiograph) -> _Mask | None:
-    if values is not None:
-        pixels = np.asarray(unpack_mask(values, name))
-        if pixels.dtype != np.bool_:
-            raise InputError(
-                f"{name} has values of type {pixels.dtype}, expected booleans: compare it with "
-                "a number, as in mask > 0"
-            )
-        check_shape(name, pixels.shape, shot.shape)
-        check_usable(pixels, name)
-        return _Mask(pixels, None)
-    if file is None:
+def _mask(masks: Sequence[ArrayLike | Path | None], name: str, shape: tuple[int, int]) -> _Mask:
+    """Return where all masks are true, with the file if there is only one, which is a file."""
+    given = [mask for mask in masks if mask is not None]
+    planes = [_pixels(mask, name) for mask in given]
+    for mask, pixels in zip(given, planes, strict=True):
+        check_shape(f"{mask}: {name}" if isinstance(mask, Path) else name, pixels.shape, shape)
+    (file,) = given if len(given) == 1 else (None,)
+    return _Mask(join_masks(*planes), file if isinstance(file, Path) else None)
+
+
+def _pixels(mask: Any, name: str) -> Any:
+    """Return a mask's pixels, from its file or as checked."""
+    if mask is None:
         return None
-    pixels = picture_mask(file, name)
-    check_shape(f"{file}: {name}", pixels.shape, shot.shape)
-    return _Mask(pixels, file)
+    if isinstance(mask, (str, Path)):
+        return picture_mask(Path(mask), name)
+    pixels = np.asarray(unpack_mask(mask, name))
+    if pixels.dtype != np.bool_:
+        raise InputError(
+            f"{name} has values of type {pixels.dtype}, expected booleans: compare it with "
+            "a number, as in mask > 0"
+        )
+    check_usable(pixels, name)
+    return pixels
 
 
-def _without_masked(mask: _Mask, *images: Any) -> _Mask:
-    """Remove the masked pixels of arrays from a mask."""
-    arrays = [image for image in images if not isinstance(image, Radiograph | str | Path | None)]
-    masks = [unpack_array(image, "image")[1] for image in arrays]
-    if all(usable is None for usable in masks):
-        return mask
-    return _Mask(join_masks(mask.pixels, *masks), None)
-
-
-def _without_missing(mask: _Mask, *images: Radiograph | None) -> _Mask:
+def _without_missing(mask: _Mask, *images: Shot | None) -> _Mask:
     """Remove the pixels without a value in the files of images from a mask."""
     masked = (image for image in images if image is not None and image.mask is not None)
     present = [~np.isnan(image.image) for image in masked]
@@ -542,16 +552,6 @@ def picture_mask(path: Path, name: str = "mask", variable: str | None = None) ->
     return mask
 
 
-def radiograph_of(image: Shot, name: str) -> Radiograph:
-    """Return an image with its metadata, read from its file if it is a path."""
-    if isinstance(image, Radiograph):
-        return image
-    if isinstance(image, (str, Path)):
-        return read_radiograph(Path(image))
-    values, usable = unpack_array(image, name)
-    return Radiograph(plane_of(values, name), mask=usable)
-
-
 def plane_of(values: Any, name: str) -> FloatArray:
     """Return an image as floats; an `InputError` if it is none."""
     array = check_plane(values, name)
@@ -559,7 +559,7 @@ def plane_of(values: Any, name: str) -> FloatArray:
     return array.astype(np.float64)
 
 
-def _origin(image: Radiograph) -> Origin:
+def _origin(image: Shot) -> Origin:
     metadata = image.metadata
     return Origin(
         file="" if image.path is None else text_of(image.path.name),

@@ -12,19 +12,19 @@ import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting import FitShot, LeaveOneOut, leave_one_out
+from napari_shadowinv.fitting import LeaveOneOut, leave_one_out
 from napari_shadowinv.fitting.left_out import check_count
 from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.fitting.shots import common_values
+from napari_shadowinv.fitting.shots import names_of, values_of
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
-from napari_shadowinv.pipeline.inversion_run import Shot
+from napari_shadowinv.pipeline.inversion_run import AnyShot
 from napari_shadowinv.preprocessing import Recipe
 
 
 def run_leave_one_out(
     recipe: Recipe,
-    shots: Sequence[FitShot | Shot],
+    shots: Sequence[AnyShot],
     fields: Sequence[str] | None = None,
     *,
     on_progress: OnProgress | None = None,
@@ -36,7 +36,7 @@ def run_leave_one_out(
     ----------
     recipe : Recipe
         Steps and options; without a section `fit` the defaults apply.
-    shots : sequence of FitShot, Radiograph, array_like or path
+    shots : sequence of Shot, array_like or path
         Three images or more, of one size after the steps.
     fields : sequence of {"B", "E", "n"}, optional
         The fields of the object. Default: those of the recipe.
@@ -65,14 +65,16 @@ def run_leave_one_out(
         )
     inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
     order = _order_by_energy(inputs)
+    images = [replace(inputs.shots[k], fiducials=None) for k in order]
     left_out = leave_one_out(
-        **inputs.only(order).keywords,
+        images,
         fields=inputs.fields,
+        options=inputs.choices.options,
         on_progress=on_progress,
         should_stop=should_stop,
     )
     left_out = left_out.only([int(place) for place in np.argsort(order)])
-    return replace(left_out, setups=inputs.setups or (), names=inputs.names)
+    return replace(left_out, setups=inputs.setups or (), names=names_of(inputs.shots))
 
 
 def _order_by_energy(inputs: FitInputs) -> list[int]:
@@ -84,8 +86,8 @@ def _order_by_energy(inputs: FitInputs) -> list[int]:
 
 def _strengths(inputs: FitInputs) -> FloatArray:
     """Displacement of each image by each field, relative to the first image."""
-    strengths = common_values(inputs.names, [shot.strength for shot in inputs.recorded], "strength")
+    strengths = values_of(inputs.shots, "strength")
     if strengths is None:
-        return strengths_of(inputs.setups, inputs.fields, len(inputs.shots), inputs.names)
+        return strengths_of(inputs.setups, inputs.fields, len(inputs.shots))
     matrix = np.array(strengths, dtype=np.float64)
     return np.asarray(matrix / matrix[0])

@@ -19,7 +19,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument
-from napari_shadowinv.preprocessing import Radiograph, Recipe
+from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.shot import Shot
 
 _BEAMS = 4
 _BLOCKS = 64  # along the longer side
@@ -29,8 +30,8 @@ _DIMMEST = 0.05  # of the mean, for a ratio
 def after_steps(
     instrument: Instrument,
     recipe: Recipe,
-    recorded: Radiograph,
-    source_of: Callable[[Radiograph], FloatArray],
+    recorded: Shot,
+    source_of: Callable[[Shot], FloatArray],
     *,
     measured: bool = False,
 ) -> Instrument:
@@ -42,7 +43,7 @@ def after_steps(
         With the beam before them, stated or assumed.
     recipe : Recipe
         Its steps are applied to the shot with other beams.
-    recorded : Radiograph
+    recorded : Shot
         The shot before them.
     source_of : callable
         Estimates the source of a shot after them, shape (H, W).
@@ -64,13 +65,13 @@ def after_steps(
         for flattens in (True, False)
     )
 
-    def flatten(shot: Radiograph, by: Recipe = recipe) -> FloatArray:
+    def flatten(shot: Shot, by: Recipe = recipe) -> FloatArray:
         """Return the image after all steps over its source, with a mean of 1; 0 where masked."""
         ready = by.prepare(shot)
         ratio = ready.image / np.maximum(source_of(ready), 1e-300)
         return _normalise(ratio, ready)
 
-    def move(shot: Radiograph) -> FloatArray:
+    def move(shot: Shot) -> FloatArray:
         ready = moving.prepare(shot)
         return _normalise(ready.image, ready)
 
@@ -87,9 +88,7 @@ def after_steps(
         for shift in ((1, 1), (1, -1)):
             steps = [sign * side // 4 for sign, side in zip(shift, usual.shape, strict=True)]
             shifted = np.roll(usual, steps, (0, 1))
-            lost.append(
-                _change(shifted, flatten(Radiograph(shifted, setup=recorded.setup), flattening))
-            )
+            lost.append(_change(shifted, flatten(Shot(shifted, setup=recorded.setup), flattening)))
         of_object, of_beam = (
             float(np.mean(np.square(each))) if each else 0.0 for each in (lost, removed)
         )
@@ -114,7 +113,7 @@ def after_steps(
     return instrument.with_beam(prior)
 
 
-def _normalise(image: FloatArray, shot: Radiograph) -> FloatArray:
+def _normalise(image: FloatArray, shot: Shot) -> FloatArray:
     values = image if shot.mask is None else np.where(shot.mask, image, 0.0)
     return np.asarray(values / values.mean())
 

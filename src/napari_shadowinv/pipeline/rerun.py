@@ -21,7 +21,7 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind, to_figures
-from napari_shadowinv.fitting import Fit, FitShot, LeaveOneOut
+from napari_shadowinv.fitting import Fit, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset
@@ -29,11 +29,12 @@ from napari_shadowinv.io.files import join_address, sha256, split_address
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_refinement
-from napari_shadowinv.pipeline.inversion_run import Shot, picture_mask, radiograph_of, run
+from napari_shadowinv.pipeline.inversion_run import AnyShot, load_shot, picture_mask, run
 from napari_shadowinv.pipeline.left_out import run_leave_one_out
-from napari_shadowinv.preprocessing import MeasuredSource, Radiograph, Recipe
+from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 from napari_shadowinv.provenance import MaskOrigin, Origin, Provenance
 from napari_shadowinv.results import result_from_dataset
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     import xarray
@@ -86,7 +87,7 @@ class RerunInputs:
         Its provenance.
     recipe : Recipe
         The recipe, with the dark frame where it is now.
-    shots : tuple of FitShot
+    shots : tuple of Shot
         The images with source, masks and setup; empty for a film pack.
     files : tuple of Path
         All files that were read, the images first.
@@ -99,7 +100,7 @@ class RerunInputs:
     dataset: xarray.Dataset
     provenance: Provenance
     recipe: Recipe
-    shots: tuple[FitShot, ...] = ()
+    shots: tuple[Shot, ...] = ()
     files: tuple[Path, ...] = ()
     masks: tuple[MaskOrigin, ...] = ()
     changes: tuple[str, ...] = ()
@@ -137,22 +138,15 @@ class RerunInputs:
 
     def _invert(self, recipe: Recipe, **callbacks: Any) -> Inversion:
         (shot,) = self.shots
-        assert isinstance(shot.image, Radiograph)
-        image, brightness = shot.image, shot.brightness
-        if brightness is not None:
-            image = replace(image, image=image.image / brightness)
-        masks: dict[str, Any] = {"mask": shot.mask, "source_mask": shot.source_mask}
-        source: Any = shot.source
         try:
-            inversion = run(recipe, image, source=source, **masks, **callbacks)
+            inversion = run(recipe, shot, **callbacks)
         except InputError as error:
-            if image.path is None:
+            if shot.path is None:
                 raise
-            raise error.about(image.path) from error
+            raise error.about(shot.path) from error
         assert inversion.provenance is not None
-        provenance = inversion.provenance.with_image(brightness=brightness)
         # The masks were passed as arrays.
-        provenance = provenance.model_copy(update={"masks": self.masks})
+        provenance = inversion.provenance.model_copy(update={"masks": self.masks})
         return replace(inversion, provenance=provenance)
 
     def _fit(self, **callbacks: Any) -> tuple[Fit, LeaveOneOut | None]:
@@ -176,7 +170,7 @@ class RerunInputs:
 
 def rerun(
     result: Path | str | AnyResult | xarray.Dataset,
-    images: Sequence[Shot] | Shot | None = None,
+    images: Sequence[AnyShot] | AnyShot | None = None,
     *,
     source: Path | str | None = None,
     other_folders: bool = False,
@@ -192,7 +186,7 @@ def rerun(
     result : path, Dataset, Inversion, Fit or FilmDoses
         An inversion, a fit with its images left out, a film pack, or the dataset of
         one shot of a stack, which is inverted without another shot to start from.
-    images : sequence of path, array_like or Radiograph, optional
+    images : sequence of path, array_like or Shot, optional
         The images in their order. Default: the files that the provenance names, in the result's
         folder or the current one.
     source : path, optional
@@ -223,7 +217,7 @@ def rerun(
 
 def collect_rerun(
     result: Path | str | AnyResult | xarray.Dataset,
-    images: Sequence[Shot] | Shot | None = None,
+    images: Sequence[AnyShot] | AnyShot | None = None,
     *,
     source: Path | str | None = None,
     other_folders: bool = False,
@@ -242,7 +236,7 @@ def collect_rerun(
         dataset = result.to_dataset()
     provenance = _checked_provenance(dataset, name)
     listed: Any = () if images is None else images
-    shots = (listed,) if isinstance(listed, (str, Path, Radiograph)) else tuple(listed)
+    shots = (listed,) if isinstance(listed, (str, Path, Shot)) else tuple(listed)
     reader = _Reader(name, folder or Path(), shots, source, other_folders)
     if provenance.version != __version__:
         reader.changes.append(f"made by version {provenance.version}, now {__version__}")
@@ -314,7 +308,7 @@ class _Reader:
 
     result: str
     folder: Path
-    images: tuple[Shot, ...]
+    images: tuple[AnyShot, ...]
     source: Path | str | None
     other_folders: bool
     files: list[Path] = field(default_factory=list)
@@ -392,28 +386,28 @@ class _Reader:
             raise FileFormatError(f"{name} {reason}: name the file to use")
         return path
 
-    def _read(self, origin: Origin, name: str, argument: Shot | None = None) -> Radiograph:
+    def _read(self, origin: Origin, name: str, argument: AnyShot | None = None) -> Shot:
         """Read an image or source; an argument has precedence."""
         if argument is None:
             argument = self._find(origin, name)
         if not isinstance(argument, (str, Path)):
-            return radiograph_of(argument, name)
+            return load_shot(argument, name)
         path, variable = split_address(argument)
         self.files.append(path)
         channel = None if origin.channel is None else str(origin.channel)
         return read_part(path, channel, variable or origin.variable)
 
-    def _shot(self, provenance: Provenance, k: int, image: Radiograph, source_name: str) -> FitShot:
+    def _shot(self, provenance: Provenance, k: int, image: Shot, source_name: str) -> Shot:
         origin, source = provenance.images[k], None
         if origin.source is not None and (
             (origin.source.file, origin.source.variable) != (origin.file, origin.variable)
         ):
             source = self._read(origin.source, source_name, self.source)
-        return FitShot(
+        return replace(
+            image,
             # The provenance says which other contents of the file were used.
-            image=replace(image, setup=None, mask=None, source_mask=None),
             setup=origin.setup or provenance.recipe.setup,
-            source=source,
+            source=image.source if source is None else source,
             mask=self._mask(provenance, origin.mask, image.mask),
             source_mask=self._mask(provenance, origin.source_mask, image.source_mask),
             measured=origin.measured,

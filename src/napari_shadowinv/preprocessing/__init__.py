@@ -1,6 +1,6 @@
 """Preparation of a shot for its inversion, and the recipe of it.
 
-- the shot: `Radiograph`; the recipe: `Recipe`
+- the shot: `Shot`; the recipe: `Recipe`
 - whether image and source look right: `image_warnings`, `ReferencePair`; a source in register with
   its image: `register_source`
 - steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,

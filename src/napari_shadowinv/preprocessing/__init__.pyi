@@ -44,7 +44,7 @@ from .recipe import (
     estimate_source,
     with_prior_of,
 )
-from .steps import Bin, Choice, Crop, Dark, Radiograph, Rotate, Step
+from .steps import Bin, Choice, Crop, Dark, Rotate, Step
 
 __all__ = [
     "ESTIMATES",
@@ -69,7 +69,6 @@ __all__ = [
     "LowPassFilter",
     "MeasuredSource",
     "PolynomialEstimate",
-    "Radiograph",
     "Recipe",
     "ReferencePair",
     "Rotate",

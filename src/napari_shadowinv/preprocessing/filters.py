@@ -35,7 +35,8 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import pixels
-from napari_shadowinv.preprocessing.steps import Radiograph, Step, degree_field, width_field
+from napari_shadowinv.preprocessing.steps import Step, degree_field, width_field
+from napari_shadowinv.shot import Shot
 
 
 class Filter(Step):
@@ -64,7 +65,7 @@ class Filter(Step):
         """Return a note on the changes by the filter."""
         return self.summary
 
-    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:
         image = self.filter_image(shot.image, shot.mask, should_stop)
         source = shot.source
         if source is not None:

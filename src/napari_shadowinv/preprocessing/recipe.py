@@ -26,7 +26,8 @@ from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter, HotPixelFilter
-from napari_shadowinv.preprocessing.steps import Choice, Dark, Radiograph, Step, choices_of
+from napari_shadowinv.preprocessing.steps import Choice, Dark, Step, choices_of
+from napari_shadowinv.shot import Shot
 
 _MIN_VISIBLE_SHARE = 0.1  # of an object under the source mask, for the inversion to see it
 _MIN_OBJECT_PIXELS = 10  # pixels
@@ -144,14 +145,14 @@ class Recipe(CheckedModel):
             shape = step.shape_after(shape)
         return matrix
 
-    def move(self, shot: Radiograph) -> Radiograph:
+    def move(self, shot: Shot) -> Shot:
         """Return a shot after only the steps that move pixels, such as for its masks."""
         for step in self.steps:
             if step.moves_pixels:
                 shot = step.apply(shot)
         return shot
 
-    def check(self, shot: Radiograph) -> None:
+    def check(self, shot: Shot) -> None:
         """Reject choices that contradict each other, or the shot, before any work is done.
 
         An `InputError` if arrays differ in shape, there is an uneven source though the image is
@@ -191,7 +192,7 @@ class Recipe(CheckedModel):
                 "choose an estimate"
             )
 
-    def prepare(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def prepare(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:
         """Return a shot, with its source and masks, after all steps; see `Step.apply`.
 
         Gaps of the detector are masked before the steps, which would change their values.
@@ -231,7 +232,7 @@ def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
 
 def estimate_source(
     estimate: Estimate,
-    shot: Radiograph,
+    shot: Shot,
     should_stop: ShouldStop | None = None,
     on_caution: OnCaution | None = None,
     *,
@@ -243,7 +244,7 @@ def estimate_source(
     ----------
     estimate : Estimate
         Placed for the shot; its `source` takes `should_stop` and `on_caution`.
-    shot : Radiograph
+    shot : Shot
     by : callable, optional
         Called instead of `Estimate.source`, such as a cached one.
     """
@@ -265,7 +266,7 @@ def estimate_source(
 
 def with_prior_of(
     estimate: Estimate,
-    shot: Radiograph,
+    shot: Shot,
     instrument: Instrument,
     should_stop: ShouldStop | None = None,
 ) -> Instrument:
@@ -276,7 +277,7 @@ def with_prior_of(
     return instrument if prior is None else instrument.with_beam(prior)
 
 
-def _for_estimate(shot: Radiograph) -> tuple[FloatArray, BoolArray | None]:
+def _for_estimate(shot: Shot) -> tuple[FloatArray, BoolArray | None]:
     """Return the image without negative pixels, 0 where it is masked, and the usable pixels."""
     masks = [mask for mask in (shot.mask, shot.source_mask) if mask is not None]
     usable = np.logical_and.reduce(masks) if masks else None

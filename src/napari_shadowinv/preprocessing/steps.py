@@ -1,6 +1,5 @@
-"""A shot, and the steps of a recipe that are no filters.
+"""The steps of a recipe that are no filters.
 
-- an image with its metadata: `Radiograph`
 - the base class of all steps: `Step`
 - subtract the detector's dark level: `Dark`
 - move pixels: `Rotate`, `Crop`, `Bin`
@@ -10,8 +9,8 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -19,131 +18,13 @@ import numpy as np
 from pydantic import BeforeValidator, Field, PlainSerializer
 from pydantic.fields import FieldInfo
 
-from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._system.validation import CheckedModel
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.cautions import Caution
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Summarised
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import ShouldStop
-    from napari_shadowinv.physics.setup import Setup
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Radiograph(Summarised):
-    """One image, ready to be inverted.
-
-    Attributes
-    ----------
-    image : ndarray of float64, shape (H, W)
-        Intensity or counts, ``[y, x]``, as stored.
-    setup, path : optional
-        The geometry, where the file contains all of it; the file of the image.
-    metadata : mapping
-        Other facts from the file: ``kind``, ``dtype``, ``bits``, ``sha256``, and for pradformat
-        ``geometry``, the part of the setup in the file.
-    source : ndarray, shape (H, W), or None
-        The undisturbed beam.
-    mask, source_mask : ndarray of bool, shape (H, W), or None
-        True where a pixel can be used; where it shows the bare beam, for an estimate of the source.
-    warnings : tuple of Caution
-        Reasons to doubt the content of the file.
-    dark : ndarray, shape (H, W), or None
-        Image of the detector without light, for a step `Dark` with a file.
-    """
-
-    image: FloatArray
-    setup: Setup | None = None
-    path: Path | None = None
-    metadata: Mapping[str, Any] = field(default_factory=dict)
-    source: FloatArray | None = None
-    mask: BoolArray | None = None
-    source_mask: BoolArray | None = None
-    warnings: tuple[Caution, ...] = ()
-    dark: FloatArray | None = None
-
-    def _summary(self) -> list[str]:
-        parts = [str(self.path)] if self.path is not None else []
-        parts += [self.setup.probe] if self.setup is not None else []
-        parts += [f"with {name}" for name in ("source", "mask") if getattr(self, name) is not None]
-        return [", ".join(parts) or "no setup", *(caution.text for caution in self.warnings)]
-
-    def _picture(self) -> FloatArray:
-        return self.image
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Shape (H, W) of the image."""
-        height, width = self.image.shape
-        return height, width
-
-    @property
-    def usable(self) -> BoolArray:
-        """Pixels that can be used: where the mask is true, or without a mask the finite ones."""
-        return np.isfinite(self.image) if self.mask is None else self.mask
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Notes on the steps applied so far, for people."""
-        return tuple(self.metadata.get("notes", ()))
-
-    def add_notes(self, *notes: str) -> Radiograph:
-        """Return the same with more notes."""
-        return replace(self, metadata={**self.metadata, "notes": (*self.notes, *notes)})
-
-    def map_planes(
-        self, values: Callable[[FloatArray], FloatArray], masks: Callable[[BoolArray], BoolArray]
-    ) -> Radiograph:
-        """Return the same with a function applied to image and source, another to the masks."""
-        return replace(
-            self,
-            image=values(self.image),
-            source=None if self.source is None else values(self.source),
-            dark=None if self.dark is None else values(self.dark),
-            mask=None if self.mask is None else masks(self.mask),
-            source_mask=None if self.source_mask is None else masks(self.source_mask),
-        )
-
-    def bin_pixels(self, factor: int) -> Radiograph:
-        """Sum blocks of `factor` × `factor` pixels; the setup's pixel grows with them.
-
-        Rows and columns that fill no block are cut off at the end. A block can be used if all its
-        pixels can. The metadata's ``bin`` is the factor. An `InputError` if `factor` is less
-        than 1 or leaves less than 2×2 blocks.
-
-        Examples
-        --------
-        >>> Radiograph(np.ones((5, 6))).bin_pixels(2).image
-        array([[4., 4., 4.], [4., 4., 4.]])
-        """
-        from napari_shadowinv.physics.setup import bin_setup
-
-        height, width = self.image.shape
-        if min(height, width) < 2:
-            raise InputError(
-                f"{'image' if self.path is None else self.path} has {height}×{width} pixels: "
-                "expected at least two rows and two columns"
-            )
-        if factor < 1 or min(height, width) // factor < 2:
-            raise InputError(
-                f"cannot bin {height}×{width} pixels by {factor}: expected a whole number from "
-                f"1 to {min(height, width) // 2}"
-            )
-        if factor == 1:
-            return self
-        binned = replace(
-            self.map_planes(
-                lambda plane: block_sums(plane, factor),
-                lambda mask: block_sums(mask, factor) == factor**2,
-            ),
-            setup=None if self.setup is None else bin_setup(self.setup, factor),
-            metadata={**self.metadata, "bin": factor * int(self.metadata.get("bin", 1))},
-        )
-        rows, columns = height % factor, width % factor
-        cut = f", {rows} rows and {columns} columns cut off" if rows or columns else ""
-        return binned.add_notes(f"binned {factor} × {factor}{cut}")
 
 
 _MIN_SIDE_PX = 4  # px of a crop
@@ -240,7 +121,7 @@ class Step(Choice):
         """Whether it reduces pixel noise but keeps low-frequency noise."""
         return False
 
-    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:
         """Return the shot with the step applied to image, source, masks and setup.
 
         Raises an `InputError` if it does not apply to this image, and `InversionCancelled` if
@@ -296,7 +177,7 @@ class Dark(Step):
         """File of the image to subtract; None for a number."""
         return self.level if isinstance(self.level, Path) else None
 
-    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:
         file = self.frame_file
         dark: Any = self.level if file is None else shot.dark
         name = f"level {dark:g}" if file is None else f"frame {file.name}"
@@ -346,7 +227,7 @@ class Rotate(Step):
     def smooths(self) -> bool:
         return self._turns is None
 
-    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:
         turns = self._turns
 
         def turn(array: AnyArray) -> Any:
@@ -355,7 +236,7 @@ class Rotate(Step):
         rotated = self._interpolate(shot) if turns is None else shot.map_planes(turn, turn)
         return rotated.add_notes(f"rotated by {self.angle:g}°")
 
-    def _interpolate(self, shot: Radiograph) -> Radiograph:
+    def _interpolate(self, shot: Shot) -> Shot:
         usable = shot.usable
         share = self._move(usable.astype(np.float64))
         mask = share > _MIN_DATA_SHARE
@@ -446,7 +327,7 @@ class Crop(Step):
             )
         return rows, columns
 
-    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:
         rows, columns = self.slices(shot.shape)
 
         def cut(array: AnyArray) -> Any:
@@ -481,7 +362,7 @@ class Bin(Step):
         json_schema_extra={"metavar": "N"},
     )
 
-    def apply(self, shot: Radiograph, should_stop: ShouldStop | None = None) -> Radiograph:
+    def apply(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:
         return shot.bin_pixels(self.factor)
 
     def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:

@@ -25,7 +25,7 @@ from typing import Any
 from napari_shadowinv._system.machine import available_threads, defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.stack._shots import BlockReference, ImageReference, Shot
+from napari_shadowinv.stack._shots import BlockReference, Exposure, ImageReference
 
 _ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 _TRIMMING = "MALLOC_TRIM_THRESHOLD_"
@@ -132,7 +132,7 @@ class _Threads:
         """Send a value to the workers, and return its representative for tasks."""
         return value
 
-    def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
+    def submit(self, task: Callable[..., Any], shots: list[Exposure], *args: Any) -> Any:
         """Start ``task(shots, blocks, *args)``, where a block is the computed image of a shot.
 
         The future has `add_done_callback` and `cancel`.
@@ -192,7 +192,7 @@ class _Cluster:
                 self._client.replicate([future])
         return future
 
-    def submit(self, task: Callable[..., Any], shots: list[Shot], *args: Any) -> Any:
+    def submit(self, task: Callable[..., Any], shots: list[Exposure], *args: Any) -> Any:
         # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
         with self._as_engine_error():
             blocks = [

@@ -31,7 +31,13 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
     values_of_beam,
 )
-from napari_shadowinv.stack._shots import ArrayReference, ImageReference, Reader, Shot, read_shot
+from napari_shadowinv.stack._shots import (
+    ArrayReference,
+    Exposure,
+    ImageReference,
+    Reader,
+    read_shot,
+)
 from napari_shadowinv.stack._worker import AnyTask, Beam
 
 if TYPE_CHECKING:
@@ -195,7 +201,7 @@ def invert_stack(
 
 def _invert(
     label: str,
-    shot: Shot,
+    shot: Exposure,
     block: AnyArray | None,
     beam: Beam | None,
     task: AnyTask,

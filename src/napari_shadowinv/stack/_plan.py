@@ -38,19 +38,14 @@ from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
-from napari_shadowinv.preprocessing import (
-    Estimate,
-    MeasuredSource,
-    Radiograph,
-    Recipe,
-    UniformEstimate,
-)
+from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.provenance import Origin
+from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
     ArrayReference,
+    Exposure,
     Reader,
     RowsReference,
-    Shot,
     Shots,
     checksum,
     find_shots,
@@ -171,7 +166,7 @@ class Stack:
         return "" if shot.source.images.unchanged(origin["source"]) else f"the source of {label}"
 
 
-def _row_of(shot: Shot) -> RowsReference:
+def _row_of(shot: Exposure) -> RowsReference:
     assert isinstance(shot.images, RowsReference)
     return shot.images
 
@@ -252,7 +247,7 @@ def describe_stack(
     common = image if task.by_row else None
     own_sources = None if shot_sources is None else shot_sources.items
     if common is not None and beam is None:
-        own_sources = [Shot("", ArrayReference(common))] * len(stack_shots)
+        own_sources = [Exposure("", ArrayReference(common))] * len(stack_shots)
     if own_sources is not None:
         items = [
             # A row may name its own.
@@ -368,10 +363,12 @@ def _describe_inputs(
     blank = np.ones(stack_shots.shape)
     inputs = collect_inputs(
         recipe.model_copy(update={"source": recipe.estimate}),
-        Radiograph(blank),
-        source=None if sources is None else _checked_beam(sources, blank),
-        mask=usable,
-        source_mask=bare,
+        Shot(
+            blank,
+            source=None if sources is None else _checked_beam(sources, blank),
+            mask=usable,
+            source_mask=bare,
+        ),
     )
     inputs.recipe.check(inputs.shot)
     if inputs.recipe.estimate is not None:
@@ -425,8 +422,7 @@ def _describe_table(
     items = table_shots(table, recipe, part.get("channel"), part.get("variable"))
     if recipe.fit is not None:
         image = first_image(items)
-        assert isinstance(image.image, Radiograph)
-        return Shots(items, image.image.shape), image.setup
+        return Shots(items, image.shape), image.setup
     return Shots(items, shape or usual_shape(items)), _row_of(items[0]).setup
 
 

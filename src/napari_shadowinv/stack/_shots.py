@@ -1,4 +1,4 @@
-"""Shots of a stack, each read on demand: `Shot`, and where they come from.
+"""Shots of a stack, each read on demand: `Exposure`, and where they come from.
 
 - one image, or several: `ArrayReference`, `BlockReference`, `FileReference`, `RowsReference`
 - all shots of an array, of files or of a list: `find_shots`; of a table: `table_shots`
@@ -27,7 +27,6 @@ from napari_shadowinv._system.validation import map_paths
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.fitting import FitShot
 from napari_shadowinv.io.files import name_of, sha256, split_address, text_of
 from napari_shadowinv.io.formats import HDF5, PRADFORMAT, TEXT, format_of
 from napari_shadowinv.io.frames import Frame, find_frames
@@ -36,7 +35,8 @@ from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import read_row_images, row_setup
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert
-from napari_shadowinv.preprocessing import Radiograph, Recipe
+from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     import xarray
@@ -50,10 +50,10 @@ _MAX_SHAPE_READS = 3  # shots that are read for the shape of all
 class ImageReference:
     """An image, or several of one object, read on demand; it can be sent to a worker."""
 
-    def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
+    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         """Return the images with all that is known of each, and metadata as `read` does."""
         image, metadata = self.read()
-        return (FitShot(Radiograph(image)),), metadata
+        return (Shot(image),), metadata
 
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
         """Return the image and its ``sha256``, with ``warnings`` for the shot's report if any."""
@@ -116,9 +116,9 @@ class FileReference(ImageReference):
         part = (self.page, self.variable)
         return (str(self.path), normalize_token(self.reader), *part, *file_stamp.values())
 
-    def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
+    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         values, usable, metadata = self._read_masked()
-        return (FitShot(Radiograph(values, mask=usable)),), metadata
+        return (Shot(values, mask=usable),), metadata
 
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
         values, _, metadata = self._read_masked()
@@ -161,7 +161,7 @@ class RowsReference(ImageReference):
         content = json.dumps([self._summaries(), files, setup, stamps])
         return content, str(self.channel), str(self.variable)
 
-    def load(self) -> tuple[tuple[FitShot, ...], dict[str, Any]]:
+    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         """Return the images, and the files of their rows."""
         images = read_row_images(
             self.rows, self.recipe, channel=self.channel, variable=self.variable
@@ -173,8 +173,7 @@ class RowsReference(ImageReference):
         if not self.to_invert:
             return images, origin
         (image,) = images
-        assert isinstance(image.image, Radiograph)
-        warnings = file_doubts(image.image)
+        warnings = file_doubts(image)
         if self.unused:
             text = (
                 f"the table has {', '.join(self.unused)}, which an inversion does not use: fit the "
@@ -292,9 +291,9 @@ def read_shot(
     return shot.image if shot.mask is None else np.ma.MaskedArray(shot.image, ~shot.mask)
 
 
-def file_doubts(shot: Radiograph) -> list[Caution]:
+def file_doubts(shot: Shot) -> list[Caution]:
     """Return the reasons to doubt the image of a file in a stack."""
-    if shot.source is None:
+    if not shot.has_own_source:
         return list(shot.warnings)
     text = "the file contains its own source, which a stack ignores: pass one for the whole stack"
     return [*shot.warnings, Caution("file", text)]
@@ -312,12 +311,12 @@ def _plain_image(image: Any) -> AnyArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class Exposure:
     """One exposure of a stack."""
 
     name: str  # for messages and tables
     images: ImageReference
-    source: Shot | None = None  # as measured, unless it is shared or estimated
+    source: Exposure | None = None  # as measured, unless it is shared or estimated
 
     @property
     def rows(self) -> tuple[ShotRow, ...]:
@@ -329,7 +328,7 @@ class Shot:
 class Shots:
     """The shots of a stack, in order."""
 
-    items: Sequence[Shot]
+    items: Sequence[Exposure]
     shape: tuple[int, int]  # that they should have
     coordinate: Any = None  # values of the coordinate ``shot`` of an xarray object
     array: Any = None  # the same images as one dask array, chunks of one shot, if they came so
@@ -403,19 +402,19 @@ def _parts_of(text: str, reader: Reader) -> dict[str, Any]:
     return {"variable": variable, "numbered": "page" in keywords}
 
 
-def _shots_at(path: str, reader: Reader) -> list[Shot]:
+def _shots_at(path: str, reader: Reader) -> list[Exposure]:
     return _shots_of(find_frames(path, **_parts_of(path, reader)), reader)
 
 
-def _shots_of(frames: Sequence[Frame], reader: Reader) -> list[Shot]:
+def _shots_of(frames: Sequence[Frame], reader: Reader) -> list[Exposure]:
     names = _distinct_names(frames)
     return [
-        Shot(name, FileReference(frame.path.absolute(), reader, frame.number, frame.variable))
+        Exposure(name, FileReference(frame.path.absolute(), reader, frame.number, frame.variable))
         for name, frame in zip(names, frames, strict=True)
     ]
 
 
-def _shots_of_files(paths: Sequence[str | Path], reader: Reader) -> list[Shot]:
+def _shots_of_files(paths: Sequence[str | Path], reader: Reader) -> list[Exposure]:
     if not paths:
         raise InputError("shots are an empty list: expected at least one path")
     frames: list[Frame] = []
@@ -439,7 +438,7 @@ def _distinct_names(frames: Sequence[Frame]) -> tuple[str, ...]:
     return names
 
 
-def usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
+def usual_shape(items: Sequence[Exposure]) -> tuple[int, int]:
     """Shape of most of the first few shots that can be read; bad ones fail later, by name."""
     shapes = _read_first(items, lambda shot: shot.images.shape(), _MAX_SHAPE_READS)
     usual = Counter(shapes).most_common(1)[0][0]
@@ -448,7 +447,9 @@ def usual_shape(items: Sequence[Shot]) -> tuple[int, int]:
     return usual[0], usual[1]
 
 
-def _read_first(items: Sequence[Shot], read: Callable[[Shot], Value], count: int) -> list[Value]:
+def _read_first(
+    items: Sequence[Exposure], read: Callable[[Exposure], Value], count: int
+) -> list[Value]:
     """Read the first shots that can be read; others fail later, by name."""
     values: list[Value] = []
     first_error: Exception | None = None
@@ -514,7 +515,7 @@ def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots
         images = [ArrayReference(plane) for plane in values]
     numbers = range(count) if coordinate is None else coordinate
     names = map(str, numbers if labels is None else labels)
-    items = [Shot(name, image) for name, image in zip(names, images, strict=True)]
+    items = [Exposure(name, image) for name, image in zip(names, images, strict=True)]
     return Shots(items, (shots.shape[1], shots.shape[2]), coordinate, array, mask)
 
 
@@ -553,13 +554,13 @@ def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots 
 
 def table_shots(
     table: Path | Sequence[ShotRow], recipe: Recipe, channel: str | None, variable: str | None
-) -> list[Shot]:
+) -> list[Exposure]:
     """Return the shots of a table, or of its rows: to fit if the recipe says so, or to invert."""
     if recipe.fit is not None:
         if not isinstance(table, Path):
             raise InputError("received rows of a table to fit, expected its file: write it first")
         return [
-            Shot(name, RowsReference(_with_absolute_paths(rows), recipe, channel, variable))
+            Exposure(name, RowsReference(_with_absolute_paths(rows), recipe, channel, variable))
             for name, rows in rows_by_shot(table, {}).items()
         ]
     rows, unused = rows_to_invert(table)
@@ -568,7 +569,7 @@ def table_shots(
     for name, row in zip(_distinct_names(files), _with_absolute_paths(rows), strict=True):
         setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
         images = RowsReference((row,), recipe, channel, variable, True, setup, unused)
-        shots.append(Shot(name, images))
+        shots.append(Exposure(name, images))
     return shots
 
 
@@ -577,20 +578,20 @@ def _with_absolute_paths(rows: Sequence[ShotRow]) -> tuple[ShotRow, ...]:
     return tuple(map_paths(row, Path.absolute) for row in rows)
 
 
-def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> Radiograph:
+def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> Shot:
     """Read an image if its file may contain a geometry; return an empty one otherwise."""
     try:
         if format_of(row.file) in (PRADFORMAT, HDF5, TEXT):
             return read_part(row.file, channel, variable)
     except (OSError, ValueError):
         pass  # its shot fails, by name
-    return Radiograph(np.zeros((1, 1)))
+    return Shot(np.zeros((1, 1)))
 
 
-def first_image(shots: Sequence[Shot]) -> FitShot:
+def first_image(shots: Sequence[Exposure]) -> Shot:
     """Return the first image of the first shot of a table that can be read, to fit."""
 
-    def read(shot: Shot) -> FitShot:
+    def read(shot: Exposure) -> Shot:
         assert isinstance(shot.images, RowsReference)
         return replace(shot.images, rows=shot.rows[:1]).load()[0][0]
 

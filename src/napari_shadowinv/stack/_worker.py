@@ -18,6 +18,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,7 +28,7 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.fitting import Fit, FitShot
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, fit_labels, variable_labels
 from napari_shadowinv.io.store import DONE, FAILED
@@ -38,8 +39,9 @@ from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache, Inputs, collect_inputs, run_fit, run_prepared
 from napari_shadowinv.pipeline.fit_run import usual_fields
 from napari_shadowinv.pipeline.inversion_run import same_array
-from napari_shadowinv.preprocessing import Estimate, Radiograph, Recipe, UniformEstimate
-from napari_shadowinv.stack._shots import ArrayReference, Shot, checksum
+from napari_shadowinv.preprocessing import Estimate, Recipe, UniformEstimate
+from napari_shadowinv.shot import Shot
+from napari_shadowinv.stack._shots import ArrayReference, Exposure, checksum
 from napari_shadowinv.transport.sites import SitePlan
 
 _REFRESH_S = 10.0  # workers come and go, but asking takes milliseconds
@@ -137,7 +139,7 @@ class Task:
         return self.inputs.recipe
 
     @cached_property
-    def moved(self) -> Radiograph:
+    def moved(self) -> Shot:
         """Masks and setup after the steps that move pixels; its image means nothing."""
         return self.recipe.move(self.inputs.shot)
 
@@ -211,7 +213,7 @@ class InvertTask(Task):
 
     def run(
         self,
-        images: Sequence[FitShot],
+        images: Sequence[Shot],
         beam: Beam | None,
         source: AnyArray | None = None,
         *,
@@ -221,18 +223,17 @@ class InvertTask(Task):
     ) -> Inversion:
         """Apply the recipe to a shot as recorded, with `source` or else with the beam's."""
         (image,) = images
-        assert isinstance(image.image, Radiograph)
-        shape, expected = np.shape(image.image.image), self.inputs.shot.shape
+        shape, expected = np.shape(image.image), self.inputs.shot.shape
         if shape != expected:
             reference = "the others" if beam is None or beam.source is None else "the source"
             raise InputError(f"image has shape {shape}, expected {expected} as {reference}")
         if source is not None and np.shape(source) != expected:
             raise InputError(f"source has shape {np.shape(source)}, expected {expected}")
         if self.by_row:
-            inputs = self._inputs_of_row(image, image.image, beam, source)
+            inputs = self._inputs_of_row(image, beam, source)
         else:
-            values = np.asarray(image.image.image, dtype=np.float64)
-            usable = join_masks(self.inputs.shot.mask, image.image.mask)
+            values = np.asarray(image.image, dtype=np.float64)
+            usable = join_masks(self.inputs.shot.mask, image.mask)
             shot = replace(self.inputs.shot, image=values, source=source, mask=usable)
             inputs = replace(self.inputs, shot=shot)
         recipe = inputs.recipe
@@ -251,9 +252,7 @@ class InvertTask(Task):
         inversion = run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
         return _with_sites_reason(inversion) if self.sites_chosen else inversion
 
-    def _inputs_of_row(
-        self, row: FitShot, image: Radiograph, beam: Beam | None, source: AnyArray | None
-    ) -> Inputs:
+    def _inputs_of_row(self, row: Shot, beam: Beam | None, source: AnyArray | None) -> Inputs:
         """Return the image of a row over its brightness, with its own source, mask and setup."""
         common = self.inputs
         kinds = [setup and setup.kind for setup in (row.setup, self.recipe.setup)]
@@ -263,29 +262,24 @@ class InvertTask(Task):
                 f"it has {texts[0]}, and the first row of its table {texts[1]}: a store has the "
                 "units of one kind of setup; give all rows such a setup, or use two tables"
             )
-        bare = Radiograph(
-            image.image / (row.brightness or 1.0),
-            path=image.path,
-            metadata=image.metadata,
-            mask=image.mask,
-        )
         # A common source is already in the beam.
         recipe_source = self.estimate if beam is None else common.recipe.source
-        changes = {"source": recipe_source, "setup": row.setup, "mask": row.mask}
-        recipe = common.recipe.model_copy(update=changes)
-        inputs = collect_inputs(
-            recipe,
-            bare,
-            source=source if row.source is None else row.source,
-            mask=common.shot.mask if row.mask is None else None,
+        changes = {"source": recipe_source, "setup": row.setup}
+        own = isinstance(row.source, Shot)
+        shot = replace(
+            row,
+            source=row.source if own else source,
+            mask=row.mask if isinstance(row.mask, Path) else join_masks(common.shot.mask, row.mask),
             source_mask=common.shot.source_mask,
+            warnings=(),
         )
+        inputs = collect_inputs(common.recipe.model_copy(update=changes), shot)
         if beam is None:
             inputs.recipe.check(inputs.shot)
-        entries: dict[str, Any] = {"brightness": row.brightness}
-        if row.source is None:
-            entries["source"] = common.provenance.image.source
-        return replace(inputs, provenance=inputs.provenance.with_image(**entries))
+        if own:
+            return inputs
+        origin = common.provenance.image.source
+        return replace(inputs, provenance=inputs.provenance.with_image(source=origin))
 
     def _planes(self, result: Inversion) -> tuple[dict[str, AnyArray], Any]:
         names = variable_labels().keys() & set(self.variables)
@@ -345,7 +339,7 @@ class FitTask(Task):
 
     def run(
         self,
-        images: Sequence[FitShot],
+        images: Sequence[Shot],
         beam: Beam | None,
         source: AnyArray | None = None,
         *,
@@ -377,16 +371,18 @@ class FitTask(Task):
         cleared = {"setup": None, "mask": None, "source_mask": None, "fit": choices}
         return self.requested.model_copy(update={"source": self.requested.estimate, **cleared})
 
-    def _completed(self, shot: FitShot, source: AnyArray | None) -> FitShot:
-        assert isinstance(shot.image, Radiograph)
+    def _completed(self, shot: Shot, source: AnyArray | None) -> Shot:
         common = self.inputs.shot
+        keeps_source = source is None or not (shot.source is None or shot.has_own_source)
+        is_file = isinstance(shot.mask, Path)
+        bare = common.source_mask
         return replace(
             shot,
-            image=replace(shot.image, image=np.asarray(shot.image.image, dtype=np.float64)),
+            image=np.asarray(shot.image, dtype=np.float64),
             setup=self.requested.setup if shot.setup is None else shot.setup,
-            source=source if shot.source is None else shot.source,
-            mask=common.mask if shot.mask is None else shot.mask,
-            source_mask=common.source_mask if shot.source_mask is None else shot.source_mask,
+            source=shot.source if keeps_source else source,
+            mask=shot.mask if is_file else join_masks(common.mask, shot.mask),
+            source_mask=bare if shot.source_mask is None else shot.source_mask,
         )
 
     def _planes(self, result: Fit) -> tuple[dict[str, AnyArray], Any]:
@@ -520,7 +516,7 @@ class TaskContext:
 
 
 def run_shots(
-    shots: list[Shot],
+    shots: list[Exposure],
     blocks: list[AnyArray | None],
     labels: list[tuple[int, bool]],
     beam: Beam | None,
@@ -557,7 +553,7 @@ class Attempt:
 
 def try_shot(
     task: AnyTask,
-    shot: Shot,
+    shot: Exposure,
     beam: Beam | None,
     start: Any = None,
     workers: int | None = None,

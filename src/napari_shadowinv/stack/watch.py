@@ -51,10 +51,10 @@ from napari_shadowinv.stack._run import (
     stored_variables,
 )
 from napari_shadowinv.stack._shots import (
+    Exposure,
     FileReference,
     ImageReference,
     Reader,
-    Shot,
     Shots,
     read_shot,
     stamp,
@@ -162,7 +162,7 @@ class Watch:
     def open(self) -> None:
         """Open or check the store before any shot arrives, as far as possible."""
         with suppress(_ShapeUnknownError):  # until a shot has arrived
-            self._stack = self._stack_of([Shot("", _NoImage())])
+            self._stack = self._stack_of([Exposure("", _NoImage())])
         if self._options.overwrite or not self._path.exists():
             return
         store = StackStore(self._path)
@@ -174,7 +174,7 @@ class Watch:
         if self._stack is not None:
             self._use_stack(match_store(store, self._stack))
 
-    def _stack_of(self, shots: Iterable[Shot]) -> Stack:
+    def _stack_of(self, shots: Iterable[Exposure]) -> Stack:
         """Return the stack of some shots, the first of which can be read."""
         stack = self._describe(Shots(list(shots), (0, 0)))
         # Shots start from each other only on the same sites.
@@ -185,8 +185,8 @@ class Watch:
     def _file(self, name: str) -> FileReference:
         return FileReference(self._arrivals.folder / name, self._reader)
 
-    def _shot(self, name: str) -> Shot:
-        return Shot(text_of(name), self._file(name))
+    def _shot(self, name: str) -> Exposure:
+        return Exposure(text_of(name), self._file(name))
 
     def run(self) -> None:
         """Invert existing and arriving files until the watch ends."""
@@ -366,7 +366,7 @@ class Watch:
         workers = _LANES if self._running or self._arrivals.waiting else 1
         return self._pool.submit(try_shot, self._task, shot, beam, start, workers, self._is_stopped)
 
-    def _prepare(self, name: str, shot: Shot) -> Attempt | None:
+    def _prepare(self, name: str, shot: Exposure) -> Attempt | None:
         """Describe the stack by its first shot; return a failed attempt if that is impossible."""
         began = time.perf_counter()
         waiting = [*reversed(self._skipped), *self._arrivals.waiting[:MAX_TRIED_SHOTS]]
@@ -421,7 +421,7 @@ class Watch:
 
     def _create_store(self, names: Sequence[str]) -> GrowingStore:
         assert self._stack is not None
-        items = [Shot(name, _NoImage()) for name in dict.fromkeys(names)]
+        items = [Exposure(name, _NoImage()) for name in dict.fromkeys(names)]
         stack = replace(self._stack, shots=replace(self._stack.shots, items=items))
         created = create_store(self._path, contents_of(stack), overwrite=self._options.overwrite)
         self.store = GrowingStore(created)

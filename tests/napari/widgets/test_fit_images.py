@@ -37,7 +37,7 @@ from napari_shadowinv._napari.widgets import _fitting
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, FitShot, compilation, fit
+from napari_shadowinv.fitting import Fit, compilation, fit
 from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -46,6 +46,7 @@ from napari_shadowinv.physics.projection import project, transferred_displacemen
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
+from napari_shadowinv.shot import Shot
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 120_000  # ms
@@ -684,7 +685,7 @@ def test_refine_starts_from_the_last_inversion(
     assert tool.panel.button.text() == "Cancel"
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
     result = answers[0].value.content
-    refined_shot = FitShot(
+    refined_shot = Shot(
         inversion.image,
         setup=SETUPS[0],
         source=inversion.source,
@@ -1095,7 +1096,7 @@ def test_a_recipe_tells_noise_and_point_spread(
     assert inputs_of(tool).keywords["noise"] == 3.5
     assert tool.fields.state() == "B and E"
     by_command = collect_fit_inputs(
-        read_recipe(path), [FitShot(np.ones(SHAPE), setup) for setup in SETUPS]
+        read_recipe(path), [Shot(np.ones(SHAPE), setup) for setup in SETUPS]
     )
     widths = of_each(by_command.images, "psf")
     assert of_each(inputs_of(tool).images, "psf") == pytest.approx(widths, rel=1e-12)

@@ -54,7 +54,6 @@ from napari_shadowinv.preprocessing import (
     LowPassFilter,
     MeasuredSource,
     PolynomialEstimate,
-    Radiograph,
     Recipe,
     Step,
     TotalVariationEstimate,
@@ -62,6 +61,7 @@ from napari_shadowinv.preprocessing import (
     filters,
     isotropic_source,
 )
+from napari_shadowinv.shot import Shot
 
 FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]
@@ -343,7 +343,7 @@ def running(recipe: Recipe) -> Any:
     "job",
     [
         lambda tmp_path: (
-            SourceJob(TotalVariationEstimate(), Radiograph(LARGE), None, {}, preview=False).run
+            SourceJob(TotalVariationEstimate(), Shot(LARGE), None, {}, preview=False).run
         ),
         lambda tmp_path: running(Recipe(source=TotalVariationEstimate())),
         lambda tmp_path: running(Recipe(steps=(BackgroundFilter(degree=10),))),

@@ -38,13 +38,13 @@ from napari_shadowinv.preprocessing import (
     LowPassFilter,
     MeasuredSource,
     PolynomialEstimate,
-    Radiograph,
     Recipe,
     Rotate,
     Step,
     UniformEstimate,
 )
 from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.shot import Shot
 
 Array = np.ndarray[Any, Any]
 FEW = InversionOptions(n_sites=300)
@@ -227,7 +227,7 @@ def test_a_feature_of_image_and_result_is_at_one_place(
 
 def recipe_size(tool: Any, setup: ProtonSetup) -> float:
     """Side of a result's pixel in µm."""
-    after = Recipe(steps=tool.steps.steps()).move(Radiograph(np.ones((48, 60)), setup=setup)).setup
+    after = Recipe(steps=tool.steps.steps()).move(Shot(np.ones((48, 60)), setup=setup)).setup
     assert after is not None
     return after.object_pixel_size * 1e6
 

@@ -35,7 +35,8 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline import run as run_recipe
-from napari_shadowinv.preprocessing import Crop, PolynomialEstimate, Radiograph, Recipe
+from napari_shadowinv.preprocessing import Crop, PolynomialEstimate, Recipe
+from napari_shadowinv.shot import Shot
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
@@ -341,7 +342,7 @@ def test_a_source_mask_hides_the_object_from_the_estimate_alone(
     assert inversion.mask.all()
     assert np.ptp(inversion.potential) == pytest.approx(np.ptp(potential), rel=0.1)
     cropped = Recipe(steps=(Crop(y=(2, 62), x=(4, 70)),))
-    moved = cropped.move(Radiograph(shot, source_mask=~is_object)).source_mask
+    moved = cropped.move(Shot(shot, source_mask=~is_object)).source_mask
     np.testing.assert_array_equal(moved, ~is_object[2:62, 4:70])
     with pytest.raises(InputError, match="source mask has shape"):
         run_recipe(recipe, shot, source_mask=is_object[1:])

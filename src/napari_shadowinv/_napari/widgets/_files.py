@@ -49,7 +49,8 @@ from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
 from napari_shadowinv.pipeline.rerun import Rerun, collect_rerun
-from napari_shadowinv.preprocessing import Crop, MeasuredSource, Radiograph, Recipe, UniformEstimate
+from napari_shadowinv.preprocessing import Crop, MeasuredSource, Recipe, UniformEstimate
+from napari_shadowinv.shot import Shot
 
 
 @dataclass(eq=False)
@@ -204,7 +205,7 @@ class RecipeButton(QPushButton):
         tool = self._tool
         return {"mask": tool.masks.usable(image), "source_mask": tool.hidden_from_source(image)}
 
-    def _beam(self, recipe: Recipe, image: Any) -> Radiograph | None:
+    def _beam(self, recipe: Recipe, image: Any) -> Shot | None:
         """Return a measured source that is in no file where a command finds it, else None."""
         source = self._tool.source
         if not isinstance(recipe.source, MeasuredSource) or recipe.source.file is not None:
@@ -249,7 +250,7 @@ class FitRecipeButton(RecipeButton):
     def _masks(self, image: Any) -> dict[str, BoolArray | None]:
         return {"mask": self._tool.masks.usable(image)}
 
-    def _beam(self, recipe: Recipe, image: Any) -> Radiograph | None:
+    def _beam(self, recipe: Recipe, image: Any) -> Shot | None:
         source = self._tool.source
         if source.layer is not None and source.layer.ndim == 3:
             raise InputError(

@@ -38,6 +38,7 @@ from napari_shadowinv.physics.beam import geometry_text, setup_warnings, unit_in
 from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
 from napari_shadowinv.pipeline.files import complete_setup
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
+from napari_shadowinv.shot import Shot
 
 _NONE = "none"
 _INSTRUMENT_KINDS = ("detector", "beam_source")
@@ -377,7 +378,7 @@ class SourcePicker(forms.ModelPicker):
             self.set_kind(FILE)
             self.changed.emit()
 
-    def measured(self, image: Any) -> preprocessing.Radiograph | None:
+    def measured(self, image: Any) -> Shot | None:
         """Return the measured source of an image layer; None for estimates and files."""
         if self.kind == LAYER:
             layer = self._selected_layer()
@@ -393,9 +394,7 @@ class SourcePicker(forms.ModelPicker):
             )
         return radiograph_of(image, supplied)
 
-    def measured_for_each(
-        self, images: Sequence[tuple[Any, int | None]]
-    ) -> list[preprocessing.Radiograph | None]:
+    def measured_for_each(self, images: Sequence[tuple[Any, int | None]]) -> list[Shot | None]:
         """Return the measured sources of a fit's images, each a layer and its plane; or None."""
         if self.kind != LAYER:
             return [None] * len(images)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +22,17 @@ from napari_shadowinv._napari.widgets._results import describe_inputs, result_fr
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import FitShot, point_spread
+from napari_shadowinv.fitting import point_spread
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
-from napari_shadowinv.preprocessing import FIT_STEPS, Radiograph, Recipe
+from napari_shadowinv.preprocessing import FIT_STEPS, Recipe
+from napari_shadowinv.shot import Shot
 
 
-def _beam_summary(shot: FitShot) -> str:
+def _beam_summary(shot: Shot) -> str:
     if shot.setup is not None:
         return shot.setup.probe
-    (strength,) = shot.strength or (1.0,)
-    return f"displaced by {strength:g}"
+    return f"displaced by {', '.join(f'{each:g}' for each in shot.strength or (1.0,))}"
 
 
 def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
@@ -206,7 +207,7 @@ class FitImages(ToolPanel):
         setup = self.setup.complete_setup()
         if setup is None or (choices.source_size is None and choices.resolution is None):
             return choices.psf
-        shot = Radiograph(np.zeros(row.data.shape), setup=self._base_setup(row, setup))
+        shot = Shot(np.zeros(row.data.shape), setup=self._base_setup(row, setup))
         processed: Any = Recipe(steps=self.steps.steps()).move(shot).setup
         return point_spread(processed, choices.source_size or 0.0, choices.resolution or 0.0)
 
@@ -231,13 +232,13 @@ class FitImages(ToolPanel):
             **described,
         )
 
-    def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[FitShot, ...]:
+    def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[Shot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
         images = [radiograph_of(row.layer, row.data, row.plane) for row in rows]
         sources = self.source.measured_for_each([(row.layer, row.plane) for row in rows])
         factors = self._known_brightness(rows)
         return tuple(
-            FitShot(
+            replace(
                 image,
                 setup=None if setup is None else self._setup_of(row, setup),
                 source=source,

@@ -30,8 +30,9 @@ from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_PIXELS, PREVIEW_SITES
-from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Radiograph, Recipe, estimate_source
+from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Recipe, estimate_source
 from napari_shadowinv.preprocessing.estimates import LowPassEstimate, TotalVariationEstimate
+from napari_shadowinv.shot import Shot
 
 # Measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites, including the
 # layers of the result.
@@ -152,14 +153,16 @@ class InvertShot(InversionInputs, panels.LivePanel):
         self.source.check(mask)
         warnings, hidden = layers.warnings_of(layer), self.hidden_from_source(layer)
         shot = replace(
-            radiograph_of(layer, image), warnings=warnings, mask=mask, source_mask=hidden
+            radiograph_of(layer, image),
+            warnings=warnings,
+            mask=mask,
+            source_mask=hidden,
+            source=self.source.measured(layer),
         )
-        source = self.source.measured(layer)
         return jobs.InversionJob(
             name=", ".join(filter(None, (jobs.name_of_result(layer), self.source.short_name))),
             frame=result_frame(layer, recipe),
             shot=shot,
-            source=source,
             cache=self._cache,
             preview=preview,
             **self.job_inputs(layer, layer.name, recipe, self.crop.layer),
@@ -304,7 +307,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
 @dataclass(frozen=True, eq=False)
 class SourceJob(jobs.Job):
     estimate: Estimate
-    shot: Radiograph  # its image may be lazy
+    shot: Shot  # its image may be lazy
     image: Any
     made_from: dict[str, str]
     preview: bool
@@ -372,7 +375,7 @@ class EstimateSource(panels.LivePanel):
         made_from = {"image": layer.name, "estimate": estimate.summary}
         if mask is not None:
             made_from["source_mask"] = self.masks.summary(layer)
-        return SourceJob(estimate, Radiograph(image, source_mask=mask), layer, made_from, preview)
+        return SourceJob(estimate, Shot(image, source_mask=mask), layer, made_from, preview)
 
     def show_result(self, finished: jobs.Finished, job: SourceJob) -> None:
         self.show_layers(job.image, finished.layer_data, job.preview)
