@@ -115,6 +115,7 @@ def worker() -> None:
     """Do what is asked for line by line, and tell the seconds, and the error where there is one."""
     from napari_shadowinv import FitOptions, InversionOptions, fit, invert, plan_sites
     from napari_shadowinv.fitting import leave_one_out
+    from napari_shadowinv.shot import shots_of
 
     def inverted(work: Work, folder: Path) -> tuple[float, float]:
         known = {
@@ -146,14 +147,14 @@ def worker() -> None:
     def fitted(work: Work, folder: Path) -> tuple[float, float]:
         shots = np.load(folder / f"{work['fit']}.npz")
         truth = np.load(folder / f"{work['fit']} truth.npy")
-        keywords = {"source": np.ones(truth.shape[-2:]), **work["keywords"]}
+        known = {"source": np.ones(truth.shape[-2:]), "noise": work["noise"], **work["keywords"]}
+        images = shots_of(shots["images"], strength=list(shots["strengths"]), **known)
         options = FitOptions(threads=work.get("threads"))
-        keywords |= {"strengths": shots["strengths"], "noise": work["noise"], "options": options}
         begun = time.perf_counter()
         if work.get("leave_one_out"):
-            leave_one_out(shots["images"], **keywords)
+            leave_one_out(images, options=options)
             return time.perf_counter() - begun, float("nan")
-        result = fit(shots["images"], **keywords)
+        result = fit(images, options=options)
         seconds = time.perf_counter() - begun
         pairs = zip(result.fields, truth, strict=True)
         shares = [length(f.displacement - t) / length(t) for f, t in pairs]

@@ -84,13 +84,14 @@ def user_seconds(who: int = resource.RUSAGE_SELF) -> float:
 def worker(work: Work) -> None:
     """Do the work once, after all that is the same in any call; print its seconds."""
     from napari_shadowinv import fit, invert
+    from napari_shadowinv.shot import shots_of
 
     folder = Path(work["folder"])
     begun = user_seconds()
     if "fit" in work:
         images = np.load(folder / f"{work['fit']}.npy")
         source = np.full(images.shape[1:], work["flat"]) if "flat" in work else None
-        result = fit(images, strengths=work["strengths"], source=source, noise=0.05)
+        result = fit(shots_of(images, strength=work["strengths"], source=source, noise=0.05))
         displacement = result.fields[0].displacement
     else:
         names = {"image": work["invert"]}

@@ -25,6 +25,7 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv import FitOptions, InversionOptions, fit, invert
 from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv.shot import shots_of
 from reference import errors, toroid_case
 
 SIDE, RAYS, AROUND = 200, 30, 40
@@ -252,7 +253,8 @@ def cases() -> Iterator[Case]:
 def row(case: Case, seeds: int, unit: float) -> str:
     images, strengths = case.images(), case.strengths()
     truths = [np.stack(one(*pixels())) for one in case.fields]
-    keywords = {"source": np.ones((SIDE, SIDE)), **case.keywords}
+    known = {"source": np.ones((SIDE, SIDE)), **case.keywords}
+    names = {"fields": known.pop("fields", ("B",))}
     found: list[list[tuple[float, float]]] = []
     verdicts, chi2, seconds, silent = [], [], [], False
     for seed in range(seeds):
@@ -260,7 +262,9 @@ def row(case: Case, seeds: int, unit: float) -> str:
         begun = time.perf_counter()
         options = FitOptions(ambiguous=True)
         result = fit(
-            images + noise, strengths=strengths, noise=case.noise, options=options, **keywords
+            shots_of(images + noise, strength=list(strengths), noise=case.noise, **known),
+            options=options,
+            **names,
         )
         seconds.append((time.perf_counter() - begun) / unit)
         found.append(
@@ -301,7 +305,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", default=[], help="parts of the rows' names")
     arguments = parser.parse_args()
     small = np.ones((40, 40))
-    fit([small, small], strengths=[1, 0.5], noise=0.1)  # compile, so that times are the work's
+    fit(
+        shots_of([small, small], strength=[1, 0.5], noise=0.1)
+    )  # compile, so that times are the work's
     unit = unit_of_time()
     print("| images | peak / L2 error, % | goal | must | χ² | verdict | time, T |")
     print("|---|---|---|---|---|---|---|")

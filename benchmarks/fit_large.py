@@ -19,6 +19,7 @@ from fit import blobs, counted, unit_of_time
 from napari_shadowinv import fit
 from napari_shadowinv.fitting.rays import RayModel, TracedBeam
 from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv.shot import shots_of
 from reference import errors
 
 SIZE = (464, 576)
@@ -45,10 +46,10 @@ def main() -> None:
     images = clean + NOISE * np.random.default_rng(0).normal(size=(3, *SIZE))
     truth = np.stack(field(*np.indices(SIZE, dtype=np.float64)))
     small = np.ones((40, 40))
-    fit([small, small], strengths=[1, 0.5], noise=0.1)  # compile
+    fit(shots_of([small, small], strength=[1, 0.5], noise=0.1))  # compile
     unit = unit_of_time()
     begun = time.perf_counter()
-    found = fit(images, strengths=strengths, noise=NOISE, source=np.ones(SIZE))
+    found = fit(shots_of(images, strength=strengths, noise=NOISE, source=np.ones(SIZE)))
     seconds = time.perf_counter() - begun
     gigabytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     peak, l2 = errors(found.fields[0].displacement, truth)

@@ -195,7 +195,14 @@ def arrays() -> Iterator[Case]:
     """Arrays of wrong kind, shape, size and content."""
     import xarray as xr
 
-    from napari_shadowinv import fit, invert, plan_sites, poisson_invert, synthetic_image
+    from napari_shadowinv import (
+        Shot,
+        fit,
+        invert,
+        plan_sites,
+        poisson_invert,
+        synthetic_image,
+    )
 
     image = _shot()
     content = (
@@ -225,7 +232,7 @@ def arrays() -> Iterator[Case]:
         lambda array: invert(image, source=array, options={"n_sites": 60}),
         lambda array: invert(image, mask=array, options={"n_sites": 60}),
         lambda array: plan_sites(array, {"n_sites": 60}),
-        lambda array: fit(array, source=array),
+        lambda array: fit(Shot(array, source=array)),
         poisson_invert,
         lambda array: synthetic_image(np.zeros((2, 32, 40)), array),
     )

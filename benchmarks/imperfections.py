@@ -38,6 +38,7 @@ from scipy.ndimage import gaussian_filter
 from fit import Beam, Field, blobs, counted
 from napari_shadowinv import Fit, FitOptions, fit
 from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv.shot import shots_of
 
 # A scientific camera: 1,000 photoelectrons a pixel, and 5 more of r.m.s. noise by reading.
 COUNTS, READ_NOISE = 1000.0, 5.0
@@ -419,10 +420,9 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
     images = shots.images(seed)
     if shots.mask is not None:
         images = np.ma.array(images, mask=np.broadcast_to(~shots.mask, np.shape(images)))
-    result = fit(
-        images, setups=setups, noise="poisson" if shots.quanta else CONSTANT_NOISE,
-        options=FitOptions(seed=seed), **shots.keywords,
-    )  # fmt: skip
+    noise = "poisson" if shots.quanta else CONSTANT_NOISE
+    known = {"setup": setups, "noise": noise, **shots.keywords}
+    result = fit(shots_of(images, **known), options=FitOptions(seed=seed))
     seconds = time.perf_counter() - begun
     truth = shots.displacement()
     error = result.fields[0].displacement - truth

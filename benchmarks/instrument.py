@@ -53,6 +53,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv.facts import Verdict
+from napari_shadowinv.shot import shots_of
 from reference import toroid_case
 
 FloatArray = NDArray[np.float64]
@@ -532,9 +533,11 @@ def fit_outcome(
     exact = scale_field(objects(side)[name], times)
     strengths = np.array(FIT_STRENGTHS[:count])
     result = fit(
-        imperfect.images(Shot(side, exact, seed), strengths),
-        strengths=strengths,
-        psf=FIT_BLUR_PX,
+        shots_of(
+            imperfect.images(Shot(side, exact, seed), strengths),
+            strength=strengths,
+            psf=FIT_BLUR_PX,
+        ),
         instrument=instrument,
         options=FitOptions(samples=8),
     )

@@ -21,7 +21,7 @@ from fit import Field
 from instrument import Shot, objects
 from napari_shadowinv import Recipe
 from napari_shadowinv.pipeline import run
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot as Radiograph
 
 METHODS = {
     "uniform": ({"method": "uniform"}, False),
@@ -64,7 +64,7 @@ def main() -> None:
                 recipe = Recipe(source=source, options={"n_sites": 3000})
                 start = time.perf_counter()
                 try:
-                    radiograph = Shot(image, source_mask=bare if masked else None)
+                    radiograph = Radiograph(image, source_mask=bare if masked else None)
                     result = run(recipe, radiograph)
                 except ValueError as error:
                     print(f"{name}, {key}: {error}")

@@ -27,7 +27,15 @@ import numpy as np
 import psutil  # dask needs it, too
 from distributed import Client
 
-from napari_shadowinv import InversionOptions, Recipe, RunOptions, run, run_stack, synthetic_image
+from napari_shadowinv import (
+    InversionOptions,
+    Recipe,
+    RunOptions,
+    Shot,
+    run,
+    run_stack,
+    synthetic_image,
+)
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import Cache
@@ -111,7 +119,7 @@ def plainly(night: Night, shots: list[Path], folder: Path, start: Any, ended: An
     began = time.perf_counter()
     source, cache = night.reader(night.source), Cache()
     for path in shots:
-        run(night.recipe, night.reader(path), source=source, cache=cache)
+        run(night.recipe, Shot(night.reader(path), source=source), cache=cache)
     ended.put(time.perf_counter() - began)
 
 

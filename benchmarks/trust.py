@@ -68,6 +68,7 @@ from napari_shadowinv import (
     uncertainty,
 )
 from napari_shadowinv.analysis import EnclosedCurrent, LineProfile
+from napari_shadowinv.shot import shots_of
 
 SIDE, COUNTS = 96, 1000.0
 MIDDLE = (SIDE - 1) / 2
@@ -316,11 +317,13 @@ def edges(seed: int, count: int) -> Iterator[Answer]:
         setups = setups_of(2)
         energies = [setup.energy for setup in setups]
         shot, other = flawed_images(Flaw("none"), displacement, energies, rng)
-        free = {"boundary": "free"}
-        given = {"source": FLAT, "options": free}
+        given = {"source": FLAT, "options": {"boundary": "free"}}
         yield answer("edges", f"{name}, free", invert(shot, **given), truth)
         yield answer("edges", f"{name}, stated", invert(shot, **given, instrument=stated), truth)
-        found = fit([shot, other], setups=setups, **given, noise="poisson")
+        found = fit(
+            shots_of([shot, other], setup=setups, source=FLAT, noise="poisson"),
+            options=given["options"],
+        )
         yield answer("edges", f"{name}, fit of two", found, truth)
 
 
@@ -357,7 +360,9 @@ def single_fits(seed: int, count: int) -> Iterator[Answer]:
         name, width = list(filling(rng))[number % 4], (1.3, 1.7, 2.2)[number % 3]
         _, image, truth = made(filling, name, 0.3, seed)
         shot = COUNTS * (image + 0.04 * correlated_noise(rng, SIDE, width))
-        yield answer("single fits", f"{width:g} px, {name}", fit(shot, source=FLAT), truth)
+        yield answer(
+            "single fits", f"{width:g} px, {name}", fit(shots_of(shot, source=FLAT)), truth
+        )
 
 
 def right(seed: int, count: int) -> Iterator[Answer]:
@@ -599,7 +604,8 @@ def flaws(seed: int, count: int) -> Iterator[Answer]:
         images = flawed_images(flaw, displacement, energies, rng)
         level = COUNTS * (1 + flaw.pedestal) ** flaw.gamma
         given = {"noise": "poisson"} if round_number % 2 else {}
-        result = fit(images, setups=setups, source=np.full((SIDE, SIDE), level), **given)
+        source = np.full((SIDE, SIDE), level)
+        result = fit(shots_of(images, setup=setups, source=source, **given))
         named = causes_named(result)
         numbers = {"named": float(bool(named)), "cause found": float(flaw.cause in named)}
         folds = "folded " * is_folded
@@ -628,7 +634,7 @@ def right_fits(seed: int, count: int) -> Iterator[Answer]:
         setups = setups_of(energies)
         images = flawed_images(Flaw("none"), displacement, [each.energy for each in setups], rng)
         beam, text = (rng.poisson(FLAT), ", recorded") if number // 6 % 2 else (FLAT, "")
-        result = fit(images, setups=setups, source=beam, noise="poisson")
+        result = fit(shots_of(images, setup=setups, source=beam, noise="poisson"))
         kind = "folded single" if is_folded and energies == 1 else "others"
         case = f"{kind}, {name} at {slope:g}, {energies} energies{text}"
         yield answer("right fits", case, result, truth)
@@ -651,7 +657,7 @@ def unknown_beams(seed: int, count: int) -> Iterator[Answer]:
         setups = setups_of(2 + number // 2 % 2)
         flaw = Flaw("beam", beam=float(rng.uniform(0.05, 0.1)))
         images = flawed_images(flaw, displacement, [each.energy for each in setups], rng)
-        result = fit(images, setups=setups, source="unknown", noise="poisson")
+        result = fit(shots_of(images, setup=setups, source="unknown", noise="poisson"))
         case = f"{'folded ' * is_folded}{name}, {len(images)} energies, beam {flaw.beam:.1%}"
         yield answer("unknown beams", case, result, truth)
 
@@ -670,7 +676,9 @@ def between(seed: int, count: int) -> Iterator[Answer]:
             Flaw("beams", beams=size), displacement, [each.energy for each in setups], rng
         )
         stated = Instrument(beam_rms=0.0, beam_between=size)
-        result = fit(images, setups=setups, source=FLAT, noise="poisson", instrument=stated)
+        result = fit(
+            shots_of(images, setup=setups, source=FLAT, noise="poisson"), instrument=stated
+        )
         yield answer("between", f"{title}, {len(images)} energies, {size:.0%}", result, truth)
 
 
@@ -797,10 +805,7 @@ def coverage(seed: int, count: int) -> Iterator[Answer]:
                     for strength in strengths_of(ENERGIES[:2])
                 ]
                 result: Any = fit(
-                    images,
-                    setups=setups,
-                    source=FLAT,
-                    noise="poisson",
+                    shots_of(images, setup=setups, source=FLAT, noise="poisson"),
                     instrument=drawn.stated,
                     options={"samples": 60},
                 )
@@ -969,9 +974,11 @@ def times(seed: int, count: int) -> Iterator[Answer]:
         "invert": lambda: invert(shot, source=FLAT),
         "invert, no source": lambda: invert(shot),
         "invert, free": lambda: invert(shot, source=FLAT, options={"boundary": "free"}),
-        "fit, one image": lambda: fit(shot, source=FLAT, noise="poisson"),
-        "fit, two images": lambda: fit(images, setups=setups, source=FLAT, noise="poisson"),
-        "fit, two images, no source": lambda: fit(images, setups=setups, noise="poisson"),
+        "fit, one image": lambda: fit(shots_of(shot, source=FLAT, noise="poisson")),
+        "fit, two images": lambda: fit(
+            shots_of(images, setup=setups, source=FLAT, noise="poisson")
+        ),
+        "fit, two images, no source": lambda: fit(shots_of(images, setup=setups, noise="poisson")),
     }
     for work in works.values():
         work()

@@ -22,6 +22,7 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv import Instrument, ProtonSetup, fit, invert, synthetic_image
 from napari_shadowinv.physics import toroid
+from napari_shadowinv.shot import shots_of
 
 UNIT = "|∫B × dz| (mT·m)"
 
@@ -72,7 +73,7 @@ def print_table(side: int = 48) -> None:
             film = synthetic_image(truth * setups[0].momentum / setup.momentum, beam)
             films.append(film + 0.03 * random.normal(size=shape))
         single = error(invert(films[0]).displacement)
-        result = fit(films, setups=setups, noise=0.03, instrument=instrument)
+        result = fit(shots_of(films, setup=setups, noise=0.03), instrument=instrument)
         print(
             f"| {name} | {single:.0%} | {error(result.fields[0].displacement):.1%} | "
             f"{result.report.total:.1%} | {result.verdict} |",

@@ -31,6 +31,7 @@ from napari_shadowinv.plotting import (
     fit_figure,
     report_figure,
 )
+from napari_shadowinv.shot import shots_of
 
 HERE = Path(__file__).parent
 SHOT = "Image_20241017221829851.bmp"
@@ -83,7 +84,7 @@ def fit_picture() -> None:
         for strength in (1, low.momentum / high.momentum)
     ]
     options = FitOptions(sampling="resolve")
-    found = fit(images, setups=[low, high], source="unknown", noise=0.05, options=options)
+    found = fit(shots_of(images, setup=[low, high], source="unknown", noise=0.05), options=options)
     save_small(fit_figure(found, title="Two energies, beam unknown"), HERE / "fit.png", 1300)
 
 

@@ -23,6 +23,7 @@ from matplotlib.figure import Figure
 
 from napari_shadowinv import FitOptions, fit, synthetic_image
 from napari_shadowinv.plotting import fit_figure
+from napari_shadowinv.shot import shots_of
 
 ROW = 47  # of the cuts
 
@@ -111,8 +112,8 @@ def print_table(page: Any) -> None:
 def verdict(
     page: Any, name: str, shots: Any, setups: Any, part: Any = np.s_[:, :], **keywords: Any
 ) -> None:
-    chosen = {"source": "unknown", "noise": "poisson", **keywords}
-    found = fit(shots, setups=setups, **chosen)
+    known = {"setup": setups, "source": "unknown", "noise": "poisson"}
+    found = fit(shots_of(shots, **known), **keywords)
     truth = page.truth[(slice(None), *part)]
     away = np.linalg.norm(found.fields[0].displacement - truth) / np.linalg.norm(truth)
     chi2 = " and ".join(f"{one:.1f}" for one in found.chi2)

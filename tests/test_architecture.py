@@ -30,6 +30,7 @@ ROOMS = (
     ("geometry",),
     ("physics",),
     ("options",),
+    ("shot",),
     ("preprocessing",),
     ("film",),
     ("provenance",),

@@ -26,7 +26,7 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import STEPS
 from napari_shadowinv.preprocessing.steps import Step, choices_of
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "napari_shadowinv"
@@ -136,12 +136,12 @@ def test_the_unknown_is_fitted_with_the_field(names, monkeypatch):
     images = np.stack([synthetic_image(truth), synthetic_image(0.6 * truth)])
     images += np.array(backgrounds)[:, None, None]
     images += 0.02 * np.random.default_rng(0).normal(size=images.shape)
-    known = {"strengths": [1, 0.6], "noise": 0.02, "source": np.ones((48, 48))}
+    shots = shots_of(images, strength=[1, 0.6], noise=0.02, source=np.ones((48, 48)))
     monkeypatch.setattr(unknowns, "ADDITIVE", (names["Background"],))
     options_class = type("Options", (names["FitOptions"], FitOptions), {})
-    result = fit(images, options=options_class(background=0.1), **known)
+    result = fit(shots, options=options_class(background=0.1))
     error = np.abs(result.fields[0].displacement - truth).max()
-    plain = fit(images, options=options_class(samples=0), **known)
+    plain = fit(shots, options=options_class(samples=0))
     assert plain.report.added == {}
     assert error < 0.1 * np.abs(plain.fields[0].displacement - truth).max()
     rows = np.array(result.report.added["background"])

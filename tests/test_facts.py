@@ -28,7 +28,7 @@ from napari_shadowinv.cli._summary import fact_rows as table_rows
 from napari_shadowinv.facts import Headline, Level, Verdict, percent, to_figures, with_error
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.physics.units import shown_fields
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +90,13 @@ def results_of(image, inversion):
     )
     radiograph = Shot(image, path=Path("<b>.tif"), mask=image > 0)
     products = analyse(inversion, ["contrast"])
-    return [inversion, doubtful, fit([image], noise=0.01, options=hasty), radiograph, *products]
+    return [
+        inversion,
+        doubtful,
+        fit(shots_of([image], noise=0.01), options=hasty),
+        radiograph,
+        *products,
+    ]
 
 
 def test_a_result_prints_a_few_lines_and_no_array(image, inversion):
@@ -179,7 +185,7 @@ def test_every_face_shows_the_same_texts(inversion):
 
 def test_facts_of_a_fit_name_images_fields_and_the_verdict(image):
     options = FitOptions(samples=0, max_iterations=20, spacing=0.25)
-    result = fit([image, image[::-1]], strengths=[1, 0.8], noise=0.01, options=options)
+    result = fit(shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01), options=options)
     facts = result.facts_with_names(["first.tif", "second.tif"])
     texts = texts_by_key(facts)
     assert texts["image_2"].startswith("second.tif, χ² ")
@@ -207,7 +213,7 @@ def test_the_title_of_a_headline_is_one_word_for_trust():
 
 def test_the_headline_of_a_fit_begins_with_its_peaks(image):
     options = FitOptions(samples=0, max_iterations=2, spacing=0.25)
-    result = fit([image], noise=0.01, options=options)
+    result = fit(shots_of([image], noise=0.01), options=options)
     (shown,) = shown_fields([result.fields[0].displacement], None, mask=result.used)
     assert result.headline.text.startswith(f"peak |d| {shown.largest:.3g} px; ")
     assert result.explanation in result.headline.text
@@ -215,7 +221,7 @@ def test_the_headline_of_a_fit_begins_with_its_peaks(image):
 
 def test_each_fitted_field_has_its_significance(image):
     options = FitOptions(samples=3, max_iterations=20, spacing=0.25)
-    result = fit([image, image[::-1]], strengths=[1, 0.8], noise=0.01, options=options)
+    result = fit(shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01), options=options)
     (fact,) = [fact for fact in result.facts if fact.key == "significance_B"]
     structures = result.structures(result.fields[0])
     assert fact.text.startswith(f"{len(structures.peaks)} structure")

@@ -50,6 +50,7 @@ from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table, table_rows
 from napari_shadowinv.preprocessing import STEPS
+from napari_shadowinv.shot import shots_of
 
 SHOT = np.random.default_rng(0).poisson(300, (16, 20)).astype(float)
 MODELS = {
@@ -127,7 +128,7 @@ def test_model_inside_another_is_named_with_its_place() -> None:
             r"run is \[1\], expected RunOptions",
         ),
         (lambda: fit(np.ones((32, 32)), options="x"), "options is 'x', expected FitOptions"),
-        (lambda: fit(np.ones((32, 32)), setups=[{}]), "setup is {}, expected BeamSetup"),
+        (lambda: fit(shots_of(np.ones((32, 32)), setup=[{}])), "setup is {}, expected BeamSetup"),
     ],
 )
 def test_wrong_kind_of_argument_is_named(call: Callable[[], Any], message: str) -> None:
@@ -161,7 +162,7 @@ HUGE = np.broadcast_to(np.float64(1), (300_000, 300_000))
         lambda: plan_sites(HUGE),
         lambda: uncertainty(HUGE, options={"units_per_quantum": 1.0}),
         lambda: fit(HUGE),
-        lambda: fit([HUGE, HUGE], strengths=[1, 0.6]),
+        lambda: fit(shots_of([HUGE, HUGE], strength=[1, 0.6])),
         lambda: run(Recipe(), HUGE),
         lambda: synthetic_image(np.broadcast_to(HUGE, (2, *HUGE.shape))),
     ],

@@ -32,7 +32,7 @@ from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.pipeline.fit_run import compared_fields, refinement_choices, run_refinement
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 SHAPE = (40, 44)
 RATIO = (8 / 12) ** 2
@@ -112,7 +112,7 @@ def test_fit_scales_images_by_a_new_kind(setups, images, tmp_path):
     result = run_fit(recipe, shots)
     np.testing.assert_allclose(result.strengths, [[1.0], [RATIO]])
     with pytest.raises(InputError, match="expected 'electron density'"):
-        fit(images, setups=setups, fields=("B",), options=HASTY)
+        fit(shots_of(images, setup=setups), fields=("B",), options=HASTY)
     path = tmp_path / "fit.shadowinv"
     write(path, result)
     assert "areal_electron_density" in read(path)

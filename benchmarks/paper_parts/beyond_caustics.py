@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from fit import counted, pixels, toroid
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import fit
+from napari_shadowinv.shot import shots_of
 from paper_parts.drawing import (
     BLUE,
     FIELD_LABEL,
@@ -81,7 +82,7 @@ def folded_shot(peak: float) -> FoldedShot:
     moved = retrieved(images[0]).displacement
     answers = {"transport": Answer(moved, errors(moved, truth))}
     for name, count in (("one", 1), ("three", len(setups))):
-        found = fit(images[:count], setups=setups[:count], **given)
+        found = fit(shots_of(images[:count], setup=setups[:count], **given))
         moved, worst = found.fields[0].displacement, float(found.chi2.max())
         answers[name] = Answer(moved, errors(moved, truth), found.verdict, worst)
     return FoldedShot(peak, images, truth, answers)

@@ -47,7 +47,7 @@ TASKS: dict[str, tuple[str, ...]] = {
         "Maximum",
     ),
     "Measure currents, profiles and maps of a result": ("analyse",),
-    "Fit one or several images, also where rays cross": ("fit", "Shot", "FitOptions", "Fit"),
+    "Fit one or several images, also where rays cross": ("fit", "FitOptions", "Fit"),
     "Invert many shots": (
         "run_stack",
         "RunOptions",

@@ -6,7 +6,8 @@
 - how far the image's noise moves its field: `uncertainty`
 - currents, fluxes, profiles and maps of a result, with their bands: `analyse`; all products are in
   `napari_shadowinv.analysis`
-- several images of one object, folds, an unknown beam: `fit`, with `FitOptions`, of `Shot`;
+- an image and all that is known of it: `Shot`
+- several images of one object, folds, an unknown beam: `fit`, with `FitOptions`;
   the answer is a `Fit` with a verdict
 - deflections in SI units: `ProtonSetup`, `OpticalSetup`
 - many shots, with dask: `invert_stack`, `run_stack`, `stack_statistics`; as they arrive in a

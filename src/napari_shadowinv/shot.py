@@ -83,6 +83,8 @@ class Shot(Summarised):
         ``geometry``, the part of the setup in the file.
     warnings : tuple of Caution
         Reasons to doubt the content of the file.
+    source_in_file : ndarray, shape (H, W), optional
+        The source that came in the image's file, which a recipe may replace.
 
     Examples
     --------
@@ -106,6 +108,7 @@ class Shot(Summarised):
     path: Path | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[Caution, ...] = ()
+    source_in_file: FloatArray | None = None
 
     def __post_init__(self) -> None:
         if self.strength is not None:
@@ -143,8 +146,8 @@ class Shot(Summarised):
 
     @property
     def has_own_source(self) -> bool:
-        """Whether its source came in the file of its image, so that an estimate may replace it."""
-        return isinstance(self.source, np.ndarray) and self.path is not None
+        """Whether its source came in the file of its image, so that a recipe may replace it."""
+        return self.source is not None and self.source is self.source_in_file
 
     def completed_by(self, recorded: Shot) -> Shot:
         """Return the shot as read from its file, with all that is known beside the file."""
@@ -217,7 +220,7 @@ def shots_of(images: Any, **known: Any) -> list[Shot]:
 
     Parameters
     ----------
-    images : sequence of array_like, or ndarray of shape (L, H, W)
+    images : sequence of array_like, or ndarray of shape (L, H, W) or (H, W)
     **known
         Attributes of the shots: a list, a tuple or an array of one or three dimensions has a value
         for each, anything else is that of all.
@@ -232,7 +235,7 @@ def shots_of(images: Any, **known: Any) -> list[Shot]:
     >>> [shot.strength for shot in shots_of(np.ones((2, 64, 64)), strength=[1, 0.6])]
     [(1.0,), (0.6,)]
     """
-    planes = list(images)
+    planes = [images] if isinstance(images, np.ndarray) and images.ndim == 2 else list(images)
     of_each: list[dict[str, Any]] = [{} for _ in planes]
     for name, value in known.items():
         is_each = isinstance(value, (list, tuple)) or np.ndim(value) in (1, 3)

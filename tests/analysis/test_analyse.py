@@ -32,6 +32,7 @@ from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import Phantom
+from napari_shadowinv.shot import Shot
 
 LINE = LineProfile(path=[(31.5, 10), (31.5, 53)], width=3)
 CIRCLES = [
@@ -124,10 +125,8 @@ def fitted(ring: Phantom) -> Fit:
     """A fit of the middle of the ring, with two samples that are known."""
     image = 400 * synthetic_image(ring.displacement)[12:52, 12:52]
     noisy = np.random.default_rng(5).poisson(image).astype(float)
-    result = fit(
-        noisy, source=np.full(image.shape, 400.0), setups=[SETUP],
-        options=FitOptions(samples=0, max_iterations=5, spacing=0.25, threads=1),
-    )  # fmt: skip
+    options = FitOptions(samples=0, max_iterations=5, spacing=0.25, threads=1)
+    result = fit(Shot(noisy, SETUP, np.full(image.shape, 400.0)), options=options)
     y, x = np.mgrid[:40, :40].astype(float)
     changes = np.stack([0.3 * x, -0.1 * y, np.zeros((40, 40))]).astype(np.float32)
     (field,) = result.fields

@@ -101,7 +101,7 @@ def refused(folder: Path) -> Callable[..., None]:
 def prepared(image: str, source: str | None = None, mask: str | None = None, **flags: Any) -> Shot:
     """Return a shot and its source after the steps that flags ask for."""
     recipe = recipe_of(flags, Recipe(mask=None if mask is None else Path(mask)))
-    return collect_inputs(recipe, image, source=source).prepare()
+    return collect_inputs(recipe, Shot(image, source=source)).prepare()
 
 
 def dataset(path: str | Path) -> xr.Dataset:

@@ -13,6 +13,7 @@ from napari_shadowinv import InversionCancelled
 from napari_shadowinv.fitting import _ray_kernels, compilation, fit
 from napari_shadowinv.fitting.compilation import ensure_compiled, is_compiled
 from napari_shadowinv.options import FitOptions
+from napari_shadowinv.shot import shots_of
 
 
 def printed(script: str, **environment: str) -> str:
@@ -28,15 +29,11 @@ def printed(script: str, **environment: str) -> str:
 
 def test_a_fit_tells_that_it_compiles_and_can_be_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
     progress: list[Any] = []
-    images = np.ones((2, 32, 32))
-    keywords: dict[str, Any] = {
-        "strengths": [1, 0.5],
-        "noise": 0.1,
-        "options": FitOptions(samples=0, max_iterations=1),
-    }
+    shots = shots_of(np.ones((2, 32, 32)), strength=[1, 0.5], noise=0.1)
+    options = FitOptions(samples=0, max_iterations=1)
     ensure_compiled()  # else transport tells that it compiles, too
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
-    fit(images, **keywords, on_progress=progress.append)
+    fit(shots, options=options, on_progress=progress.append)
     assert [news.stage for news in progress[:4]] == ["compile"] * 3 + ["fit"]
     assert [news.step for news in progress[:3]] == [0, 1, 2]
     assert "once, for" in progress[0].message
@@ -46,7 +43,7 @@ def test_a_fit_tells_that_it_compiles_and_can_be_cancelled(monkeypatch: pytest.M
     assert len(progress) == 2
     monkeypatch.undo()
     assert is_compiled()
-    fit(images, **keywords, on_progress=progress.append)
+    fit(shots, options=options, on_progress=progress.append)
     assert progress[2].stage == "fit"
 
 
@@ -95,8 +92,8 @@ kernels = {
 compiled = {kernel: len(kernel.signatures) for kernel in kernels}
 y, x = np.indices((36, 48)) / 10
 image = 1 + 0.1 * np.sin(y) * np.cos(x)
-keywords = {"noise": 0.02, "options": FitOptions(samples=2, max_iterations=2, align="affine")}
-fit([image, 1 + 0.5 * (image - 1)], strengths=[1, 0.5], **keywords)
+shots = shots_of([image, 1 + 0.5 * (image - 1)], strength=[1, 0.5], noise=0.02)
+fit(shots, options=FitOptions(samples=2, max_iterations=2, align="affine"))
 print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) > compiled[kernel]])
 """
     assert printed(script) == "[]"

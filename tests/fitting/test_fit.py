@@ -19,7 +19,7 @@ from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.plotting import fit_figure
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
@@ -31,7 +31,7 @@ RING_AND_SPOT = together(bump(3.2, 4.5, (20, 32)), bump(-1.6, 5, (30, 19)))
 WEAK = bump(0.4, 8, (22, 29))
 
 
-def shots_of(displacement: Displacement, **changes: Any) -> list[FloatArray]:
+def images_of(displacement: Displacement, **changes: Any) -> list[FloatArray]:
     return [
         counted(lambda y, x: strength * displacement(y, x), SIZE, **changes)  # noqa: B023
         for strength in STRENGTHS
@@ -40,23 +40,22 @@ def shots_of(displacement: Displacement, **changes: Any) -> list[FloatArray]:
 
 @pytest.fixture(scope="module")
 def folded_shots() -> list[FloatArray]:
-    return shots_of(RING_AND_SPOT)
+    return images_of(RING_AND_SPOT)
 
 
 @pytest.fixture(scope="module")
 def found(folded_shots: list[FloatArray]) -> Fit:
     return fit(
-        noisy(folded_shots, NOISE),
-        strengths=STRENGTHS,
-        source=np.ones(SIZE),
-        noise=NOISE,
+        shots_of(noisy(folded_shots, NOISE), strength=STRENGTHS, source=np.ones(SIZE), noise=NOISE),
         options=FitOptions(samples=4, threads=1),
     )
 
 
 def test_sampled_potentials_spread_as_far_as_the_total_error(found: Fit) -> None:
     images = noisy([counted(WEAK, SIZE)], NOISE)
-    assumed = fit(images, strengths=[1], noise=NOISE, options=FitOptions(samples=12, threads=1))
+    assumed = fit(
+        shots_of(images, strength=[1], noise=NOISE), options=FitOptions(samples=12, threads=1)
+    )
     assert assumed.report.beam is not None
     parts = assumed.report.parts
     assert parts["beam"] > 2 * parts["noise"] > 0
@@ -117,7 +116,9 @@ def test_strong_rays_first_or_weak_ones_makes_no_difference(
     found: Fit, folded_shots: list[FloatArray]
 ) -> None:
     """The field is that of the first image."""
-    turned = fit(noisy(folded_shots, NOISE)[::-1], strengths=[0.6, 1], noise=NOISE, options=PLAIN)
+    turned = fit(
+        shots_of(noisy(folded_shots, NOISE)[::-1], strength=[0.6, 1], noise=NOISE), options=PLAIN
+    )
     forwards, backwards = found.fields[0].displacement, turned.fields[0].displacement / 0.6
     assert distance(backwards, forwards) < 0.04
 
@@ -133,13 +134,13 @@ def test_the_noise_of_a_fit_is_that_of_its_chi2(found: Fit) -> None:
 def test_the_drawn_residual_is_as_even_as_the_noise(noise: str) -> None:
     """The variance is 1 in the dark and in the bright half, as far as so many pixels show it."""
     beam = 400 * np.exp(np.linspace(-1.5, 1.5, SIZE[1])) * np.ones(SIZE)  # 20 times as bright
-    clean = np.stack(shots_of(WEAK, beam=lambda y, x: 400 * np.exp(3 * x / (SIZE[1] - 1) - 1.5)))
+    clean = np.stack(images_of(WEAK, beam=lambda y, x: 400 * np.exp(3 * x / (SIZE[1] - 1) - 1.5)))
     rng = np.random.default_rng(5)
     deviations = {"proportional": 0.05 * clean, "pixels": 0.01 * clean**1.2}.get(noise)
     chance = rng.normal(size=clean.shape)
     images = rng.poisson(clean) if deviations is None else clean + deviations * chance
     stated: Any = deviations if noise == "pixels" else noise
-    result = fit(images, strengths=STRENGTHS, source=beam, noise=stated, options=PLAIN)
+    result = fit(shots_of(images, strength=STRENGTHS, source=beam, noise=stated), options=PLAIN)
     assert result.noise is not None
     assert result.noise.shape == images.shape
     panels = [axes for axes in fit_figure(result).axes if "Residual" in axes.get_title(loc="left")]
@@ -157,10 +158,12 @@ def uneven_beam(y: FloatArray, x: FloatArray, share: float = 0.2) -> FloatArray:
 
 def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
     result = fit(
-        noisy(shots_of(RING_AND_SPOT, beam=uneven_beam), NOISE),
-        strengths=STRENGTHS,
-        source="unknown",
-        noise=NOISE,
+        shots_of(
+            noisy(images_of(RING_AND_SPOT, beam=uneven_beam), NOISE),
+            strength=STRENGTHS,
+            source="unknown",
+            noise=NOISE,
+        ),
         options=FitOptions(samples=0, threads=1),
     )
     assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
@@ -172,9 +175,9 @@ def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
 def test_two_energies_correct_an_assumed_beam() -> None:
     beam = partial(uneven_beam, share=0.1)
     result = fit(
-        noisy(shots_of(RING_AND_SPOT, beam=beam), NOISE),
-        strengths=STRENGTHS,
-        noise=NOISE,
+        shots_of(
+            noisy(images_of(RING_AND_SPOT, beam=beam), NOISE), strength=STRENGTHS, noise=NOISE
+        ),
         options=FitOptions(samples=2, threads=1),
     )
     assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
@@ -192,8 +195,8 @@ def test_three_energies_tell_a_magnetic_field_from_an_electric_one() -> None:
         counted(lambda y, x: b * magnetic(y, x) + e * electric(y, x), SIZE)  # noqa: B023
         for b, e in strengths_of(setups, ("B", "E"), 3)
     ]
-    known = {"setups": setups, "source": np.ones(SIZE), "noise": 0.02}
-    result = fit(noisy(images, 0.02), fields=("B", "E"), options=PLAIN, **known)
+    shots = shots_of(noisy(images, 0.02), setup=setups, source=np.ones(SIZE), noise=0.02)
+    result = fit(shots, fields=("B", "E"), options=PLAIN)
     assert [field.name for field in result.fields] == ["B", "E"]
     assert distance(result.fields[0].displacement, on_pixels(magnetic, SIZE)) < 0.06
     assert distance(result.fields[1].displacement, on_pixels(electric, SIZE)) < 0.12
@@ -202,7 +205,7 @@ def test_three_energies_tell_a_magnetic_field_from_an_electric_one() -> None:
 
 def test_one_image_tells_a_weak_field() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)[0]
-    result = fit(image, noise=0.02, options=PLAIN)
+    result = fit(shots_of(image, noise=0.02), options=PLAIN)
     assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
     assert result.verdict is Verdict.DETERMINED
     assert result.folded == 0
@@ -212,7 +215,7 @@ def test_one_image_tells_a_weak_field() -> None:
 def test_one_image_does_not_tell_an_unknown_beam_from_the_field() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
     options = HASTY.model_copy(update={"ambiguous": True})
-    result = fit(image, source="unknown", noise=0.02, options=options)
+    result = fit(shots_of(image, source="unknown", noise=0.02), options=options)
     assert result.verdict is Verdict.AMBIGUOUS
     assert result.chi2[0] < 1.3
 
@@ -222,7 +225,8 @@ def test_an_object_that_has_moved_between_the_images_is_told(
 ) -> None:
     moved = counted(lambda y, x: 0.6 * RING_AND_SPOT(y - 3, x), SIZE)
     result = fit(
-        noisy([folded_shots[0], moved], NOISE), strengths=STRENGTHS, noise=NOISE, options=HASTY
+        shots_of(noisy([folded_shots[0], moved], NOISE), strength=STRENGTHS, noise=NOISE),
+        options=HASTY,
     )
     assert result.verdict is Verdict.MISFIT
     assert "image 2" in result.explanation
@@ -233,7 +237,7 @@ def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
     """Where rays cross over much of the image, that is too little."""
     strong = bump(3.2, 8, (23, 27))
     images = [counted(lambda y, x: s * strong(y, x), SIZE) for s in (1, 0.97)]  # noqa: B023
-    result = fit(noisy(images, 0.1), strengths=[1, 0.97], noise=0.1, options=PLAIN)
+    result = fit(shots_of(noisy(images, 0.1), strength=[1, 0.97], noise=0.1), options=PLAIN)
     assert result.folded > 0.15
     assert result.verdict is Verdict.AMBIGUOUS
     assert "one image does not show" in result.explanation
@@ -243,21 +247,26 @@ def test_a_start_at_the_truth_is_taken() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
     y, x = np.indices(SIZE) - np.array([22, 29])[:, None, None]
     truth = 0.4 * 8**2 * np.exp(-(y**2 + x**2) / 2 / 8**2)
-    result = fit(Shot(image[0], start=truth), noise=0.02, options=PLAIN)
+    result = fit(Shot(image[0], start=truth, noise=0.02), options=PLAIN)
     assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
     for wrong in (truth[1:], np.full(SIZE, np.nan)):
         with pytest.raises(InputError, match="start has shape"):
-            fit(Shot(image[0], start=wrong), noise=0.02, options=PLAIN)
+            fit(Shot(image[0], start=wrong, noise=0.02), options=PLAIN)
 
 
 def test_a_mask_of_all_images_is_the_mask_of_each() -> None:
     hole = np.zeros(SIZE, bool)
     hole[30:38, 5:12] = True
-    shots = np.array(shots_of(WEAK))
+    shots = np.array(images_of(WEAK))
     shots[:, hole] = 1e6
-    by_all = fit(shots, strengths=STRENGTHS, noise=NOISE, mask=~hole, options=HASTY)
-    each = [Shot(s, strength=(k,), mask=~hole) for s, k in zip(shots, STRENGTHS, strict=True)]
-    by_each = fit(each, noise=NOISE, options=HASTY)
+    by_all = fit(shots_of(shots, strength=STRENGTHS, noise=NOISE, mask=~hole), options=HASTY)
+    by_each = fit(
+        [
+            Shot(s, strength=k, mask=~hole, noise=NOISE)
+            for s, k in zip(shots, STRENGTHS, strict=True)
+        ],
+        options=HASTY,
+    )
     assert_array_equal(by_all.mask, np.broadcast_to(~hole, shots.shape))
     assert_array_equal(by_all.fields[0].potential, by_each.fields[0].potential)
     truth = on_pixels(WEAK, SIZE)
@@ -268,7 +277,7 @@ def test_a_fit_that_runs_out_of_steps_says_so() -> None:
     image = noisy([counted(bump(1.2, 8, (22, 29)), SIZE)], 0.004)[0]
     for steps in (1, 100):
         options = FitOptions(samples=0, max_iterations=steps, threads=1)
-        result = fit(image, noise=0.004, options=options)
+        result = fit(shots_of(image, noise=0.004), options=options)
         assert result.report.converged == (steps == 100)
         assert result.report.converged or result.report.iterations == steps
 
@@ -276,7 +285,7 @@ def test_a_fit_that_runs_out_of_steps_says_so() -> None:
 def test_a_shot_without_the_object_is_one_more_image() -> None:
     """Its strength is zero: an image of the beam."""
     images = noisy([counted(WEAK, SIZE), np.ones(SIZE)], 0.02)
-    result = fit(images, strengths=[1, 0], noise=0.02, options=PLAIN)
+    result = fit(shots_of(images, strength=[1, 0], noise=0.02), options=PLAIN)
     assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
     assert result.verdict is Verdict.DETERMINED
 
@@ -287,8 +296,8 @@ def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
     cut = bump(0.7, 8, (0, 30))
     images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
     options = FitOptions(samples=2, spacing=0.25, boundary=boundary)
-    known = {"strengths": [1, 0.7], "source": np.ones(SIZE), "noise": 0.02}
-    result = fit(noisy(images, 0.02), options=options, **known)
+    shots = shots_of(noisy(images, 0.02), strength=[1, 0.7], source=np.ones(SIZE), noise=0.02)
+    result = fit(shots, options=options)
     assert result.chi2.max() < 1.3
     assert result.verdict is Verdict.EDGE
     assert "larger field of view" in result.explanation
@@ -301,7 +310,7 @@ def test_an_object_cut_by_either_end_of_a_filled_side_is_reported(column: int) -
     cut = bump(0.7, 8, (20, column))
     images = [counted(lambda y, x: s * cut(y, x), size) for s in (1, 0.7)]  # noqa: B023
     options = PLAIN.model_copy(update={"samples": 2})
-    result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=options)
+    result = fit(shots_of(noisy(images, 0.02), strength=[1, 0.7], noise=0.02), options=options)
     assert result.verdict is Verdict.EDGE
     assert "larger field of view" in result.explanation
 
@@ -327,7 +336,9 @@ def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:
     strengths = [1, 2.23]
     images = [counted(lambda y, x: s * ring(y, x), size, beam=beam) for s in strengths]  # noqa: B023
     counts = [np.random.default_rng(k).poisson(400 * image) for k, image in enumerate(images)]
-    result = fit(counts, strengths=strengths, source="unknown", noise="poisson", options=PLAIN)
+    result = fit(
+        shots_of(counts, strength=strengths, source="unknown", noise="poisson"), options=PLAIN
+    )
     assert result.verdict is Verdict.DETERMINED
     assert distance(result.fields[0].displacement, on_pixels(ring, size)) < 0.02
 
@@ -335,9 +346,9 @@ def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:
 def test_nothing_is_taken_twice() -> None:
     first, second = noisy([counted(WEAK, SIZE), counted(WEAK, SIZE)], 0.02)
     with pytest.raises(InputError, match="image 1 and image 3 are the same"):
-        fit([first, second, 3 * first], strengths=[1, 0.9, 0.8], options=PLAIN)
+        fit(shots_of([first, second, 3 * first], strength=[1, 0.9, 0.8]), options=PLAIN)
     with pytest.raises(InputError, match="the source is image 2 itself"):
-        fit([first, second], strengths=[1, 0.9], source=second, options=PLAIN)
+        fit(shots_of([first, second], strength=[1, 0.9], source=second), options=PLAIN)
 
 
 def test_a_field_that_is_not_there_does_not_make_the_images_likelier() -> None:
@@ -351,8 +362,8 @@ def test_a_field_that_is_not_there_does_not_make_the_images_likelier() -> None:
     weaker = [setups[0].momentum / setup.momentum for setup in setups]
     images = [counted(lambda y, x: s * WEAK(y, x), SIZE) for s in weaker]  # noqa: B023
     options = FitOptions(samples=0, spacing=0.25)
-    known = {"setups": setups, "noise": NOISE, "source": np.ones(SIZE)}
-    fits = compare(noisy(images, NOISE), options=options, **known)
+    shots = shots_of(noisy(images, NOISE), setup=setups, noise=NOISE, source=np.ones(SIZE))
+    fits = compare(shots, options=options)
     assert [len(each.fields) for each in fits] == [1, 2, 1]
     assert fits[0].fields[0].name == "B"
     evidence = [each.report.log_evidence for each in fits]

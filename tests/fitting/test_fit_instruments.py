@@ -15,7 +15,7 @@ from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.options import FitOptions
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
@@ -34,8 +34,8 @@ def shots() -> list[FloatArray]:
 
 def fitted(images: Any, align: Any = "none", threads: int = 1, **keywords: Any) -> Fit:
     options = FitOptions(samples=0, max_iterations=30, spacing=0.25, threads=threads, align=align)
-    keywords = {"strengths": STRENGTHS, "noise": NOISE} | keywords
-    return fit(images, options=options, **keywords)
+    known = {"strength": STRENGTHS, "noise": NOISE} | keywords
+    return fit(shots_of(images, **known), options=options)
 
 
 def error(result: Fit) -> float:
@@ -60,7 +60,7 @@ def test_a_blur_that_was_not_told_is_noticed() -> None:
     ring = bump(1.9, 8, (40, 40))
     for blur in (0.0, 2.0):
         image = noisy([counted(ring, size, blur=blur)], 0.02)[0]
-        keywords = {"strengths": None, "noise": 0.02, "source": np.ones(size)}
+        keywords = {"strength": None, "noise": 0.02, "source": np.ones(size)}
         blind = fitted(image, psf=0.0, **keywords)
         aware = fitted(image, psf=blur, **keywords) if blur else blind
         assert blind.chi2.max() < 1.1
@@ -93,7 +93,7 @@ def test_one_folded_image_does_not_pass_for_an_answer() -> None:
     size = (80, 80)
     ring = bump(4.0, 8, (40, 40))
     image = noisy([counted(ring, size, blur=1.5)], 0.05)[0]
-    keywords = {"strengths": None, "noise": 0.05, "source": np.ones(size)}
+    keywords = {"strength": None, "noise": 0.05, "source": np.ones(size)}
     result = fitted(image, psf=1.5, **keywords)
     assert result.chi2.max() < 1.1
     assert result.verdict is Verdict.AMBIGUOUS
@@ -129,7 +129,7 @@ def test_an_image_is_shifted_no_further_than_it_may_be(shots: list[FloatArray]) 
     options = FitOptions(
         samples=0, max_iterations=30, spacing=0.25, align="shift", align_spread=1e-3
     )
-    result = fit(images, strengths=STRENGTHS, noise=NOISE, options=options)
+    result = fit(shots_of(images, strength=STRENGTHS, noise=NOISE), options=options)
     assert np.abs(result.frames[1][[0, 3]]).max() < 0.5
     assert result.verdict == Verdict.MISFIT
 
@@ -178,9 +178,9 @@ def test_answers_to_few_counts_are_compared_by_what_is_expected() -> None:
     counts = np.random.default_rng(5).poisson(30 * counted(strong, size))
     options = FitOptions(samples=0, max_iterations=20, spacing=0.25, smoothness=200, ambiguous=True)
     source = np.full(size, 30)
-    result = fit(counts, source=source, noise="poisson", options=options)
+    result = fit(shots_of(counts, source=source, noise="poisson"), options=options)
     noise = np.sqrt(np.maximum(result.reprojection[0], 1))
-    by_deviation = fit(counts, source=source, noise=noise, options=options)
+    by_deviation = fit(shots_of(counts, source=source, noise=noise), options=options)
     assert result.basins[0].objective == pytest.approx(by_deviation.basins[0].objective, rel=0.03)
 
 
@@ -196,7 +196,7 @@ def test_units_of_the_images_do_not_matter(shots: list[FloatArray]) -> None:
     images = noisy(shots, NOISE)
     options = FitOptions(samples=0, max_iterations=5, spacing=0.25, threads=1)
     first, second = (
-        fit(unit * images, strengths=STRENGTHS, noise=unit * NOISE, options=options)
+        fit(shots_of(unit * images, strength=STRENGTHS, noise=unit * NOISE), options=options)
         for unit in (1, 1024)
     )
     np.testing.assert_array_equal(first.fields[0].displacement, second.fields[0].displacement)
@@ -221,8 +221,9 @@ def test_fiducials_hold_the_field_where_noise_does_not() -> None:
     places = rows.ravel(), columns.ravel()
     displaced = truth[:, *places] + np.random.default_rng(6).normal(0, 0.03, (2, 25))
     fiducials = np.column_stack([*places, *displaced, np.full(25, 0.03)])
+    options = FitOptions(samples=0, max_iterations=30, spacing=0.25, threads=1)
     fields = [
-        fitted(Shot(image[0], fiducials=table), strengths=None, noise=0.3).fields[0].displacement
+        fit(Shot(image[0], fiducials=table, noise=0.3), options=options).fields[0].displacement
         for table in (None, fiducials)
     ]
     missed = [np.sqrt(((field[:, *places] - displaced) ** 2).mean()) for field in fields]
@@ -235,7 +236,7 @@ def test_neither_threads_nor_a_second_time_change_a_bit(shots: list[FloatArray])
     runs = []
     for threads in (1, 3):
         options = FitOptions(samples=2, max_iterations=5, spacing=0.25, threads=threads, seed=3)
-        runs.append(fit(images, strengths=STRENGTHS, noise=NOISE, options=options))
+        runs.append(fit(shots_of(images, strength=STRENGTHS, noise=NOISE), options=options))
     first, second = runs
     np.testing.assert_array_equal(first.fields[0].displacement, second.fields[0].displacement)
     assert first.fields[0].uncertainty is not None
@@ -255,7 +256,7 @@ def test_a_fit_ends_at_once_when_asked(shots: list[FloatArray], after: int) -> N
         return calls >= after
 
     with pytest.raises(InversionCancelled):
-        fit(noisy(shots, NOISE), strengths=STRENGTHS, noise=NOISE, should_stop=should_stop)
+        fit(shots_of(noisy(shots, NOISE), strength=STRENGTHS, noise=NOISE), should_stop=should_stop)
     assert calls == after
 
 
@@ -263,7 +264,7 @@ def test_each_step_is_told_with_its_stage_and_objective() -> None:
     reports: list[Progress] = []
     image = noisy([counted(bump(0.4, 7, (23, 29)), SIZE)], NOISE)
     options = FitOptions(samples=2, max_iterations=10, spacing=0.25, threads=1)
-    fit(image, noise=NOISE, options=options, on_progress=reports.append)
+    fit(shots_of(image, noise=NOISE), options=options, on_progress=reports.append)
     for stage in ("from near", "transport", "smoothness", "full size", "samples"):
         objectives = [news.objective for news in reports if news.message == stage]
         assert objectives
@@ -284,10 +285,10 @@ def test_a_beam_assumed_uniform_is_fitted_as_an_unknown_one() -> None:
         synthetic_image(strength * on_pixels(ring, size), 400 * beam) for strength in strengths
     ]
     counts = [np.random.default_rng(k).poisson(image) for k, image in enumerate(images, 5)]
-    keywords: dict[str, Any] = {"strengths": strengths, "noise": "poisson"}
     options = FitOptions(samples=0, threads=1)
     assumed, unknown = (
-        fit(counts, source=source, options=options, **keywords) for source in (None, "unknown")
+        fit(shots_of(counts, strength=strengths, source=source, noise="poisson"), options=options)
+        for source in (None, "unknown")
     )
     np.testing.assert_allclose(assumed.chi2, unknown.chi2, atol=0.015)
     assert assumed.verdict is unknown.verdict is Verdict.DETERMINED

@@ -8,11 +8,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from helpers.fit_images import bump, counted, distance, noisy, on_pixels
+from helpers.fit_images import bump, counted, distance, fit_images, noisy, on_pixels
 from napari_shadowinv import BeamPrior, Instrument, ProtonSetup
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, fit
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.instrument import (
     Imperfect,
@@ -28,6 +28,7 @@ from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.inversion.imperfections import SmoothField
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.units import shown_fields
+from napari_shadowinv.shot import shots_of
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
@@ -50,8 +51,8 @@ def shots(background: float = 0.0, gamma: float = 0.0, blur: float = 0.0) -> Flo
 
 
 def fitted(images: FloatArray, instrument: Instrument | None, **keywords: object) -> Fit:
-    choices = {"strengths": STRENGTHS, "noise": NOISE, "options": FEW} | keywords
-    return fit(images, instrument=instrument, **choices)
+    choices = {"strength": STRENGTHS, "noise": NOISE, "options": FEW} | keywords
+    return fit_images(images, instrument=instrument, **choices)
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +127,7 @@ def test_one_image_keeps_its_field_and_gets_larger_errors() -> None:
     """It cannot tell the instrument from the object."""
     image = shots()[1]
     source = np.ones(SIZE)
-    keywords = {"strengths": None, "source": source}
+    keywords = {"strength": None, "source": source}
     exact = fitted(image, Instrument(), **keywords)
     unsure = fitted(image, Instrument(beam_rms=0.05, background=0.1), **keywords)
     np.testing.assert_array_equal(unsure.fields[0].displacement, exact.fields[0].displacement)
@@ -207,7 +208,7 @@ def test_energy_adds_to_the_errors_of_fields_in_si_units_alone() -> None:
         for energy in (3.0, 8.0)
     ]
     images = noisy([counted(lambda y, x, a=a: a * RING(y, x), SIZE) for a in (1, 0.61)], NOISE)
-    keywords = {"strengths": None, "setups": setups}
+    keywords = {"strength": None, "setup": setups}
     result = fitted(images, Instrument(energy=0.1), **keywords)
     (field,) = result.fields
     (pixels,) = shown_fields([field.displacement], None)
@@ -243,9 +244,7 @@ def test_each_fit_states_its_sensitivities(plain: Fit) -> None:
 
 def test_effects_of_noise_and_instrument_add_to_each_sample() -> None:
     data = collect_data(
-        shots(),
-        strengths=STRENGTHS,
-        noise=NOISE,
+        shots_of(shots(), strength=STRENGTHS, noise=NOISE),
         instrument=Instrument(beam_rms=0.05, background=0.1, gamma=0.1),
         options=FEW.model_copy(update={"smoothness": 100.0}),
     )
@@ -260,10 +259,10 @@ def test_effects_of_noise_and_instrument_add_to_each_sample() -> None:
 
 
 def test_beams_are_fitted_as_uneven_as_is_assumed_of_their_source() -> None:
-    keywords = {"strengths": STRENGTHS, "noise": NOISE, "options": FEW}
     speckled = 1 + 0.1 * np.random.default_rng(0).random(SIZE)
     for source, rms in ((None, 0.05), (speckled, 0.005), (np.ones(SIZE), 0.0)):
-        data = collect_data(shots(), source=source, **keywords)
+        known = {"strength": STRENGTHS, "noise": NOISE, "source": source}
+        data = collect_data(shots_of(shots(), **known), options=FEW)
         assert data.beam.rms == rms
         assert [part.key for part in data.scene.imperfect.parts] == ["beam"] * (rms > 0)
         assert data.common

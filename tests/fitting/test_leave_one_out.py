@@ -16,6 +16,7 @@ from napari_shadowinv import FitOptions, InputError, ProtonSetup
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import LeaveOneOut, leave_one_out
 from napari_shadowinv.fitting.left_out import explanation_of
+from napari_shadowinv.shot import shots_of
 
 SHAPE = (56, 56)
 NOISE = 0.04
@@ -48,8 +49,9 @@ def levels(count: int) -> FloatArray:
 
 
 def checked(images: FloatArray, **keywords: Any) -> LeaveOneOut:
-    usual = {"setups": SETUPS, "noise": NOISE, "options": FitOptions(spacing=0.2)}
-    return leave_one_out(images, **{**usual, **keywords})
+    options = keywords.pop("options", FitOptions(spacing=0.2))
+    known = {"setup": SETUPS, "noise": NOISE} | keywords
+    return leave_one_out(shots_of(images, **known), options=options)
 
 
 def assert_follows_noise_a_little(found: LeaveOneOut) -> None:
@@ -103,7 +105,7 @@ def test_neither_gains_nor_noise_given_too_small_are_taken_for_a_change() -> Non
     brightness = np.array([1.0, 1.4, 0.8])
     images = images_of([1] * 3) * brightness[:, None, None]
     known = {"source": np.ones(SHAPE), "noise": 0.85 * NOISE * brightness, "brightness": "free"}
-    found = checked(images, setups=SETUPS[:3], **known)
+    found = checked(images, setup=SETUPS[:3], **known)
     assert found.chi2.min() > 1.3
     assert found.explained.all()
     np.testing.assert_allclose(found.brightness, brightness, rtol=0.01)
@@ -116,7 +118,7 @@ def test_an_unknown_beam_is_that_of_the_others() -> None:
     setups = [ProtonSetup(energy=energy, **LENGTHS) for energy in (5, 10, 20, 40)]
     images = images_of([1, 1, 1, 1.6], energies=setups, beam=beam)
     options = FitOptions(spacing=0.25)
-    found = checked(images, setups=setups, source="unknown", options=options)
+    found = checked(images, setup=setups, source="unknown", options=options)
     np.testing.assert_array_equal(found.explained, [True, True, True, False])
 
 
@@ -124,7 +126,7 @@ def test_an_image_that_lies_elsewhere_on_its_detector_is_found_there() -> None:
     images = images_of([1] * 3)
     images[0] = np.roll(images[0], (1, -2), axis=(0, 1))
     images[2] = np.roll(images[2], 2, axis=1)
-    aligned = checked(images, setups=SETUPS[:3], options=FitOptions(align="shift", spacing=0.2))
+    aligned = checked(images, setup=SETUPS[:3], options=FitOptions(align="shift", spacing=0.2))
     assert aligned.explained.all()
     np.testing.assert_allclose(aligned.chi2, levels(3), atol=0.06)
 
@@ -140,7 +142,9 @@ def test_deep_folds_of_a_static_object_are_no_change() -> None:
         for strength in strengths
     ]
     beam = np.ones((42, 48))
-    left_out = leave_one_out(noisy(images, 0.03, 21), strengths=strengths, source=beam, noise=0.03)
+    left_out = leave_one_out(
+        shots_of(noisy(images, 0.03, 21), strength=strengths, source=beam, noise=0.03)
+    )
     assert left_out.explained.all()
     assert left_out.chi2[2] > 1.4
 
@@ -154,9 +158,8 @@ def test_the_limit_allows_five_times_the_prediction_variance() -> None:
         ]
     )
     images = noisy(clean, sigma)
-    beam, options = np.ones((44, 48)), FitOptions(spacing=0.2)
-    known = {"strengths": strengths, "source": beam, "noise": sigma, "options": options}
-    left_out = leave_one_out(images, **known)
+    shots = shots_of(images, strength=strengths, source=np.ones((44, 48)), noise=sigma)
+    left_out = leave_one_out(shots, options=FitOptions(spacing=0.2))
     noise, variance = (
         (((planes - clean) / sigma) ** 2).mean(axis=(1, 2))
         for planes in (images, left_out.predicted)
@@ -169,7 +172,7 @@ def test_the_limit_allows_five_times_the_prediction_variance() -> None:
 
 def test_two_images_are_too_few() -> None:
     with pytest.raises(InputError, match="received 2 images: leaving one out needs 3 or more"):
-        checked(np.ones((2, *SHAPE)), setups=SETUPS[:2])
+        checked(np.ones((2, *SHAPE)), setup=SETUPS[:2])
 
 
 def test_images_without_energies_are_told() -> None:

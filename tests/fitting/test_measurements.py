@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from napari_shadowinv.fitting.shots import point_spread
 from napari_shadowinv.inversion.noise import estimated_noise
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 SIZE = (40, 51)
 
@@ -33,17 +34,12 @@ def images(count: int = 2) -> FloatArray:
 
 def given(**changes: Any) -> FitData:
     """Two images with strengths, and what a test changes about them."""
-    usual: dict[str, Any] = {
-        "images": images(),
-        "strengths": [1, 0.6],
-        "noise": 0.1,
-        "options": FitOptions(),
-    }
-    usual |= changes
-    planes = usual.pop("images")
-    if "fiducials" in usual:
-        planes = [Shot(planes[0], fiducials=usual.pop("fiducials")), *planes[1:]]
-    return collect_data(planes, **usual)
+    known: dict[str, Any] = {"images": images(), "strength": [1, 0.6], "noise": 0.1} | changes
+    chosen = {name: known.pop(name) for name in ("options", "fields") if name in known}
+    fiducials = known.pop("fiducials", None)
+    first, *others = shots_of(known.pop("images"), **known)
+    shots = [replace(first, fiducials=fiducials), *others]
+    return collect_data(shots, **{"options": FitOptions()} | chosen)
 
 
 def protons(energy: float, **changes: Any) -> ProtonSetup:
@@ -66,82 +62,73 @@ def nearly_all_masked() -> FloatArray:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"images": [[1, 2], [3]]}, "images are no stack of numbers: expected planes"),
-        ({"images": "film.tif"}, "expected an array: read it first"),
-        ({"images": np.ones(40)}, r"images have shape \(40,\): expected \(images, height, width\)"),
-        ({"images": np.ones((0, 40, 40))}, r"images have shape \(0, 40, 40\)"),
-        ({"images": np.ones((2, 40, 20))}, r"shape \(40, 20\): expected 32 pixels or more"),
+        ({"images": ["a.tif", "b.tif"]}, "received the file a.tif: read it first"),
+        ({"images": [np.ones(40)] * 2}, r"image 1 has shape \(40,\), expected two dimensions"),
+        ({"images": np.ones((2, 40, 20))}, r"shape \(40, 20\), expected at least 32 × 32 pixels"),
         ({"images": with_pixel(np.nan)}, "1 pixels that are NaN or infinite.*: mask them"),
         ({"images": with_pixel(np.inf)}, "image 2 has 1 pixels that are NaN or infinite"),
         ({"images": np.zeros((2, *SIZE))}, "image 1 has no flux: expected a beam"),
-        ({"mask": np.ones((51, 40))}, r"mask has shape \(51, 40\): expected \(40, 51\)"),
+        ({"mask": np.ones((51, 40), bool)}, r"mask has shape \(51, 40\), image \(40, 51\)"),
         (
             {"mask": nearly_all_masked()},
-            r"mask of image 2 leaves 51 of 2,040 pixels usable.*NeXus.* invert",
-        ),
-        ({"strengths": [1, 0.6, 0.3]}, r"strengths have shape \(3, 1\).* each of 2 images"),
-        ({"strengths": [1, np.nan]}, "strengths have shape.*: expected a finite number"),
-        ({"strengths": [0, 1]}, r"strengths of the first image are \[0.0\]: all fields must act"),
-        ({"strengths": [[1, 1], [0.5, 0.5]]}, "2 fields cannot be distinguished by images"),
-        ({"strengths": None}, "2 images and neither strengths nor setups: give"),
-        ({"setups": [protons(3), protons(15)]}, "both strengths and setups, expected one of them"),
-        (
-            {"strengths": None, "setups": [protons(3)]},
-            "received 2 images and 1 setups: expected one each",
+            r"image 2: mask leaves 51 of 2,040 pixels usable.*NeXus.* invert",
         ),
         (
-            {"strengths": None, "setups": [protons(3), protons(15, pixel_size=3e-6)]},
+            {"strength": [1, np.nan]},
+            "strength is nan: expected a finite number",
+        ),
+        ({"strength": [0, 1]}, r"strengths of the first image are \[0.0\]: all fields must act"),
+        ({"strength": [[1, 1], [0.5, 0.5]]}, "2 fields cannot be distinguished by images"),
+        ({"strength": None}, "2 images and neither strengths nor setups: give"),
+        (
+            {"strength": None, "setup": [protons(3), protons(15, pixel_size=3e-6)]},
             "image 2 has pixels of 3 µm at the object, the first of 2 µm: bring all",
         ),
         (
-            {"strengths": None, "setups": [protons(3)] * 2, "fields": ("B", "C")},
+            {"strength": None, "setup": [protons(3)] * 2, "fields": ("B", "C")},
             r"fields are \['B', 'C'\]: expected some of B, E, plasma, phase",
         ),
         (
-            {"strengths": None, "setups": [protons(3)] * 2, "fields": ("B", "B")},
+            {"strength": None, "setup": [protons(3)] * 2, "fields": ("B", "B")},
             r"fields are \['B', 'B'\]",
         ),
-        ({"source": "unkown"}, "source is 'unkown': expected an array, None or 'unknown'"),
-        ({"source": np.ones((40, 50))}, r"source has shape \(40, 50\): expected \(40, 51\)"),
+        ({"source": "unkown"}, "source is the file unkown, expected an array: read it first"),
+        ({"source": np.ones((40, 50))}, r"source has shape \(40, 50\), image \(40, 51\)"),
         ({"source": -np.ones(SIZE)}, "source has pixels that are negative or not finite"),
         ({"source": np.full(SIZE, np.nan)}, "source has pixels that are negative or not finite"),
         ({"noise": "gauss"}, "noise is 'gauss': expected 'poisson' or 'proportional', standard"),
         ({"noise": 0}, "noise is not positive everywhere"),
         ({"noise": np.full(SIZE, np.nan)}, "noise is not positive everywhere"),
-        ({"noise": []}, "noise is not positive everywhere"),
         ({"noise": [0.1, 1e300]}, r"image 2: the noise is \S+e\+\d+ times the beam or more"),
-        ({"noise": np.ones(3)}, r"noise has shape \(3,\): expected one number, one an image"),
         ({"noise": "poisson", "images": with_pixel(-1)}, "negative pixels, so they are no counts"),
-        ({"psf": [1.0, 2.0, 3.0]}, "psf has 3 entries: expected one, or one for each of 2"),
         ({"psf": -1.0}, "psf is -1.0: expected a standard deviation in px or a kernel"),
         ({"psf": 9.0}, "psf is 9 px: expected less than an eighth of a side"),
         ({"psf": np.ones((3, 4))}, r"psf has shape \(3, 4\): expected a kernel with odd sides"),
         ({"psf": np.zeros((3, 3))}, r"psf has shape \(3, 3\)"),
         ({"psf": "wide"}, "psf is 'wide': expected numbers"),
-        ({"psf": [[1.0, 2.0, 3.0]] * 2}, r"psf has shape \(2, 3\): expected a kernel"),
+        ({"psf": np.ones((2, 3))}, r"psf has shape \(2, 3\): expected a kernel"),
         ({"psf": [1.0, "wide"]}, "psf is 'wide': expected numbers"),
-        ({"strengths": "strong"}, "strengths is 'strong': expected numbers"),
-        ({"strengths": [[1, 2], [3]]}, r"strengths is \[\[1, 2\], \[3\]\]: expected numbers"),
-        ({"source": [[1, 2], [3]]}, "source is .*: expected numbers"),
-        ({"noise": [0.1, "little"]}, "noise is .*: expected numbers"),
+        ({"strength": "strong"}, "strength is 'strong': expected numbers"),
+        ({"strength": [[1, 2], [3]]}, r"strengths are \(1.0, 2.0\), \(3.0,\): expected one number"),
+        ({"source": "beam.tif"}, "source is the file beam.tif, expected an array"),
+        ({"noise": [0.1, [1, [2]]]}, "noise is .*: expected numbers"),
         ({"fiducials": [[1, 2, 3], [4]]}, "fiducials is .*: expected numbers"),
-        ({"mask": [[True], [True, False]]}, "mask is .*: expected numbers"),
-        ({"brightness": [1, None, "x"]}, "brightness is .*: expected numbers"),
+        ({"mask": np.ones(SIZE)}, "image 1: mask has values of type float64, expected booleans"),
+        ({"brightness": [1, "x"]}, "brightness is 1, 'x': expected a number for each image"),
         (
             {"brightness": "some"},
-            "brightness is 'some': expected 'known', 'free' or a number for each image",
+            "brightness is 'some', 'some': expected a number for each image, or 'free' for all",
         ),
         (
             {"brightness": [1, -2]},
-            r"brightness is \[1, -2\]: expected a positive number for each of 2",
+            r"brightness is \(1, -2\): expected a positive number for each of 2",
         ),
-        ({"brightness": [1, 1, 1]}, "expected a positive number for each of 2 images"),
         ({"fiducials": np.ones((2, 4))}, r"fiducials have shape \(2, 4\): expected rows of y, x"),
         ({"fiducials": [[45, 5, 0, 0, 1]]}, "fiducials lie outside the image or have no positive"),
         ({"fiducials": [[5, 5, 0, 0, 0]]}, "fiducials lie outside the image or have no positive"),
         ({"fiducials": [[5, 5, 0, -1e300, 1]]}, "displaced by more than the image's 51 px"),
         ({"fiducials": [[5, 5, 0, 0, 1e-300]]}, "σ below 1e-06 px"),
-        ({"images": images(1), "strengths": [1], "source": "unknown"}, "one image and an unknown"),
+        ({"images": images(1), "strength": [1], "source": "unknown"}, "one image and an unknown"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_a_sentence(changes: Any, sentence: str) -> None:
@@ -161,7 +148,7 @@ def test_noise_may_hide_single_pixels() -> None:
 def test_one_image_and_an_unknown_source_are_taken_if_asked_for() -> None:
     alone = given(
         images=images(1)[0],
-        strengths=None,
+        strength=None,
         source="unknown",
         options=FitOptions(ambiguous=True),
     )
@@ -191,7 +178,7 @@ def test_a_source_in_other_units_is_refused_unless_gains_are_free() -> None:
 
 @pytest.mark.parametrize(("second", "single"), [(1.0, True), (0.95, True), (0.8, False)])
 def test_images_at_nearly_one_energy_are_one_image(second: float, single: bool) -> None:
-    assert given(strengths=[1, second]).single is single
+    assert given(strength=[1, second]).single is single
 
 
 def test_images_are_in_units_of_their_beams() -> None:
@@ -240,7 +227,7 @@ def test_sides_are_filled_to_lengths_with_fast_transforms(side: int, filled: int
 
 
 def test_strengths_are_relative_to_the_first_image() -> None:
-    data = given(strengths=[[2, 4], [1, 3]])
+    data = given(strength=[[2, 4], [1, 3]])
     np.testing.assert_allclose(data.scene.strengths, [[1, 1], [0.5, 0.75]])
 
 
@@ -291,7 +278,7 @@ def test_kernels_have_the_sum_one_and_each_image_may_have_its_own() -> None:
 
 
 def test_one_kernel_is_for_all_images_and_kernels_may_differ_in_size() -> None:
-    for kernel in (np.ones((3, 5)), [[1, 1, 1]] * 5):
+    for kernel in (np.ones((3, 5)), np.ones((5, 3))):
         data = given(psf=kernel)
         assert [np.shape(psf) for psf in data.scene.psf] == [np.shape(kernel)] * 2
     data = given(psf=[np.ones((3, 3)), np.ones((5, 5))])
@@ -307,10 +294,10 @@ def test_alignment_frees_the_numbers_of_a_frame(align: Any, free: int) -> None:
 
 def test_a_free_edge_has_a_wider_strip_and_fades() -> None:
     stack = np.ones((1, 240, 280))
-    free = given(images=stack, strengths=[1], options=FitOptions(boundary="free"))
+    free = given(images=stack, strength=[1], options=FitOptions(boundary="free"))
     assert free.scene.pad == 24  # a tenth of the shorter side in blocks
     assert free.scene.decay == 24
-    fading = given(images=stack, strengths=[1])
+    fading = given(images=stack, strength=[1])
     assert fading.scene.pad == 16
     assert fading.scene.decay == np.inf
     open_edge = given(options=FitOptions(boundary="free", margin=40, decay_length=9.0))
@@ -407,39 +394,21 @@ def test_noise_that_nobody_tells_is_estimated() -> None:
     np.testing.assert_allclose(noise / np.array([[0.1], [0.3]]), 1, atol=0.05)
 
 
-def test_what_is_known_of_an_image_precedes_what_is_known_of_all() -> None:
-    first, second = images()
-    beam, mask = np.full(SIZE, 5.0), np.ones(SIZE, bool)
-    mask[3:6, 4:9] = False
-    shots = [
-        Shot(first, strength=(1.0,), source=beam, brightness=1.0, mask=mask),
-        Shot(second, strength=(0.6,), source=beam, brightness=2.0, psf=0.5, noise=0.3),
-    ]
-    data = collect_data(shots, noise=0.1, psf=0.2, options=FitOptions())
-    masks = [mask, np.ones(SIZE, bool)]
-    same = {"source": beam, "brightness": [1, 2], "mask": masks, "psf": [0.2, 0.5]}
-    expected = given(noise=[0.1, 0.3], **same).scene
-    for name in ("images", "weights", "beams", "strengths"):
-        np.testing.assert_array_equal(getattr(data.scene, name), getattr(expected, name))
-    assert data.scene.psf == expected.psf == [0.2, 0.5]
-    np.testing.assert_array_equal(data.brightness, [1, 2])
-    assert data.names is None
-
-
-def test_radiographs_have_setup_source_and_mask_and_a_dict_names() -> None:
+def test_shots_have_setup_source_mask_and_name() -> None:
     setups = protons(14.7), protons(6)
     beam, mask = np.full(SIZE, 5.0), np.eye(*SIZE) == 0
     shots = [
         Shot(image, setup, source=beam, mask=mask)
         for image, setup in zip(images(), setups, strict=True)
     ]
-    data = collect_data({"fast": shots[0], "slow": Shot(shots[1])}, options=FitOptions())
+    shots = [replace(shot, name=name) for shot, name in zip(shots, ("fast", "slow"), strict=True)]
+    data = collect_data(shots, options=FitOptions())
     assert data.names == ("fast", "slow")
     assert data.setups == setups
     np.testing.assert_array_equal(data.scene.weights[1, : SIZE[0], : SIZE[1]] > 0, mask)
-    plain = dict(zip("ab", images(), strict=True))
-    with pytest.raises(InputError, match="a and b are the same"):
-        collect_data({"a": plain["a"], "b": plain["a"]}, strengths=[1, 0.6], options=FitOptions())
+    same = [Shot(shots[0].image, strength=1 / k, name=f"shot {k}") for k in (1, 2)]
+    with pytest.raises(InputError, match="shot 1 and shot 2 are the same"):
+        collect_data(same, options=FitOptions())
 
 
 @pytest.mark.parametrize(
@@ -454,30 +423,22 @@ def test_radiographs_have_setup_source_and_mask_and_a_dict_names() -> None:
         ),
         ({}, {"fiducials": [[5, 5, 0, 0, 1]]}, "received fiducials of a later image"),
         ({}, {"start": np.zeros(SIZE)}, "received start of a later image"),
-        ({"strength": (1,)}, {"strength": (1, 0.5)}, "strengths have 1, 2 numbers: expected one"),
+        (
+            {"strength": (1,)},
+            {"strength": (1, 0.5)},
+            "expected one number for each field in all",
+        ),
     ],
 )
 def test_images_that_are_known_differently_are_refused(
     first: dict[str, Any], second: dict[str, Any], message: str
 ) -> None:
-    keywords = {} if "strength" in first else {"strengths": [1, 0.6]}
-    shots = [Shot(image, **known) for image, known in zip(images(), (first, second), strict=True)]
+    usual = {} if "strength" in first else {"strength": 1}
+    shots = [
+        Shot(image, **usual | known) for image, known in zip(images(), (first, second), strict=True)
+    ]
     with pytest.raises(InputError, match=re.escape(message)):
-        collect_data(shots, options=FitOptions(), **keywords)
-
-
-@pytest.mark.parametrize(
-    ("known", "keywords", "message"),
-    [
-        ({"brightness": 1.0}, {"brightness": "free"}, "of each image and brightness='free'"),
-        ({"strength": (1.0,)}, {"strengths": [1]}, "of each image and strengths: expected one of"),
-    ],
-)
-def test_what_is_known_of_each_and_of_all_is_refused(
-    known: dict[str, Any], keywords: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(InputError, match=message):
-        collect_data(Shot(images()[0], **known), options=FitOptions(), **keywords)
+        collect_data(shots, options=FitOptions())
 
 
 def test_a_file_is_not_read() -> None:

@@ -11,6 +11,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.options import FitOptions
+from napari_shadowinv.shot import shots_of
 
 SIZE = (64, 64)
 COUNTS = 200
@@ -32,7 +33,7 @@ def share_off(result: Fit) -> float:
 def test_correlated_noise_widens_the_bars_of_one_image(clean: FloatArray) -> None:
     noise = np.random.default_rng(3).normal(0, 0.1, SIZE)
     image = clean + gaussian_filter(noise, 2.0, mode="wrap")
-    result = fit(image, source=np.ones(SIZE), options=OPTIONS)
+    result = fit(shots_of(image, source=np.ones(SIZE)), options=OPTIONS)
     assert share_off(result) < 2
     assert result.verdict is not Verdict.MISFIT
 
@@ -40,14 +41,14 @@ def test_correlated_noise_widens_the_bars_of_one_image(clean: FloatArray) -> Non
 def test_smoothed_counts_are_no_misfit(clean: FloatArray) -> None:
     counts = np.random.default_rng(4).poisson(COUNTS * clean).astype(float)
     image, source = gaussian_filter(counts, 0.8), np.full(SIZE, float(COUNTS))
-    result = fit(image, source=source, noise="poisson", psf=0.8, options=OPTIONS)
+    result = fit(shots_of(image, source=source, noise="poisson", psf=0.8), options=OPTIONS)
     assert result.verdict is Verdict.DETERMINED
     assert 0.5 < share_off(result) < 2
 
 
 def test_noise_that_is_stated_too_large_is_used_smaller(clean: FloatArray) -> None:
     image = clean + np.random.default_rng(5).normal(0, 0.05, SIZE)
-    result = fit(image, source=np.ones(SIZE), noise=0.2, options=OPTIONS)
+    result = fit(shots_of(image, source=np.ones(SIZE), noise=0.2), options=OPTIONS)
     assert result.verdict is Verdict.DETERMINED
     assert "the noise was stated 4." in result.explanation
     assert result.noise == pytest.approx(0.05, rel=0.15)
@@ -59,9 +60,7 @@ def test_the_noise_of_a_reference_is_no_misfit(clean: FloatArray) -> None:
     image, reference = rng.poisson(4 * COUNTS * clean), rng.poisson(4 * COUNTS, SIZE)
     for noise in (None, "poisson"):
         result = fit(
-            image.astype(float),
-            source=reference.astype(float),
-            noise=noise,
+            shots_of(image.astype(float), source=reference.astype(float), noise=noise),
             options=OPTIONS,
             instrument={"beam_rms": 0},
         )
@@ -77,7 +76,9 @@ def test_a_fit_does_not_follow_the_noise_of_a_reference() -> None:
     image, reference = rng.poisson(beam * counted(hill, SIZE)), rng.poisson(beam)
     errors = []
     for source in (reference.astype(float), beam):
-        result = fit(image.astype(float), source=source, options=FitOptions(samples=0, threads=1))
+        result = fit(
+            shots_of(image.astype(float), source=source), options=FitOptions(samples=0, threads=1)
+        )
         assert result.chi2 == pytest.approx(1, abs=0.3)
         errors.append(distance(result.fields[0].displacement, on_pixels(hill, SIZE)))
     assert errors[0] < 1.5 * errors[1]
@@ -86,9 +87,7 @@ def test_a_fit_does_not_follow_the_noise_of_a_reference() -> None:
 def test_a_beam_of_fine_structure_is_taken_as_it_is() -> None:
     speckles = np.exp(0.2 * gaussian_filter(np.random.default_rng(8).normal(size=SIZE), 1.5) * 5)
     result = fit(
-        speckles * counted(OBJECT, SIZE),
-        source=speckles,
-        noise=0.01,
+        shots_of(speckles * counted(OBJECT, SIZE), source=speckles, noise=0.01),
         options=FitOptions(samples=0, threads=1),
     )
     np.testing.assert_allclose(

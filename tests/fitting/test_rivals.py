@@ -15,6 +15,7 @@ from napari_shadowinv.fitting.rivals import Comparison, compare_rivals
 from napari_shadowinv.fitting.search import Minimum, settle_minimum
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
+from napari_shadowinv.shot import shots_of
 
 SIDE, NOISE, STRENGTHS = 40, 0.03, (1.0, 0.6)
 
@@ -25,10 +26,9 @@ def tell(stage: str, objective: float) -> None:
 
 def given(images: FloatArray) -> FitData:
     return collect_data(
-        images,
-        strengths=STRENGTHS[: len(images)],
-        source=np.ones((SIDE, SIDE)),
-        noise=NOISE,
+        shots_of(
+            images, strength=STRENGTHS[: len(images)], source=np.ones((SIDE, SIDE)), noise=NOISE
+        ),
         options=FitOptions(smoothness=0.05, threads=1),
     )
 
@@ -93,7 +93,7 @@ def test_tried_lists_the_likeliest_first() -> None:
 def test_a_wider_beam_starts_as_the_narrower_one() -> None:
     """Numbers are in standard deviations: their shape stays in that of another prior."""
     data = collect_data(
-        images_of_blob(), strengths=STRENGTHS, noise=NOISE, options=FitOptions(threads=1)
+        shots_of(images_of_blob(), strength=STRENGTHS, noise=NOISE), options=FitOptions(threads=1)
     )
     imperfect = data.scene.imperfect
     assert imperfect.keys == {"beam"}

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.fitting.forward import Linear
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 __all__ = [
     "Displacement",
     "bump",
     "counted",
     "distance",
+    "fit_images",
     "hessian_times",
     "noisy",
     "of_each",
@@ -121,3 +124,10 @@ def hessian_times(linear: Linear, change: Unknowns) -> Unknowns:
     only_free = linear.scene._only_free
     free = only_free(change)
     return only_free(linear.scene.prior.times(free)).plus(linear.normal_times(free))
+
+
+def fit_images(images: Any, **keywords: Any) -> Fit:
+    """Fit images with what is known of each, and with further keywords of a fit."""
+    names = {each.name for each in fields(Shot)} & keywords.keys()
+    known = {name: keywords.pop(name) for name in names}
+    return fit(shots_of(images, **known), **keywords)

@@ -636,7 +636,7 @@ def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path)
     estimated = Recipe(options=options, source=PolynomialEstimate(degree=1))
     assert run(uniform, image).errors.beam is not None
     assert run(estimated, image).errors.beam is not None
-    recorded = run(uniform, image, source=np.ones(image.shape)).errors
+    recorded = run(uniform, Shot(image, source=np.ones(image.shape))).errors
     assert recorded.beam is None
     assert recorded.beam_sensitivity.rms > 0
     for beam, is_measured in (({}, False), ({"source": np.ones(image.shape)}, True)):

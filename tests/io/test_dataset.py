@@ -19,6 +19,7 @@ from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.pipeline import run
 from napari_shadowinv.preprocessing import Crop, LowPassFilter, MeasuredSource, Recipe
 from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.shot import Shot
 
 
 def assert_same(first: Inversion, second: Inversion) -> None:
@@ -139,7 +140,7 @@ def test_attributes_contain_recipe_and_origins(tmp_path: Path, proton_setup: Pro
         setup=proton_setup,
         options=InversionOptions(n_sites=300),
     )
-    inversion = run(recipe, tmp_path / "shot.npy", source=tmp_path / "beam.npy", mask=dead)
+    inversion = run(recipe, Shot(tmp_path / "shot.npy", source=tmp_path / "beam.npy", mask=dead))
     dataset = inversion.to_dataset()
     provenance = Provenance.of(dataset.attrs)
     assert provenance == inversion.provenance == Inversion.from_dataset(dataset).provenance

@@ -32,6 +32,7 @@ from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.projection import transferred_displacement
+from napari_shadowinv.shot import shots_of
 
 SHAPE = (48, 64)
 LENGTHS = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2, "pixel_size": 1.5e-6}
@@ -56,7 +57,9 @@ def found(fields: tuple[str, ...]) -> Fit:
     images = [image(setup, electric=len(fields) > 1) for setup in SETUPS]
     options = FitOptions(max_iterations=3, samples=2)
     even = Instrument(beam_rms=0)
-    best = fit(images, setups=SETUPS, fields=fields, noise=0.01, options=options, instrument=even)
+    best = fit(
+        shots_of(images, setup=SETUPS, noise=0.01), fields=fields, options=options, instrument=even
+    )
     (first, *_) = best.basins
     alternative = replace(
         first, start="from near", distance=0.5, displacement=first.displacement / 2

@@ -10,6 +10,7 @@ from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.shot import shots_of
 
 OPTIONS = FitOptions(samples=2)
 SETUPS = [
@@ -32,9 +33,9 @@ def test_the_bar_never_goes_back_and_names_the_stages(options: FitOptions, last:
     progress = FitProgress(TimeEstimate((48, 48), 2, 1, False, options))
     reports: list[Progress] = []
     fit(
-        [synthetic_image(truth), synthetic_image(0.6 * truth)],
-        strengths=[1, 0.6],
-        noise=0.02,
+        shots_of(
+            [synthetic_image(truth), synthetic_image(0.6 * truth)], strength=[1, 0.6], noise=0.02
+        ),
         options=options,
         on_progress=lambda report: reports.append(progress.update(report)),
     )

@@ -88,7 +88,9 @@ def inversion(folder: Path) -> Example:
     options = InversionOptions(n_sites=150, boundary="free", seed=3)
     steps = (*STEPS, LowPassFilter(width=0.6))
     recipe = Recipe(steps=steps, mask=Path("mask.tif"), setup=SETUPS[0], options=options)
-    return Example(write(Path("a.shadowinv"), run(recipe, paths[0], source="beam.npy")), paths[0])
+    return Example(
+        write(Path("a.shadowinv"), run(recipe, Shot(paths[0], source="beam.npy"))), paths[0]
+    )
 
 
 def fit(folder: Path) -> Example:
@@ -233,7 +235,7 @@ def test_arrays_of_one_file_are_found_again(tmp_path: Path) -> None:
             setup=SETUPS[0],
             options=InversionOptions(n_sites=150),
         )
-        first = run(recipe, "run.h5::/entry/data[1]", source="run.h5::/beam")
+        first = run(recipe, Shot("run.h5::/entry/data[1]", source="run.h5::/beam"))
         again = rerun(write(Path("a.shadowinv"), first))
     assert not first.mask[rejected != 0].any()
     assert again.changes == ()

@@ -85,7 +85,7 @@ def test_without_steps_it_is_invert(image: FloatArray) -> None:
     beam = np.full_like(image, 90)
     mask = np.ones(SHAPE, bool)
     mask[5, 7] = False
-    inversion = run(Recipe(options=OPTIONS), image, source=beam, mask=mask)
+    inversion = run(Recipe(options=OPTIONS), Shot(image, source=beam, mask=mask))
     assert_same(inversion, invert(image, source=beam, mask=mask, options=OPTIONS))
 
 
@@ -118,12 +118,14 @@ def test_source_and_masks_go_through_the_same_steps(image: FloatArray) -> None:
     small = LowPassFilter(width=1).filter_image(by_hand(image), usable)
     recipe = Recipe(steps=steps, source=PolynomialEstimate(degree=1), options=OPTIONS)
     source = polynomial_source(small, degree=1, mask=usable & by_hand(bare))
-    inversion = run(recipe, image, mask=mask, source_mask=bare)
+    inversion = run(recipe, Shot(image, mask=mask, source_mask=bare))
     # Sums of a turned array are rounded in another order.
     expected = invert(small, source=source, mask=usable, options=OPTIONS)
     assert_same(inversion, expected, rtol=1e-9)
     measured = LowPassFilter(width=1).filter_image(by_hand(1.1 * image + 9), usable)
-    inversion = run(Recipe(steps=steps, options=OPTIONS), image, source=1.1 * image + 9, mask=mask)
+    inversion = run(
+        Recipe(steps=steps, options=OPTIONS), Shot(image, source=1.1 * image + 9, mask=mask)
+    )
     expected = invert(small, source=measured, mask=usable, options=OPTIONS)
     assert_same(inversion, expected, rtol=1e-9)
 
@@ -182,7 +184,7 @@ def test_a_mask_of_bad_pixels_is_called_inverted(
     masks = {} if key == "file" else {key: bad}
     leaves = f"mask leaves {n_bad} of {bad.size:,} pixels usable"
     with pytest.raises(InputError, match=f"{leaves}.*NeXus pixel masks 0 is usable"):
-        run(recipe, image, source=np.ones(SHAPE), **masks)
+        run(recipe, Shot(image, source=np.ones(SHAPE), **masks))
 
 
 def test_a_mask_too_complex_for_an_attribute_is_not_kept_in_part() -> None:
@@ -305,7 +307,7 @@ def test_cache_spares_work_without_changing_results(image: FloatArray) -> None:
 def test_run_and_invert_have_the_same_default_sites(image: FloatArray) -> None:
     for options in (InversionOptions(), InversionOptions(boundary="free", flux="known")):
         assert_same(
-            run(Recipe(options=options), image, source=image.mean() + 0 * image),
+            run(Recipe(options=options), Shot(image, source=image.mean() + 0 * image)),
             invert(image, source=image.mean() + 0 * image, options=options),
         )
 
@@ -335,7 +337,7 @@ def test_run_refuses_inputs_that_do_not_match(
         for name, value in given.items()
     }
     with pytest.raises(InputError, match=named):
-        run(recipe, image, **arguments)
+        run(recipe, Shot(image, **arguments))
 
 
 def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: FloatArray) -> None:

@@ -27,7 +27,7 @@ from napari_shadowinv.preprocessing import (
     low_pass_source,
 )
 from napari_shadowinv.provenance import Origin
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 SHAPE = (84, 92)
 SETUPS = [
@@ -72,12 +72,15 @@ def test_run_fit_equals_a_fit_of_the_prepared_images(images: list[FloatArray]) -
     after = [setup.model_copy(update={"pixel_size": 2e-5}) for setup in SETUPS]
     spread = 1e-5 * (1 - 1 / SETUPS[0].magnification) / 2e-5
     by_hand = fit(
-        [Shot(binned(image), mask=binned(mask) == 4) for image in images],
-        setups=after,
-        source=np.full((40, 40), 4.0),
-        noise=0.04,
-        psf=[spread, spread],
-        brightness="free",
+        shots_of(
+            list(map(binned, images)),
+            mask=binned(mask) == 4,
+            setup=after,
+            source=np.full((40, 40), 4.0),
+            noise=0.04,
+            psf=[spread, spread],
+            brightness="free",
+        ),
         options=HASTY,
     )
     assert_same_fields(result, by_hand)
@@ -130,21 +133,21 @@ def test_provenance_too_large_for_an_attribute_is_omitted() -> None:
     assert provenance.fiducial_rows is None
     assert provenance.fiducials == Origin()
     assert len(provenance.to_json()) < 60_000
-    np.testing.assert_array_equal(of_each(inputs.images, "mask"), [shot.mask for shot in shots])
+    np.testing.assert_array_equal(of_each(inputs.shots, "mask"), [shot.mask for shot in shots])
 
 
 def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[FloatArray]) -> None:
     recipe = Recipe(steps=STEPS, source=LowPassEstimate(width=20))
     inputs = collect_fit_inputs(recipe, [Shot(image, strength=(1.0,)) for image in images])
     expected = [low_pass_source(binned(image), width=20) for image in images]
-    np.testing.assert_allclose(of_each(inputs.images, "source"), expected)
+    np.testing.assert_allclose(of_each(inputs.shots, "source"), expected)
     assert inputs.provenance.recipe.source == LowPassEstimate(width=20)
 
 
 def test_an_unknown_beam_takes_no_source(images: list[FloatArray]) -> None:
     unknown = Recipe(fit=FitChoices(beam="unknown"))
     inputs = collect_fit_inputs(unknown, [Shot(image, strength=(1.0,)) for image in images])
-    assert inputs.keywords["source"] == "unknown"
+    assert all(shot.beam_unknown for shot in inputs.shots)
     said = collect_fit_inputs(Recipe(), [Shot(image, source="unknown") for image in images])
     assert said.choices.beam == "unknown"
     with pytest.raises(InputError, match="has no unknown source"):

@@ -135,9 +135,9 @@ def test_gaps_of_a_detector_are_masked_by_their_mark(mark, shot) -> None:
     gaps = np.zeros(SHAPE, bool)
     gaps[130:137] = gaps[:, 100:104] = True
     options = InversionOptions(n_sites=500)
-    expected = run(Recipe(options=options), image, source=source, mask=~gaps)
+    expected = run(Recipe(options=options), Shot(image, source=source, mask=~gaps))
     image[gaps] = mark
-    inversion = run(Recipe(steps=(Dark(level=0),), options=options), image, source=source)
+    inversion = run(Recipe(steps=(Dark(level=0),), options=options), Shot(image, source=source))
     np.testing.assert_array_equal(inversion.mask, ~gaps)
     np.testing.assert_array_equal(inversion.potential, expected.potential)
     (caution,) = (each for each in inversion.cautions if each.code == "unlit")
@@ -362,8 +362,8 @@ def test_invert_reports_the_cautions_of_the_checks(shot):
 
 def test_dark_gives_the_field_without_an_offset(shot):
     image, source = (plane[:64, :64] for plane in shot)
-    plain = run(Recipe(), image, source=source)
-    taken = run(Recipe(steps=(Dark(level=200.0),)), image + 200, source=source + 200)
+    plain = run(Recipe(), Shot(image, source=source))
+    taken = run(Recipe(steps=(Dark(level=200.0),)), Shot(image + 200, source=source + 200))
     np.testing.assert_array_equal(taken.displacement, plain.displacement)
     assert taken.provenance.image.notes == ("dark level 200 subtracted",)
 
@@ -374,9 +374,9 @@ def test_dark_frame_moves_with_the_image(shot, tmp_path):
     np.save(tmp_path / "dark.npy", frame)
     dark = Dark(level=tmp_path / "dark.npy")
     crop, merge = Crop(y=(10, 74), x=(20, 84)), Bin(factor=2)
-    plain = run(Recipe(steps=(crop, merge)), image, source=source)
+    plain = run(Recipe(steps=(crop, merge)), Shot(image, source=source))
     for steps in ((dark, crop, merge), (crop, dark, merge), (crop, merge, dark)):
-        taken = run(Recipe(steps=steps), image + frame, source=source + frame)
+        taken = run(Recipe(steps=steps), Shot(image + frame, source=source + frame))
         np.testing.assert_allclose(taken.displacement, plain.displacement, atol=1e-6)
     assert taken.provenance.image.dark.file == "dark.npy"
 

@@ -37,6 +37,7 @@ from napari_shadowinv.pipeline.rerun import rerun
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_rows
 from napari_shadowinv.preprocessing import Bin, PolynomialEstimate
 from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import read_shot
 from napari_shadowinv.stack._plan import describe_stack
 
@@ -119,11 +120,9 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
     store = run_stack(pack, out, recipe, source=beam(), run=RunOptions(dtype="float64"))
     alone = run(
         recipe.model_copy(update={"setup": at(5.0)}),
-        np.load("film0.npy") / 1.25,
-        source=beam(),
-        mask=usable,
+        Shot(np.load("film0.npy") / 1.25, source=beam(), mask=usable),
     )
-    second = run(recipe, "film1.npy", source="other.npy")
+    second = run(recipe, Shot("film1.npy", source="other.npy"))
     for k, expected in enumerate((alone, second)):
         np.testing.assert_array_equal(store["displacement"][k], expected.displacement)
         in_si = expected.to_dataset()["path_integrated_b"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import dask.array as da
@@ -64,21 +64,26 @@ def displaced(result: Any) -> Any:
 
 INVERT: dict[str, Callable[..., Any]] = {
     "invert": lambda image, mask=None: invert(image, mask=mask, options=OPTIONS),
-    "run": lambda image, mask=None: run(Recipe(options=OPTIONS), image, mask=mask),
+    "run": lambda image, mask=None: run(Recipe(options=OPTIONS), Shot(image, mask=mask)),
     "invert_stack": lambda image, mask=None: (
         invert_stack(_stack_of(image), Recipe(options=OPTIONS), mask=mask).isel(shot=1).compute()
     ),
     "fit": lambda image, mask=None: _measured(image, mask),
     "fit a list": lambda image, mask=None: _measured([image], mask),
-    "run_fit": lambda image, mask=None: _measured(
-        **collect_fit_inputs(Recipe(), [Shot(image, mask=mask)]).keywords
+    "run_fit": lambda image, mask=None: _seen(
+        collect_fit_inputs(Recipe(), [Shot(image, mask=mask)]).shots
     ),
 }
 
 
-def _measured(images: Any, mask: Any = None, **keywords: Any) -> np.ndarray[Any, Any]:
+def _measured(images: Any, mask: Any = None) -> np.ndarray[Any, Any]:
+    is_list = isinstance(images, list)
+    return _seen([Shot(image, mask=mask) for image in (images if is_list else [images])])
+
+
+def _seen(shots: Sequence[Shot]) -> np.ndarray[Any, Any]:
     """Images and weights that a fit sees."""
-    scene = collect_data(images, mask=mask, **{"options": FitOptions()} | keywords).scene
+    scene = collect_data(shots, options=FitOptions()).scene
     return np.stack([scene.images, scene.weights])
 
 
@@ -117,7 +122,7 @@ def test_mask_argument_and_array_mask_both_count(burnt: np.ma.MaskedArray[Any, A
 
     for inversion in (
         invert(burnt, mask=mask, options=OPTIONS),
-        run(Recipe(options=OPTIONS), burnt, mask=mask),
+        run(Recipe(options=OPTIONS), Shot(burnt, mask=mask)),
     ):
         assert np.array_equal(inversion.mask, mask & ~burnt.mask)
 

@@ -464,7 +464,10 @@ def _checked_planes(
         image, exposed = unpack_array(shot.image, name)
         images.append(check_plane(image, name, _SMALLEST_SIDE))
         check_shape(name, images[-1].shape, images[0].shape, names[0])
-        mask = check_mask(unpack_mask(shot.mask), images[0].shape, name)
+        try:
+            mask = check_mask(unpack_mask(shot.mask), images[0].shape)
+        except InputError as error:
+            raise error.about(name) from error
         masks.append(join_masks(mask, exposed))
     needed = _BYTES_PER_PIXEL + len(shots) * _BYTES_PER_PIXEL_AND_IMAGE
     check_memory(images[0].shape, needed, "a fit")
@@ -491,8 +494,6 @@ def _checked_planes(
 
 
 def _checked_source(source: Any, shape: tuple[int, ...]) -> FloatArray:
-    if isinstance(source, str):
-        raise InputError(f"source is {source!r}: expected an array, None or 'unknown'")
     beam = as_numbers("source", check_plane(source, "source"))
     check_shape("source", beam.shape, shape)
     if not np.isfinite(beam).all() or beam.min() < 0 or not beam.any():

@@ -165,10 +165,13 @@ def _as_radiograph(
     if array.ndim == 3 and channel is not None:
         facts["channel"] = channel
     source, mask = facts.pop("source", None), facts.pop("mask", None)
+    if source is not None:
+        source = np.ascontiguousarray(source, dtype=np.float64)
     return Shot(
         image=image,
         metadata=facts,
-        source=None if source is None else np.ascontiguousarray(source, dtype=np.float64),
+        source=source,
+        source_in_file=source,
         mask=mask,
         warnings=tuple(facts.pop("warnings", ())),
     )

@@ -409,10 +409,9 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
         check_spacing(given.image, "the image", setup.pixel_sizes)
         check_spacing(given.source, "the source", setup.pixel_sizes)
     usable = _mask((loaded.mask, recipe.mask), "mask", loaded.shape)
-    is_array = not isinstance(given.source, Shot | str | Path | None)
-    lit = beam.mask if is_array and beam is not None and not loaded.has_own_source else None
-    if lit is not None:
-        usable = _Mask(join_masks(usable.pixels, lit), None)
+    is_array = not isinstance(given.source, Shot | str | Path)
+    if is_array and beam is not None and beam.mask is not None:  # of a masked array
+        usable = _Mask(join_masks(usable.pixels, beam.mask), None)
     usable = _without_missing(usable, loaded, beam)
     bare = _mask((loaded.source_mask, recipe.source_mask), "source mask", loaded.shape)
     kind = recipe.source
@@ -427,17 +426,18 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     if dark is not None:
         origin = _origin(dark)
         resolved = resolved.with_dark_file(join_address(origin.file, origin.variable))
+    factor = None if isinstance(loaded.brightness, str) else loaded.brightness
     origin = ImageOrigin(
         **dict(_origin(loaded)),
         source=None if beam is None else _origin(beam),
         dark=None if dark is None else _origin(dark),
-        brightness=loaded.brightness,
+        brightness=factor,
     )
     masks = index_masks([origin], [(usable.origin, bare.origin)])
     provenance = Provenance(kind="inversion", recipe=resolved, **masks).shorten()
     complete = replace(
         loaded,
-        image=loaded.image if loaded.brightness is None else loaded.image / loaded.brightness,
+        image=loaded.image if factor is None else loaded.image / factor,
         brightness=None,
         source=None if beam is None else beam.image,
         setup=resolved.setup,
@@ -515,9 +515,10 @@ def _mask(masks: Sequence[ArrayLike | Path | None], name: str, shape: tuple[int,
     given = [mask for mask in masks if mask is not None]
     planes = [_pixels(mask, name) for mask in given]
     for mask, pixels in zip(given, planes, strict=True):
-        check_shape(f"{mask}: {name}" if isinstance(mask, Path) else name, pixels.shape, shape)
+        is_file = isinstance(mask, (str, Path))
+        check_shape(f"{mask}: {name}" if is_file else name, pixels.shape, shape)
     (file,) = given if len(given) == 1 else (None,)
-    return _Mask(join_masks(*planes), file if isinstance(file, Path) else None)
+    return _Mask(join_masks(*planes), Path(file) if isinstance(file, (str, Path)) else None)
 
 
 def _pixels(mask: Any, name: str) -> Any:

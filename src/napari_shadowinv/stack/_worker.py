@@ -265,7 +265,7 @@ class InvertTask(Task):
         # A common source is already in the beam.
         recipe_source = self.estimate if beam is None else common.recipe.source
         changes = {"source": recipe_source, "setup": row.setup}
-        own = isinstance(row.source, Shot)
+        own = row.source is not None and not row.has_own_source
         shot = replace(
             row,
             source=row.source if own else source,

@@ -46,7 +46,7 @@ from napari_shadowinv.physics.projection import project, transferred_displacemen
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.shot import Shot, shots_of
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 120_000  # ms
@@ -87,7 +87,7 @@ def tool(window: Any, open_widget: Callable[[str], Any]) -> Any:
 def fitted() -> Fit:
     """The fit of the widget to its two images, without the window."""
     options = FitOptions(samples=2, max_iterations=5, spacing=0.25)
-    return fit(np.stack(images()), setups=SETUPS, psf=[0, 0], options=options)
+    return fit(shots_of(np.stack(images()), setup=SETUPS, psf=[0, 0]), options=options)
 
 
 @pytest.fixture
@@ -164,17 +164,17 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     tool.noise.restore("poisson")
     inputs = inputs_of(tool)
     assert [setup.energy for setup in inputs.setups] == [14.7, 7.0]
-    assert of_each(inputs.images, "brightness") == [1.0, 1.2]
-    assert of_each(inputs.images, "psf") == [0.0, 0.8]
-    assert of_each(inputs.images, "source") == [None, None]
-    assert (inputs.keywords["noise"], inputs.keywords["source"]) == ("poisson", None)
+    assert of_each(inputs.shots, "brightness") == [1.0, 1.2]
+    assert of_each(inputs.shots, "psf") == [0.0, 0.8]
+    assert of_each(inputs.shots, "source") == [None, None]
+    assert of_each(inputs.shots, "noise") == ["poisson", "poisson"]
     assert inputs.choices.options == FitOptions(**QUICK)
     # The image's own setup stays; what was typed stays with its layer, not with the widget.
     assert setup_of(window.layers["6.0 MeV"]) == SETUPS[1]
     window.add_image(np.ones((20, 30)))
     assert texts(tool, BEAM)[:2] == ["14.7", "7"]
     tool.brightness.restore("free")
-    assert inputs_of(tool).keywords["brightness"] == "free"
+    assert of_each(inputs_of(tool).shots, "brightness") == ["free", "free"]
     assert texts(tool, GAIN)[:2] == ["free", "free"]
     # The energy of the first image is that of the setup below, whichever is edited.
     type_in(tool, 0, BEAM, "15")
@@ -288,12 +288,12 @@ def test_an_unknown_beam_is_fitted_and_shown(window: Any, tool: Any, run: Any) -
     assert "beam" in texts(tool, 0)
     tool.source.layers.layer = measured
     assert "beam" not in texts(tool, 0)
-    for source in of_each(inputs_of(tool).images, "source"):
+    for source in of_each(inputs_of(tool).shots, "source"):
         np.testing.assert_array_equal(source, 300 * beam)
-    assert all(of_each(inputs_of(tool).images, "measured"))
+    assert all(of_each(inputs_of(tool).shots, "measured"))
     made_from = {"image": "14.7 MeV", "estimate": "fitted polynomial"}
     measured.metadata.update(metadata_for("source", "", made_from=made_from))
-    assert not any(of_each(inputs_of(tool).images, "measured"))
+    assert not any(of_each(inputs_of(tool).shots, "measured"))
 
 
 def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
@@ -312,7 +312,7 @@ def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
     job = tool.request()
     inputs = inputs_of(tool)
     planes, masks, sources, setups = (
-        of_each(inputs.images, name) for name in ("image", "mask", "source", "setup")
+        of_each(inputs.shots, name) for name in ("image", "mask", "source", "setup")
     )
     usable = np.ones((2, *SHAPE), bool)
     usable[:, :2, :3] = False
@@ -338,7 +338,7 @@ def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None
     tool.images.table.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
     inputs = inputs_of(tool)
     assert inputs.setups == SETUPS
-    np.testing.assert_array_equal(of_each(inputs.images, "image"), stack[:2])
+    np.testing.assert_array_equal(of_each(inputs.shots, "image"), stack[:2])
     # Another reference: its own energy goes with it, and comes back.
     tool.images.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
     assert tool.setup.setup().energy == 6
@@ -1080,9 +1080,9 @@ def test_a_recipe_is_the_same_for_window_and_command(
     after = inputs_of(tool)
     assert after.provenance.recipe == before.provenance.recipe
     for name in ("image", "source", "mask"):
-        old, new = (of_each(inputs.images, name) for inputs in (before, after))
+        old, new = (of_each(inputs.shots, name) for inputs in (before, after))
         np.testing.assert_array_equal(new, old)
-    assert of_each(after.images, "psf") == of_each(before.images, "psf") == [0.6, 0.6]
+    assert of_each(after.shots, "psf") == of_each(before.shots, "psf") == [0.6, 0.6]
     assert after.setups == before.setups
 
 
@@ -1093,13 +1093,13 @@ def test_a_recipe_tells_noise_and_point_spread(
     choices = '[fit]\nfields = ["E", "B"]\nnoise = 3.5\nsource_size = 3e-6\nresolution = 4e-5\n'
     path.write_text(f"[[steps]]\nstep = 'bin'\nfactor = 2\n{choices}")
     tool.recipes.load(path)
-    assert inputs_of(tool).keywords["noise"] == 3.5
+    assert of_each(inputs_of(tool).shots, "noise") == [3.5, 3.5]
     assert tool.fields.state() == "B and E"
     by_command = collect_fit_inputs(
         read_recipe(path), [Shot(np.ones(SHAPE), setup) for setup in SETUPS]
     )
-    widths = of_each(by_command.images, "psf")
-    assert of_each(inputs_of(tool).images, "psf") == pytest.approx(widths, rel=1e-12)
+    widths = of_each(by_command.shots, "psf")
+    assert of_each(inputs_of(tool).shots, "psf") == pytest.approx(widths, rel=1e-12)
     assert 1 < widths[0] < 2
     tool.setup.picker.set_kind("none")
     tool.recipes.load(path)

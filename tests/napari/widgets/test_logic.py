@@ -109,7 +109,7 @@ def test_what_the_mask_hides_does_not_matter(shot: Array) -> None:
     spoiled[~usable] = np.nan
     recipe = Recipe(steps=(LowPassFilter(),), source=LowPassEstimate(), options=FEW)
     first, second = (
-        run(recipe, image, mask=usable) for image in (spoiled, np.where(usable, shot, 1e4))
+        run(recipe, Shot(image, mask=usable)) for image in (spoiled, np.where(usable, shot, 1e4))
     )
     np.testing.assert_allclose(first.potential, second.potential, atol=1e-9)
 
@@ -119,7 +119,7 @@ def test_sites_are_kept_while_the_source_stays(shot: Array) -> None:
     source = np.full(shot.shape, 7.0)
 
     def inverted(image: Array, source: Any, **options: Any) -> None:
-        run(Recipe(options=FEW.model_copy(update=options)), image, source=source, cache=cache)
+        run(Recipe(options=FEW.model_copy(update=options)), Shot(image, source=source), cache=cache)
 
     inverted(shot, source)
     inverted(shot, source)
@@ -165,7 +165,7 @@ def test_a_step_does_the_same_to_image_and_source_as_alone(shot: Array) -> None:
     image = np.where(usable, shot, np.nan)
     beam = 1 + np.random.default_rng(0).random(shot.shape)
     recipe = Recipe(steps=(LowPassFilter(width=1.5),), options=FEW)
-    mine = run(recipe, image, source=beam, mask=usable)
+    mine = run(recipe, Shot(image, source=beam, mask=usable))
     smooth, source = (
         LowPassFilter(width=1.5).filter_image(plane, usable) for plane in (image, beam)
     )
@@ -181,7 +181,7 @@ def test_what_flattens_the_image_fits_no_measured_source(
     beam = np.linspace(1, 1.1, shot.shape[1]) * np.ones(shot.shape)
     recipe = Recipe(steps=(step,), source=MeasuredSource())
     with pytest.raises(InputError, match="would flatten the image but not the source"):
-        run(recipe, shot, source=beam)
+        run(recipe, Shot(shot, source=beam))
     with pytest.raises(InputError, match="would flatten the image but not the source"):
         run_job(StackJob(shot[None], tmp_path / "a.shadowinv.zarr", recipe, beam))
 
@@ -200,7 +200,7 @@ def test_a_stack_tells_that_it_compiles(
 
 def test_a_flat_source_is_no_other_after_the_image_is_flattened(shot: Array) -> None:
     recipe = Recipe(steps=(HighPassFilter(width=9.0),), options=FEW)
-    fields = [run(recipe, shot, source=beam) for beam in (None, 3 * np.ones(shot.shape))]
+    fields = [run(recipe, Shot(shot, source=beam)) for beam in (None, 3 * np.ones(shot.shape))]
     np.testing.assert_allclose(fields[0].displacement, fields[1].displacement, atol=1e-9)
     assert fields[1].errors.beam.rms > 0  # the filter takes from the object
 
@@ -236,7 +236,7 @@ def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
 
     def warnings(source: Estimate, image: Array = shot, **more: Any) -> str:
         recipe = Recipe(source=source, options=FEW, setup=near)
-        return str(run(recipe, image, **more).report.warnings)
+        return str(run(recipe, Shot(image, **more)).report.warnings)
 
     assert "choose the source 'isotropic'" in warnings(UniformEstimate())
     assert "isotropic" not in warnings(IsotropicEstimate())
@@ -264,7 +264,7 @@ def test_the_axis_of_an_isotropic_source_is_in_the_middle_of_the_whole_image(sho
 
 def test_the_image_itself_is_refused_as_its_source(shot: Array) -> None:
     with pytest.raises(InputError, match="the source is the image itself"):
-        run(Recipe(options=FEW), shot, source=3 * shot)
+        run(Recipe(options=FEW), Shot(shot, source=3 * shot))
 
 
 def test_a_preview_has_few_sites(shot: Array) -> None:
@@ -315,7 +315,7 @@ def test_a_mistake_gets_a_sentence(change: dict[str, Any], words: str) -> None:
     good = {"recipe": Recipe(), "image": np.ones((20, 20))}
     arguments = {**good, **change}
     with pytest.raises((InputError, OSError), match=words):
-        run(arguments.pop("recipe"), arguments.pop("image"), **arguments)
+        run(arguments.pop("recipe"), Shot(**arguments))
 
 
 def test_a_job_ends_when_it_is_asked_to(shot: Array) -> None:
