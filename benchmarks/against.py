@@ -113,8 +113,9 @@ def fits() -> Iterator[tuple[str, Case, float, tuple[int, int]]]:
 
 def worker() -> None:
     """Do what is asked for line by line, and tell the seconds, and the error where there is one."""
-    from napari_shadowinv import FitOptions, InversionOptions, fit, invert, plan_sites
+    from napari_shadowinv import FitOptions, InversionOptions, fit, invert
     from napari_shadowinv.fitting import leave_one_out
+    from napari_shadowinv.inversion import plan_sites
     from napari_shadowinv.shot import shots_of
 
     def inverted(work: Work, folder: Path) -> tuple[float, float]:

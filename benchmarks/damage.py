@@ -26,7 +26,6 @@ from napari_shadowinv import (
     InversionOptions,
     ProtonSetup,
     Recipe,
-    RunOptions,
     invert,
     read,
     run_stack,
@@ -35,6 +34,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.io.store import DONE
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.pipeline import RunOptions
 
 SHAPE = (24, 28)
 OPTIONS = InversionOptions(n_sites=60)

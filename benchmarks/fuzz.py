@@ -142,7 +142,8 @@ def _result(path: Path) -> None:
 
 
 def _store(path: Path) -> None:
-    from napari_shadowinv import Recipe, RunOptions, run_stack
+    from napari_shadowinv import Recipe, run_stack
+    from napari_shadowinv.pipeline import RunOptions
 
     shots = np.stack([_shot(), _shot()[::-1]]).astype(float)
     run_stack(

@@ -195,14 +195,8 @@ def arrays() -> Iterator[Case]:
     """Arrays of wrong kind, shape, size and content."""
     import xarray as xr
 
-    from napari_shadowinv import (
-        Shot,
-        fit,
-        invert,
-        plan_sites,
-        poisson_invert,
-        synthetic_image,
-    )
+    from napari_shadowinv import Shot, fit, invert, poisson_invert, synthetic_image
+    from napari_shadowinv.inversion import plan_sites
 
     image = _shot()
     content = (

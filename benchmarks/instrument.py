@@ -40,19 +40,10 @@ from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.stats import kstest
 
 from fit import Beam, Field, blobs, counted
-from napari_shadowinv import (
-    FitOptions,
-    Instrument,
-    InversionOptions,
-    Maximum,
-    fit,
-    invert,
-    plan_sites,
-    synthetic_image,
-    uncertainty,
-)
+from napari_shadowinv import FitOptions, Instrument, InversionOptions, fit, invert, synthetic_image
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv.facts import Verdict
+from napari_shadowinv.inversion import Maximum, plan_sites, uncertainty
 from napari_shadowinv.shot import shots_of
 from reference import toroid_case
 

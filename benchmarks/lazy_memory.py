@@ -23,8 +23,9 @@ import numpy as np
 import psutil
 import tifffile
 
-from napari_shadowinv import InversionOptions, Recipe, RunOptions, read, run_stack
+from napari_shadowinv import InversionOptions, Recipe, read, run_stack
 from napari_shadowinv.io.store import DONE, StackStore
+from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.stack import RunStatus
 from napari_shadowinv.stack._engines import local_client
 from stack import plume, warm_up

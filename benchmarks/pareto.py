@@ -25,8 +25,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv import InversionOptions, invert, plan_sites
+from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.transport.minimise import Solution, TransportObjective
 from napari_shadowinv.transport.solvers import LevelSolution

@@ -19,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from napari_shadowinv import InversionOptions, invert, plan_sites
+from napari_shadowinv import InversionOptions, invert
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.transport.solvers import solve
 from reference import toroid_case

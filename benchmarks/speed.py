@@ -17,9 +17,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from napari_shadowinv import InversionOptions, invert, plan_sites
+from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.transport.minimise import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan

@@ -27,18 +27,10 @@ import numpy as np
 import psutil  # dask needs it, too
 from distributed import Client
 
-from napari_shadowinv import (
-    InversionOptions,
-    Recipe,
-    RunOptions,
-    Shot,
-    run,
-    run_stack,
-    synthetic_image,
-)
+from napari_shadowinv import InversionOptions, Recipe, Shot, run, run_stack, synthetic_image
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.pipeline import Cache
+from napari_shadowinv.pipeline import Cache, RunOptions
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import ShotOutcome, read_shot
 from napari_shadowinv.stack._engines import local_client

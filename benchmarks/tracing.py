@@ -19,8 +19,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv import FieldGrid, ProtonSetup, TraceOptions, trace
+from napari_shadowinv import ProtonSetup, trace
 from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv.physics import FieldGrid, TraceOptions
 from napari_shadowinv.physics.particle_flight import trace_particles
 
 Array = NDArray[np.float64]

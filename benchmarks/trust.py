@@ -56,18 +56,9 @@ from exact_shots import (
     truth_of,
     with_slope,
 )
-from napari_shadowinv import (
-    Fit,
-    Instrument,
-    Inversion,
-    ProtonSetup,
-    analyse,
-    fit,
-    invert,
-    read,
-    uncertainty,
-)
+from napari_shadowinv import Fit, Instrument, Inversion, ProtonSetup, analyse, fit, invert, read
 from napari_shadowinv.analysis import EnclosedCurrent, LineProfile
+from napari_shadowinv.inversion import uncertainty
 from napari_shadowinv.shot import shots_of
 
 SIDE, COUNTS = 96, 1000.0

@@ -19,13 +19,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv import (
-    InversionOptions,
-    invert,
-    plan_sites,
-    synthetic_image,
-    uncertainty,
-)
+from napari_shadowinv import InversionOptions, invert, synthetic_image
+from napari_shadowinv.inversion import plan_sites, uncertainty
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from reference import toroid_case
 

@@ -37,17 +37,11 @@ import numpy as np
 import psutil
 import tifffile
 
-from napari_shadowinv import (
-    InversionOptions,
-    Recipe,
-    RunOptions,
-    WatchOptions,
-    run_stack,
-    watch_stack,
-)
+from napari_shadowinv import InversionOptions, Recipe, run_stack
 from napari_shadowinv.io.store import DONE, SKIPPED, StackStore
+from napari_shadowinv.pipeline import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Bin
-from napari_shadowinv.stack import RunStatus, read_shot
+from napari_shadowinv.stack import RunStatus, read_shot, watch_stack
 from napari_shadowinv.stack._engines import local_client
 from stack import plume, warm_up
 

@@ -23,11 +23,11 @@ from napari_shadowinv import (
     ProtonSetup,
     analyse,
     invert,
-    plan_sites,
     read,
     synthetic_image,
 )
 from napari_shadowinv.analysis.power_spectra import random_displacement, ring_spectrum
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field

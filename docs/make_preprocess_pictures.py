@@ -22,7 +22,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from napari_shadowinv import BeamPrior, invert, read, synthetic_image
+from napari_shadowinv import invert, read, synthetic_image
+from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.preprocessing import (
     butterworth,

@@ -35,7 +35,7 @@ from napari_shadowinv import run_stack, synthetic_image
 from napari_shadowinv._napari.layer_metadata import metadata_for
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
-from napari_shadowinv.physics.projection import project
+from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.preprocessing import Recipe
 
 HERE = Path(__file__).parent / "pictures"
@@ -280,7 +280,7 @@ def fit_window() -> None:
     truth = toroid((96, 96), setup, 90.0, 16e-6).displacement
     for seed, energy in enumerate((14.7, 30.0)):
         film = setup.model_copy(update={"energy": energy})
-        counts = np.random.default_rng(seed).poisson(1000 * project(truth, setup, film))
+        counts = np.random.default_rng(seed).poisson(1000 * predict_image(truth, setup, film))
         name, metadata = f"{energy:g} MeV", metadata_for("shot", "counts", film)
         viewer.add_image(counts.astype(float), name=name, metadata=metadata)
     widget = open_widget(viewer, "Fit several images")

@@ -12,7 +12,8 @@ import numpy as np
 from _drawing import DARK, ORANGE, save, show, tidy
 from matplotlib.figure import Figure
 
-from napari_shadowinv import FieldGrid, ProtonSetup, invert, trace
+from napari_shadowinv import ProtonSetup, invert, trace
+from napari_shadowinv.physics import FieldGrid
 
 SETUP = ProtonSetup(
     energy=14.7, source_object_distance=1e-2, object_image_distance=0.28, pixel_size=5e-6

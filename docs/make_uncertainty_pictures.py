@@ -12,7 +12,8 @@ from _drawing import DARK, ORANGE, FloatArray, save, show, tidy
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from napari_shadowinv import Uncertainty, invert, synthetic_image, uncertainty
+from napari_shadowinv import invert, synthetic_image
+from napari_shadowinv.inversion import Uncertainty, uncertainty
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
 SHAPE = (160, 160)

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from napari_shadowinv import InversionOptions, invert, plan_sites, read
+from napari_shadowinv import InversionOptions, invert, read
+from napari_shadowinv.inversion import plan_sites
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("folder", type=Path, help="folder with the frames and Image_00000.bmp")

@@ -13,7 +13,7 @@ import numpy as np
 from napari.components import ViewerModel
 from npe2 import PluginManager
 
-from napari_shadowinv import InversionOptions, add_inversion, invert
+from napari_shadowinv import InversionOptions, add_to_viewer, invert
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
@@ -28,7 +28,7 @@ inversion = invert(shot, options=InversionOptions(n_sites=2500))
 
 PluginManager.instance().discover()  # a window does this by itself
 viewer = ViewerModel()
-add_inversion(viewer, inversion, setup, name="shot 1")
+add_to_viewer(viewer, inversion, setup, name="shot 1")
 for layer in viewer.layers:
     print(f"{layer.name:48s} {type(layer).__name__:8s} {'shown' if layer.visible else 'hidden'}")
 

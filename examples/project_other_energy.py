@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from napari_shadowinv import ProtonSetup, invert, synthetic_image, write
-from napari_shadowinv.physics import project, toroid
+from napari_shadowinv.physics import predict_image, toroid
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--out", type=Path, default=Path(), help="folder for the results")
@@ -41,8 +41,8 @@ measured = np.random.default_rng(0).poisson(protons * exact_fast)
 
 # %% Its inversion, and what that predicts for 3 MeV
 inversion = invert(measured, source=np.full((side, side), protons))
-predicted = project(inversion.displacement, fast, slow)
-electric = project(inversion.displacement, fast, slow, deflector="electric field")
+predicted = predict_image(inversion.displacement, fast, slow)
+electric = predict_image(inversion.displacement, fast, slow, deflector="electric field")
 
 # %% The exact image at 3 MeV
 exact = synthetic_image(toroid(predicted.shape, slow, **field).displacement)

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from napari_shadowinv import FieldGrid, ProtonSetup, analyse, invert, trace
+from napari_shadowinv import ProtonSetup, analyse, invert, trace
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
+from napari_shadowinv.physics import FieldGrid
 from napari_shadowinv.physics.poisson import potential_from_displacement
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

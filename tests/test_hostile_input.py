@@ -31,19 +31,17 @@ from napari_shadowinv import (
     fit,
     invert,
     invert_stack,
-    plan_sites,
     poisson_invert,
     read,
     run,
     run_stack,
     synthetic_image,
-    uncertainty,
     write,
 )
 from napari_shadowinv._system.safety import LIMIT_VARIABLE, check_regular, resolved_path
 from napari_shadowinv.cli._export import _escape_cell
 from napari_shadowinv.film import Calibration, Pack, usable_pixels
-from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion import Inversion, plan_sites, uncertainty
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_toml
 from napari_shadowinv.io.files import sha256

@@ -13,15 +13,7 @@ import numpy as np
 import pytest
 
 from helpers.command_line import flat, shadowinv
-from napari_shadowinv import (
-    InputError,
-    ProtonSetup,
-    fit,
-    invert,
-    project,
-    run_stack,
-    stack_statistics,
-)
+from napari_shadowinv import InputError, ProtonSetup, fit, invert, predict_image, run_stack
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.io import read, read_radiograph, write
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
@@ -33,6 +25,7 @@ from napari_shadowinv.pipeline.fit_run import compared_fields, refinement_choice
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot, shots_of
+from napari_shadowinv.stack import stack_statistics
 
 SHAPE = (40, 44)
 RATIO = (8 / 12) ** 2
@@ -92,10 +85,10 @@ def test_inversion_of_a_new_kind_has_its_fields(setups, images, tmp_path):
 
 def test_projection_scales_with_the_wavelength_squared(setups):
     displacement = gaussian_blob(SHAPE, 12.0, 6.0).displacement
-    image = project(displacement, *setups, deflector="electron density")
+    image = predict_image(displacement, *setups, deflector="electron density")
     np.testing.assert_allclose(image, synthetic_image(RATIO * displacement))
     with pytest.raises(InputError, match="expected 'electron density'"):
-        project(displacement, *setups, deflector="magnetic field")
+        predict_image(displacement, *setups, deflector="magnetic field")
 
 
 def test_refinement_fits_the_field_of_a_new_kind(setups, images):

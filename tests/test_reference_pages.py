@@ -34,4 +34,4 @@ def test_api_page_lists_names_below_their_tasks(pages: Any) -> None:
     text = pages.api_page()
     section = text.split("### Invert many shots\n")[1].split("###")[0]
     assert "run_stack" in section
-    assert "add_inversion" not in section
+    assert "add_to_viewer" not in section

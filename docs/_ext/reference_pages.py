@@ -28,60 +28,36 @@ FOLDER = Path(__file__).parents[1] / "reference"
 _SHAPES: dict[Any, str] = {Path: "PATH", int: "INTEGER", float: "NUMBER", str: "TEXT"}
 
 TASKS: dict[str, tuple[str, ...]] = {
-    "Invert one image": (
-        "invert",
-        "InversionOptions",
-        "Inversion",
-        "Report",
-        "Caution",
-        "plan_sites",
-    ),
+    "Invert one image": ("invert", "InversionOptions", "Inversion"),
     "Apply a recipe to a file": ("read", "Shot", "Recipe", "run", "write"),
-    "Repeat a result from its provenance": ("rerun", "Rerun"),
-    "Describe the experiment, for SI units": ("ProtonSetup", "OpticalSetup"),
-    "Estimate the error of a field": (
+    "Repeat a result from its provenance": ("rerun",),
+    "Describe the experiment, for SI units and errors": (
+        "ProtonSetup",
+        "OpticalSetup",
         "Instrument",
-        "BeamPrior",
-        "uncertainty",
-        "Uncertainty",
-        "Maximum",
     ),
     "Measure currents, profiles and maps of a result": ("analyse",),
     "Fit one or several images, also where rays cross": ("fit", "FitOptions", "Fit"),
-    "Invert many shots": (
-        "run_stack",
-        "RunOptions",
-        "watch_stack",
-        "WatchOptions",
-        "invert_stack",
-        "stack_statistics",
-    ),
+    "Invert many shots": ("run_stack", "invert_stack"),
     "Predict an image, or compare with linear theory": (
         "synthetic_image",
-        "project",
-        "project_potential",
+        "predict_image",
         "poisson_invert",
     ),
-    "Trace particles through a 3-D field": (
-        "trace",
-        "TraceOptions",
-        "TracedImage",
-        "FieldGrid",
-    ),
-    "Show a result in napari": ("add_inversion",),
-    "Follow progress, cancel, handle errors": (
-        "Progress",
-        "InversionCancelled",
-        "InputError",
-        "FileFormatError",
-    ),
+    "Plan an experiment": ("plan_experiment",),
+    "Trace particles through a 3-D field": ("trace",),
+    "Show a result in napari": ("add_to_viewer",),
+    "Handle errors": ("InputError", "FileFormatError"),
 }
-
 MODULES = {
+    "inversion": "Inversions, their sites and errors",
+    "options": "Options, and how well the instrument is known",
     "analysis": "Products of a result",
     "preprocessing": "Recipes, steps, filters and source estimates",
     "film": "Films, CR-39 and image plates",
     "pipeline": "From a recipe and a shot to a result",
+    "stack": "Many shots",
+    "physics": "Setups, images and traced particles",
     "physics.phantoms": "Test objects",
     "io": "Files",
 }
@@ -115,9 +91,10 @@ def write_pages(app: Sphinx, config: Config) -> None:
 
 
 def parameters_page() -> str:
-    from napari_shadowinv import FitOptions, InversionOptions, RunOptions, WatchOptions
+    from napari_shadowinv import FitOptions, InversionOptions
     from napari_shadowinv.options import FitChoices
     from napari_shadowinv.physics.setup import SETUPS
+    from napari_shadowinv.pipeline import RunOptions, WatchOptions
     from napari_shadowinv.preprocessing import ESTIMATES, STEPS, MeasuredSource
 
     sources = [MeasuredSource, *ESTIMATES.values()]
@@ -145,11 +122,11 @@ def parameters_page() -> str:
         table_of(InversionOptions.model_fields),
         "## Run options",
         "Of many shots; flags of `shadowinv batch`, in Python the arguments of "
-        "{py:class}`~napari_shadowinv.RunOptions`. See [](../batch.md).",
+        "{py:class}`~napari_shadowinv.pipeline.RunOptions`. See [](../batch.md).",
         table_of(RunOptions.model_fields),
         "## Watch options",
         "Of a watched folder; flags of `shadowinv watch`, in Python the arguments of "
-        "{py:class}`~napari_shadowinv.WatchOptions`.",
+        "{py:class}`~napari_shadowinv.pipeline.WatchOptions`.",
         table_of(WatchOptions.model_fields),
         "## Fit choices",
         "What a fit finds and what is known. In a recipe `[fit]`; on the command line flags of "

@@ -19,14 +19,14 @@ from napari_shadowinv import (
     InversionOptions,
     OpticalSetup,
     Recipe,
-    RunOptions,
     invert_stack,
     read,
     run_stack,
-    stack_statistics,
     synthetic_image,
 )
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.pipeline import RunOptions
+from napari_shadowinv.stack import stack_statistics
 
 # %% [markdown]
 # ## The shots

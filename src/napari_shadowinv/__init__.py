@@ -1,26 +1,20 @@
 """Shadowgrams and proton radiographs to deflection potentials and line-integrated fields.
 
 - invert an image: `invert`, with `InversionOptions`; the answer is an `Inversion`
-- how well beam, detector and alignment are known, for its errors: `Instrument`, `BeamPrior`
-- share sites between shots with one source: `plan_sites`
-- how far the image's noise moves its field: `uncertainty`
-- currents, fluxes, profiles and maps of a result, with their bands: `analyse`; all products are in
-  `napari_shadowinv.analysis`
+- how well beam, detector and alignment are known, for its errors: `Instrument`
+- currents, fluxes, profiles and maps of a result, with their bands: `analyse`
 - an image and all that is known of it: `Shot`
-- several images of one object, folds, an unknown beam: `fit`, with `FitOptions`;
-  the answer is a `Fit` with a verdict
+- several images of one object, folds, an unknown beam: `fit`, with `FitOptions`; the answer is a
+  `Fit` with a verdict
 - deflections in SI units: `ProtonSetup`, `OpticalSetup`
-- many shots, with dask: `invert_stack`, `run_stack`, `stack_statistics`; as they arrive in a
-  folder: `watch_stack`
-- everything that is done to a shot, as one model: `Recipe`; apply it: `run`; its parts, and
-  further filters of images and estimates of beams: `napari_shadowinv.preprocessing`
-- repeat a result from its provenance: `rerun`; the answer is a `Rerun`
-- predict an image, or invert it linearly: `synthetic_image`, `poisson_invert`
-- trace particles through a 3-D field: `trace`, with `TraceOptions`, of a `FieldGrid`; the answer
-  is a `TracedImage`
-- predict the image of the same object in another experiment: `project`, `project_potential`
+- everything that is done to a shot, as one model: `Recipe`; apply it: `run`; to many shots, with
+  dask: `run_stack`, `invert_stack`
+- repeat a result from its provenance: `rerun`
+- predict an image: `synthetic_image`; in another experiment: `predict_image`; invert it linearly:
+  `poisson_invert`; trace particles through a 3-D field: `trace`
+- find out what an experiment would tell: `plan_experiment`
 - read and write files: `read`, `write`
-- show a result in a napari viewer: `add_inversion`
+- show a result in a napari viewer: `add_to_viewer`
 
 Arrays are ``[y, x]``, vectors in axis order (y, x), a pixel's centre is at its integer
 index, and lengths are object-plane pixels unless a setup makes them SI.

@@ -9,7 +9,7 @@ import pytest
 
 from helpers.exact_fields import SETUP
 from helpers.turbulence import solenoidal_field
-from napari_shadowinv import InversionCancelled, OpticalSetup, invert, synthetic_image
+from napari_shadowinv import OpticalSetup, invert, synthetic_image
 from napari_shadowinv._system.progress import Progress, Reporter
 from napari_shadowinv.analysis import TurbulenceSpectrum, analyse
 from napari_shadowinv.analysis.power_spectra import (
@@ -19,7 +19,7 @@ from napari_shadowinv.analysis.power_spectra import (
     ring_spectrum,
     window_weights,
 )
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.options import Instrument

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from napari_shadowinv import InversionCancelled
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.fitting import _ray_kernels, compilation, fit
 from napari_shadowinv.fitting.compilation import ensure_compiled, is_compiled
 from napari_shadowinv.options import FitOptions

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.fit_images import bump, counted, distance, fit_images, noisy, on_pixels
-from napari_shadowinv import BeamPrior, Instrument, ProtonSetup
+from napari_shadowinv import Instrument, ProtonSetup
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit
@@ -26,7 +26,7 @@ from napari_shadowinv.fitting.instrument import (
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.fitting.posterior import Posterior
 from napari_shadowinv.inversion.imperfections import SmoothField
-from napari_shadowinv.options import FitOptions
+from napari_shadowinv.options import BeamPrior, FitOptions
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.shot import shots_of
 

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from napari_shadowinv import InversionOptions, Recipe, RunOptions, synthetic_image
+from napari_shadowinv import InversionOptions, Recipe, synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.pipeline import RunOptions
 
 SHAPE = (24, 28)
 OPTIONS = InversionOptions(n_sites=100)

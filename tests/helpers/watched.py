@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from helpers.night import OPTIONS, grouped, make_shots
-from napari_shadowinv import WatchOptions, watch_stack
-from napari_shadowinv.stack import RunStatus
+from napari_shadowinv.pipeline import WatchOptions
+from napari_shadowinv.stack import RunStatus, watch_stack
 
 IMAGES, SOURCE = make_shots(6)
 SETTLE = 0.1

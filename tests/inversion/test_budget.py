@@ -13,24 +13,22 @@ import pytest
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from napari_shadowinv import (
-    BeamPrior,
     InputError,
     Instrument,
     InversionOptions,
     ProtonSetup,
     invert,
-    plan_sites,
     synthetic_image,
 )
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.budget import Budget, discretisation_share
 from napari_shadowinv.inversion.error_budget import ErrorEstimate
 from napari_shadowinv.inversion.imperfections import motions
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import LinearResponse
-from napari_shadowinv.options import ASSUMED_BEAM
+from napari_shadowinv.options import ASSUMED_BEAM, BeamPrior
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.pipeline import run
 from napari_shadowinv.preprocessing import (

@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from napari_shadowinv import InversionCancelled, invert
+from napari_shadowinv import invert
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry import flips
 from napari_shadowinv.inversion import compilation, machine_code
 from napari_shadowinv.inversion.compilation import ensure_compiled

@@ -11,19 +11,17 @@ from scipy import ndimage
 
 from napari_shadowinv import (
     InputError,
-    InversionCancelled,
     InversionOptions,
     OpticalSetup,
     ProtonSetup,
     invert,
-    plan_sites,
     read,
     synthetic_image,
-    uncertainty,
     write,
 )
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry.interpolation import WIDTH
-from napari_shadowinv.inversion import Inversion, error_bars, samples
+from napari_shadowinv.inversion import Inversion, error_bars, plan_sites, samples, uncertainty
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.poisson import border_mean
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from napari_shadowinv import InputError, InversionOptions, invert, plan_sites, synthetic_image
+from napari_shadowinv import InputError, InversionOptions, invert, synthetic_image
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.error_bars import uncertainty
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.transport.sites import Margin, edge_flux

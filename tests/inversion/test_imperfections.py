@@ -4,16 +4,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, shift, zoom
 
-from napari_shadowinv import (
-    BeamPrior,
-    InputError,
-    Instrument,
-    InversionOptions,
-    OpticalSetup,
-    invert,
-    plan_sites,
-)
+from napari_shadowinv import InputError, Instrument, InversionOptions, OpticalSetup, invert
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
+from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 

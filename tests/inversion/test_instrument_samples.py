@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from napari_shadowinv import (
-    BeamPrior,
-    InputError,
-    Instrument,
-    InversionOptions,
-    Maximum,
-    invert,
-    plan_sites,
-    synthetic_image,
-    uncertainty,
-)
+from napari_shadowinv import InputError, Instrument, InversionOptions, invert, synthetic_image
+from napari_shadowinv.inversion import Maximum, plan_sites, uncertainty
 from napari_shadowinv.inversion import samples as sampling
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.imperfections import (
@@ -26,6 +17,7 @@ from napari_shadowinv.inversion.imperfections import (
     Scene,
     SmoothField,
 )
+from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
 SHAPE = (48, 56)

@@ -9,16 +9,10 @@ import pytest
 
 from helpers.public_data import load_donut
 from helpers.toroid import noisy_toroid_image, toroid_displacement, toroid_image
-from napari_shadowinv import (
-    InputError,
-    InversionCancelled,
-    InversionOptions,
-    invert,
-    plan_sites,
-    read,
-    synthetic_image,
-)
+from napari_shadowinv import InputError, InversionOptions, invert, read, synthetic_image
 from napari_shadowinv.cautions import CAUTION_CODES, Caution
+from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob
 

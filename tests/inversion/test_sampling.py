@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from napari_shadowinv import InversionOptions, invert, plan_sites, synthetic_image, uncertainty
+from napari_shadowinv import InversionOptions, invert, synthetic_image
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH, CloughTocher, with_gradients
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.inversion import plan_sites, uncertainty
 from napari_shadowinv.inversion import samples as sampling
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import read_dual

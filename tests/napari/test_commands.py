@@ -14,7 +14,7 @@ from napari_shadowinv import (
     InversionOptions,
     ProtonSetup,
     Shot,
-    add_inversion,
+    add_to_viewer,
     fit,
     invert,
 )
@@ -118,7 +118,7 @@ def test_an_inversion_is_refined_from_any_of_its_layers(
     viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
 ) -> None:
     inversion = invert(shot, options=InversionOptions(n_sites=500))
-    layers = add_inversion(viewer, inversion, proton_setup, name="shot", translate=(30.0, 60.0))
+    layers = add_to_viewer(viewer, inversion, proton_setup, name="shot", translate=(30.0, 60.0))
     arrows = next(layer for layer in layers if role_of(layer) == "arrows")
     by_role = {
         role_of(entries): (data, entries) for data, entries, _ in commands.refine(arrows, viewer)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
-from napari_shadowinv import OpticalSetup, ProtonSetup, add_inversion
+from napari_shadowinv import OpticalSetup, ProtonSetup, add_to_viewer
 from napari_shadowinv._napari.layer_metadata import (
     frame_for,
     place_image,
@@ -32,7 +32,7 @@ def by_role(layers: list[Any]) -> dict[str, Any]:
 def test_result_shows_its_main_layers(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved, proton_setup, name="shot 7"))
+    layers = by_role(add_to_viewer(viewer, solved, proton_setup, name="shot 7"))
     assert list(layers) == ["residual", "field", "caustic", "arrows"]
     assert {role for role, layer in layers.items() if layer.visible} == {"field", "arrows"}
 
@@ -40,7 +40,7 @@ def test_result_shows_its_main_layers(
 def test_all_of_a_result_is_there_on_request(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved, proton_setup, name="shot 7", all_layers=True))
+    layers = by_role(add_to_viewer(viewer, solved, proton_setup, name="shot 7", all_layers=True))
     assert list(layers) == [
         "image", "reprojection", "residual", "potential", "field y", "field x", "field",
         "caustic", "field arrows", "arrows", "sites",
@@ -55,7 +55,7 @@ def test_all_of_a_result_is_there_on_request(
 def test_values_are_those_of_the_result_in_the_unit_that_the_layer_names(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved, proton_setup, all_layers=True))
+    layers = by_role(add_to_viewer(viewer, solved, proton_setup, all_layers=True))
     field = proton_setup.path_integrated_b(solved.displacement)
     factor = {"mT·m": 1e3, "µT·m": 1e6, "T·m": 1.0}[unit_of(layers["field"])]
     np.testing.assert_allclose(layers["field"].data, factor * np.hypot(*field))
@@ -76,7 +76,7 @@ def test_values_are_those_of_the_result_in_the_unit_that_the_layer_names(
 def test_light_shows_the_deflection_angle(
     viewer: ViewerModel, solved: Inversion, optical_setup: OpticalSetup
 ) -> None:
-    field = by_role(add_inversion(viewer, solved, optical_setup))["field"]
+    field = by_role(add_to_viewer(viewer, solved, optical_setup))["field"]
     factor = {"mrad": 1e3, "µrad": 1e6}[unit_of(field)]
     angle = np.hypot(*optical_setup.deflection_angle(solved.displacement))
     np.testing.assert_allclose(field.data, factor * angle)
@@ -85,7 +85,7 @@ def test_light_shows_the_deflection_angle(
 def test_signed_layers_have_symmetric_limits_and_a_white_middle(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved, all_layers=True))
+    layers = by_role(add_to_viewer(viewer, solved, all_layers=True))
     for role in ("residual", "field y", "field x"):
         low, high = layers[role].contrast_limits
         assert low == -high
@@ -97,7 +97,7 @@ def test_signed_layers_have_symmetric_limits_and_a_white_middle(
 def test_pixels_are_lengths_at_the_object(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    for layer in add_inversion(viewer, solved, proton_setup):
+    for layer in add_to_viewer(viewer, solved, proton_setup):
         np.testing.assert_allclose(layer.scale, 1.5)
         assert {str(unit) for unit in layer.units} == {"micrometer"}
         assert layer.axis_labels == ("y", "x")
@@ -111,7 +111,7 @@ def test_pixels_are_lengths_at_the_object(
 
 
 def test_without_a_setup_lengths_are_pixels(viewer: ViewerModel, solved: Inversion) -> None:
-    for layer in add_inversion(viewer, solved):
+    for layer in add_to_viewer(viewer, solved):
         assert {str(unit) for unit in layer.units} == {"pixel"}
         np.testing.assert_array_equal(layer.scale, 1)
 
@@ -144,7 +144,7 @@ def test_place_gives_a_stack_the_pixels_of_a_setup(
 def test_arrows_are_true_displacements_on_a_grid_that_can_be_read(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
-    arrows = by_role(add_inversion(viewer, solved))["arrows"]
+    arrows = by_role(add_to_viewer(viewer, solved))["arrows"]
     starts, steps = arrows.data[:, 0].astype(int), arrows.data[:, 1]
     np.testing.assert_array_equal(steps, solved.displacement[:, starts[:, 0], starts[:, 1]].T)
     # Drawn, nearly all keep to their own place, and the longest reach to the next but one.
@@ -172,7 +172,7 @@ def test_no_field_makes_no_arrow(viewer: ViewerModel, solved: Inversion) -> None
         residual=np.zeros_like(solved.residual),
         site_displacement=np.zeros_like(solved.site_displacement),
     )
-    layers = by_role(add_inversion(viewer, still))
+    layers = by_role(add_to_viewer(viewer, still))
     assert len(layers["arrows"].data) == 0
     assert layers["field"].contrast_limits == [0, 1]
 
@@ -180,7 +180,7 @@ def test_no_field_makes_no_arrow(viewer: ViewerModel, solved: Inversion) -> None
 def test_features_of_the_sites_agree_with_the_report(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
-    sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
+    sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
     features = sites.features
     assert list(features) == ["weight", "mass", "displacement", "flux residual"]
     np.testing.assert_array_equal(features["weight"], solved.weights)
@@ -191,7 +191,7 @@ def test_features_of_the_sites_agree_with_the_report(
 
 
 def test_sites_are_coloured_by_displacement(viewer: ViewerModel, solved: Inversion) -> None:
-    sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
+    sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
     order = np.argsort(sites.features["displacement"])
     brightness = sites.face_color[order][:, :3].sum(axis=1)
     assert brightness[-1] > brightness[0] + 1
@@ -201,7 +201,7 @@ def test_many_sites_are_thinned_and_the_name_says_so(
     viewer: ViewerModel, solved: Inversion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("napari_shadowinv._napari.layers._MAX_SHOWN_SITES", 200)
-    sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
+    sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
     np.testing.assert_array_equal(sites.data, solved.sites[::3])
     assert sites.name == "✓ sites (1 in 3)"
     np.testing.assert_array_equal(sites.features["weight"], solved.weights[::3])
@@ -210,7 +210,7 @@ def test_many_sites_are_thinned_and_the_name_says_so(
 def test_each_layer_knows_the_whole_result(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    for layer in add_inversion(viewer, solved, proton_setup, attributes={"setup_origin": "typed"}):
+    for layer in add_to_viewer(viewer, solved, proton_setup, attributes={"setup_origin": "typed"}):
         result = result_of(layer)
         assert result is not None
         assert result.content is solved
@@ -241,7 +241,7 @@ def large(make_inversion: Callable[..., Inversion]) -> Inversion:
 
 
 def test_layers_share_the_arrays_of_a_large_result(large: Inversion) -> None:
-    added = add_inversion(ViewerModel(), large, all_layers=True)
+    added = add_to_viewer(ViewerModel(), large, all_layers=True)
     layers = {role_of(layer): layer for layer in added}
     assert np.shares_memory(layers["reprojection"].data, large.reprojection)
     assert np.shares_memory(layers["sites"].data, large.sites)
@@ -341,7 +341,7 @@ def test_structures_of_an_inversion_are_outlined_on_its_significance(
 ) -> None:
     std = np.full_like(solved.displacement, 0.05)
     certain = replace(solved, pixel_errors=PixelErrors(std, ("noise",)))
-    layers = by_role(add_inversion(viewer, certain, all_layers=True))
+    layers = by_role(add_to_viewer(viewer, certain, all_layers=True))
     expected = np.hypot(*solved.displacement) / 0.05
     np.testing.assert_allclose(layers["significance"].data, expected)
     structures = layers["structures"]
@@ -352,4 +352,4 @@ def test_structures_of_an_inversion_are_outlined_on_its_significance(
         around = regions.labels[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
         assert structures.data[row, column] == regions.labels[row, column]
         assert (around == 0).any()
-    assert not {"significance", "structures"} & set(by_role(add_inversion(viewer, certain)))
+    assert not {"significance", "structures"} & set(by_role(add_to_viewer(viewer, certain)))

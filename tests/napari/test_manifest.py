@@ -127,7 +127,7 @@ from napari_shadowinv.cli import app
 answer = CliRunner().invoke(app, ["info", "blank.shadowinv"])
 assert answer.exit_code == 0, answer.output
 try:
-    nsi.add_inversion(object(), inversion)
+    nsi.add_to_viewer(object(), inversion)
 except ModuleNotFoundError as error:
     print(error.name)
 """
@@ -140,7 +140,7 @@ def test_the_public_function_does_not_import_napari(alone: Any) -> None:
         """
 import sys
 import napari_shadowinv
-napari_shadowinv.add_inversion
+napari_shadowinv.add_to_viewer
 print([m for m in sys.modules if m in ("napari", "qtpy", "dask")])
 """
     )

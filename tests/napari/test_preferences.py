@@ -9,7 +9,7 @@ import pytest
 from napari.components import ViewerModel
 from napari.layers import Image
 
-from napari_shadowinv import ProtonSetup, add_inversion, invert
+from napari_shadowinv import ProtonSetup, add_to_viewer, invert
 from napari_shadowinv._napari import preferences as about
 from napari_shadowinv._napari.layer_metadata import frame_for, role_of
 from napari_shadowinv._napari.samples import toroid
@@ -40,10 +40,10 @@ def test_napari_has_every_colour_map_on_offer(configurations: dict[str, Any]) ->
 def test_new_layers_have_the_preferred_colours(
     viewer: ViewerModel, solved: Inversion, preferences: Any
 ) -> None:
-    add_inversion(viewer, solved, all_layers=True)
+    add_to_viewer(viewer, solved, all_layers=True)
     colours = preferences.colour_maps
     colours.field, colours.signed, colours.image = "viridis", "PiYG", "gray_r"
-    layers = add_inversion(viewer, solved, all_layers=True)
+    layers = add_to_viewer(viewer, solved, all_layers=True)
     names = {role_of(layer): layer.colormap.name for layer in layers if isinstance(layer, Image)}
     assert names["field"] == "viridis"
     assert names["residual"] == names["field y"] == "PiYG"
@@ -71,7 +71,7 @@ def test_a_unit_that_napari_must_know(
     viewer: ViewerModel, preferences: Any, proton_setup: ProtonSetup, solved: Inversion
 ) -> None:
     preferences.units.length = "mm"
-    (field, *_) = add_inversion(viewer, solved, proton_setup)
+    (field, *_) = add_to_viewer(viewer, solved, proton_setup)
     assert {str(unit) for unit in field.units} == {"millimeter"}
     assert field.scale == pytest.approx([1.5e-3, 1.5e-3])
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from napari.components import ViewerModel
 
-from napari_shadowinv import ProtonSetup, add_inversion
+from napari_shadowinv import ProtonSetup, add_to_viewer
 from napari_shadowinv._napari.layer_metadata import frame_of, metadata_for, role_of
 from napari_shadowinv.inversion import Inversion
 
@@ -26,8 +26,8 @@ def bars(viewer: ViewerModel) -> list[str]:
 def test_only_the_image_that_is_seen_has_a_colour_bar(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
-    add_inversion(viewer, solved, name="a")
-    add_inversion(viewer, solved, name="b")
+    add_to_viewer(viewer, solved, name="a")
+    add_to_viewer(viewer, solved, name="b")
     layers = viewer.layers
     assert bars(viewer) == ["✓ |d| (px) – b"]
     layers["✓ |d| (px) – b"].visible = False
@@ -48,7 +48,7 @@ def test_only_the_image_that_is_seen_has_a_colour_bar(
 def test_a_colour_bar_that_was_switched_off_stays_off(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
-    add_inversion(viewer, solved, name="a")
+    add_to_viewer(viewer, solved, name="a")
     viewer.layers["✓ |d| (px) – a"].colorbar.visible = False
     viewer.layers["✓ |d| (px) – a"].visible = False
     viewer.layers["✓ residual (% of mean) – a"].visible = True
@@ -58,8 +58,8 @@ def test_a_colour_bar_that_was_switched_off_stays_off(
 def test_a_long_name_is_smaller_beside_the_colour_bar(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
-    add_inversion(viewer, solved, name="a")
-    add_inversion(viewer, solved, name=80 * "b")
+    add_to_viewer(viewer, solved, name="a")
+    add_to_viewer(viewer, solved, name=80 * "b")
     short, long = (viewer.layers[f"✓ |d| (px) – {name}"] for name in ("a", 80 * "b"))
     long.visible = False
     sizes = [layer.name_overlay.font_size for layer in (short, long)]
@@ -70,7 +70,7 @@ def test_an_image_of_the_same_size_lies_on_the_result(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str],
     tmp_path: Path,
 ) -> None:  # fmt: skip
-    layers = add_inversion(viewer, solved, proton_setup, name="a", translate=(3.0, 4.0))
+    layers = add_to_viewer(viewer, solved, proton_setup, name="a", translate=(3.0, 4.0))
     frame = frame_of(next(layer for layer in layers if role_of(layer) == "field"))
     for data in (np.ones((40, 52)), np.ones((5, 40, 52)), np.ones((40, 52), np.uint8)):
         messages.clear()
@@ -88,7 +88,7 @@ def test_an_image_of_the_same_size_lies_on_the_result(
 def test_an_image_of_another_size_is_told_how_to_get_a_scale(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str]
 ) -> None:
-    add_inversion(viewer, solved, proton_setup, name="a")
+    add_to_viewer(viewer, solved, proton_setup, name="a")
     image = viewer.add_image(np.ones((30, 52)), name="other")
     assert tuple(image.scale) == (1, 1)
     assert "'other' is in pixels, the results are in µm" in messages[-1]
@@ -99,9 +99,9 @@ def test_what_has_a_place_keeps_it(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str]
 ) -> None:
     viewer.add_image(np.ones((40, 52)))
-    add_inversion(viewer, solved, name="in pixels")
+    add_to_viewer(viewer, solved, name="in pixels")
     first = viewer.add_image(np.ones((40, 52)))
-    add_inversion(viewer, solved, proton_setup, name="a")
+    add_to_viewer(viewer, solved, proton_setup, name="a")
     messages.clear()
     with_scale = viewer.add_image(np.ones((40, 52)), scale=(2, 2), units=("um", "um"))
     of_plugin = viewer.add_image(np.ones((40, 52)), metadata=metadata_for("image", ""))

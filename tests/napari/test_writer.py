@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
-from napari_shadowinv import FileFormatError, ProtonSetup, add_inversion, read
+from napari_shadowinv import FileFormatError, ProtonSetup, add_to_viewer, read
 from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, role_of
 from napari_shadowinv._napari.result_files import write_result
 from napari_shadowinv.inversion import Inversion
@@ -71,7 +71,7 @@ def test_all_layers_come_back_as_they_were(
     proton_setup: ProtonSetup,
     tmp_path: Path,
 ) -> None:
-    before = add_inversion(viewer, solved, proton_setup, name="shot 7", all_layers=True)
+    before = add_to_viewer(viewer, solved, proton_setup, name="shot 7", all_layers=True)
     layers = by_role(before)
     layers["residual"].visible = True
     layers["field"].colormap = "magma"
@@ -92,7 +92,7 @@ def test_all_layers_come_back_as_they_were(
 def test_nothing_of_the_result_is_lost(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
 ) -> None:
-    add_inversion(viewer, solved, proton_setup, attributes={"setup_origin": "typed"})
+    add_to_viewer(viewer, solved, proton_setup, attributes={"setup_origin": "typed"})
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     dataset = read(tmp_path / "a.shadowinv")
     expected = solved.to_dataset(proton_setup)
@@ -106,7 +106,7 @@ def test_nothing_of_the_result_is_lost(
 def test_one_saved_layer_stands_for_the_main_ones(
     viewer: ViewerModel, other_viewer: ViewerModel, solved: Inversion, tmp_path: Path
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved, name="shot", all_layers=True))
+    layers = by_role(add_to_viewer(viewer, solved, name="shot", all_layers=True))
     layers["potential"].visible = True
     viewer.layers.selection = {layers["potential"]}
     viewer.layers.save(str(tmp_path / "a.shadowinv"), selected=True, plugin=PLUGIN)
@@ -121,7 +121,7 @@ def test_a_place_that_no_setup_tells_comes_back(
     viewer: ViewerModel, other_viewer: ViewerModel, solved: Inversion, tmp_path: Path
 ) -> None:
     place = {"scale": (3.0, 3.0), "translate": (7.5, 9.0), "units": ("mm", "mm")}
-    before = add_inversion(viewer, solved, **place, all_layers=True)
+    before = add_to_viewer(viewer, solved, **place, all_layers=True)
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     after = other_viewer.open(tmp_path / "a.shadowinv", plugin=PLUGIN)
     for layer, two in zip(before, after, strict=True):
@@ -129,7 +129,7 @@ def test_a_place_that_no_setup_tells_comes_back(
 
 
 def test_painted_caustics_are_kept(viewer: ViewerModel, solved: Inversion, tmp_path: Path) -> None:
-    caustics = by_role(add_inversion(viewer, solved))["caustic"]
+    caustics = by_role(add_to_viewer(viewer, solved))["caustic"]
     caustics.data[:5, :6] = 1
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     caustic = read(tmp_path / "a.shadowinv")["caustic"].values
@@ -140,7 +140,7 @@ def test_painted_caustics_are_kept(viewer: ViewerModel, solved: Inversion, tmp_p
 def test_a_layer_that_was_changed_is_named(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path, messages: list[str]
 ) -> None:
-    layers = by_role(add_inversion(viewer, solved, all_layers=True))
+    layers = by_role(add_to_viewer(viewer, solved, all_layers=True))
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     assert messages == []
     layers["potential"].data = layers["potential"].data + 1
@@ -152,14 +152,14 @@ def test_a_layer_that_was_changed_is_named(
 def test_pradformat_has_the_potential(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
 ) -> None:
-    add_inversion(viewer, solved, proton_setup)
+    add_to_viewer(viewer, solved, proton_setup)
     assert viewer.layers.save(str(tmp_path / "a.h5"), plugin=PLUGIN) == [str(tmp_path / "a.h5")]
     potential = read(tmp_path / "a.h5")["potential"]
     np.testing.assert_allclose(potential, solved.potential, rtol=1e-9, atol=1e-12)
 
 
 def test_pradformat_needs_protons(viewer: ViewerModel, solved: Inversion, tmp_path: Path) -> None:
-    add_inversion(viewer, solved)
+    add_to_viewer(viewer, solved)
     with pytest.raises(FileFormatError, match="needs a setup of kind 'proton', received none"):
         viewer.layers.save(str(tmp_path / "a.h5"), plugin=PLUGIN)
     assert not list(tmp_path.iterdir())
@@ -168,7 +168,7 @@ def test_pradformat_needs_protons(viewer: ViewerModel, solved: Inversion, tmp_pa
 def test_sites_are_written_with_all_that_is_known(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path
 ) -> None:
-    sites = by_role(add_inversion(viewer, solved, all_layers=True))["sites"]
+    sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
     viewer.layers.selection = {sites}
     viewer.layers.save(str(tmp_path / "a.csv"), selected=True, plugin=PLUGIN)
     rows = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
@@ -183,7 +183,7 @@ def test_a_field_of_other_origin_can_be_kept_as_a_result(
     proton_setup: ProtonSetup,
     tmp_path: Path,
 ) -> None:
-    add_inversion(viewer, solved, proton_setup)
+    add_to_viewer(viewer, solved, proton_setup)
     viewer.layers.save(str(tmp_path / "a.h5"), plugin=PLUGIN)
     viewer.layers.clear()
     before = viewer.open(tmp_path / "a.h5", plugin=PLUGIN)
@@ -199,8 +199,8 @@ def test_layers_of_two_results_are_refused(
     make_inversion: Callable[..., Inversion],
     tmp_path: Path,
 ) -> None:
-    add_inversion(viewer, solved, name="one")
-    add_inversion(viewer, make_inversion((24, 32)), name="two")
+    add_to_viewer(viewer, solved, name="one")
+    add_to_viewer(viewer, make_inversion((24, 32)), name="two")
     with pytest.raises(
         FileFormatError, match=r"the layers belong to 2 results .*select layers of one"
     ):
@@ -226,7 +226,7 @@ def described_layers(viewer: ViewerModel) -> list[Any]:
 def test_an_ending_is_added_but_never_onto_an_existing_file(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path
 ) -> None:
-    add_inversion(viewer, solved)
+    add_to_viewer(viewer, solved)
     target = tmp_path / "shot.07"
     assert write_result(str(target), described_layers(viewer)) == [f"{target}.shadowinv"]
     # The dialog asked about "shot.07", not about this.
@@ -237,7 +237,7 @@ def test_an_ending_is_added_but_never_onto_an_existing_file(
 def test_a_failed_write_leaves_the_old_file_whole(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add_inversion(viewer, solved)
+    add_to_viewer(viewer, solved)
     target = tmp_path / "a.shadowinv"
     viewer.layers.save(str(target), plugin=PLUGIN)
     before = target.read_bytes()
@@ -260,7 +260,7 @@ def test_a_duplicated_layer_still_belongs_to_the_result(
 
     from napari.layers import Layer
 
-    (layer, *_) = add_inversion(viewer, solved)
+    (layer, *_) = add_to_viewer(viewer, solved)
     data, keywords, kind = layer.as_layer_data_tuple()
     twin = Layer.create(deepcopy(data), keywords, kind)
     assert result_of(twin) is result_of(layer)

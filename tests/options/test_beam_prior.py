@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv import BeamPrior, InputError, Instrument, InversionOptions, invert
+from napari_shadowinv import InputError, Instrument, InversionOptions, invert
+from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from napari_shadowinv import BeamPrior, InputError, Instrument, Recipe
+from napari_shadowinv import InputError, Instrument, Recipe
 from napari_shadowinv.cli._flags import _option_flags, recipe_of
-from napari_shadowinv.options import BEAM_SOURCES, DETECTORS
+from napari_shadowinv.options import BEAM_SOURCES, DETECTORS, BeamPrior
 from napari_shadowinv.pipeline import read_recipe, write_recipe
 
 

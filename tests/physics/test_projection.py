@@ -11,7 +11,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
 from napari_shadowinv.physics.projection import (
-    project,
+    predict_image,
     project_potential,
     transferred_displacement,
 )
@@ -47,7 +47,7 @@ def test_in_its_own_experiment_nothing_changes(field: np.ndarray) -> None:
     truth = toroid(SHAPE, FAST, 20.0, 10e-6).displacement
     source = np.linspace(1, 2, truth[0].size).reshape(SHAPE)
     np.testing.assert_array_equal(
-        project(truth, FAST, FAST, source=source), synthetic_image(truth, source)
+        predict_image(truth, FAST, FAST, source=source), synthetic_image(truth, source)
     )
 
 
@@ -158,7 +158,7 @@ def test_cubic_fields_are_resampled_exactly_up_to_the_border() -> None:
 def test_exact_field_predicts_the_image_of_another_energy() -> None:
     measured = toroid((80, 80), FAST, 40.0, 15e-6).displacement
     expected = synthetic_image(toroid((80, 80), SLOW, 40.0, 15e-6).displacement)
-    np.testing.assert_allclose(project(measured, FAST, SLOW), expected, rtol=1e-9)
+    np.testing.assert_allclose(predict_image(measured, FAST, SLOW), expected, rtol=1e-9)
 
 
 def test_a_potential_in_metres_makes_the_image() -> None:
@@ -170,10 +170,10 @@ def test_a_potential_in_metres_makes_the_image() -> None:
 
 def test_source_gives_the_shape_of_the_image() -> None:
     source = np.full((20, 24), 7.0)
-    image = project(np.zeros((2, *SHAPE)), FAST, FAST, source=source)
+    image = predict_image(np.zeros((2, *SHAPE)), FAST, FAST, source=source)
     np.testing.assert_allclose(image, source)
     with pytest.raises(InputError, match=r"\(60, 24\) .* known only on \(48, 56\)"):
-        project(np.zeros((2, *SHAPE)), FAST, FAST, source=np.ones((60, 24)))
+        predict_image(np.zeros((2, *SHAPE)), FAST, FAST, source=np.ones((60, 24)))
 
 
 def test_projection_refuses_impossible_transfers(field: np.ndarray) -> None:

@@ -6,18 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napari_shadowinv import (
-    FieldGrid,
-    Instrument,
-    InversionCancelled,
-    OpticalSetup,
-    invert,
-    read,
-    trace,
-    write,
-)
-from napari_shadowinv.errors import InputError
+from napari_shadowinv import Instrument, OpticalSetup, invert, read, trace, write
+from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.facts import Verdict
+from napari_shadowinv.physics import FieldGrid
 from napari_shadowinv.physics.phantom_models import BlobRecipe, FourToroidsRecipe, ToroidRecipe
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment, sweep_experiment

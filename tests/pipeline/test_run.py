@@ -23,10 +23,10 @@ from napari_shadowinv import (
     OpticalSetup,
     invert,
     invert_stack,
-    plan_sites,
 )
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cli._flags import recipe_of, takes_recipe
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import number_of_sites
 from napari_shadowinv.io import read_radiograph
 from napari_shadowinv.physics.forward import synthetic_image

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv import InversionOptions, invert, plan_sites, run, synthetic_image
+from napari_shadowinv import InversionOptions, invert, run, synthetic_image
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.preprocessing import (
     Bin,

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from helpers.night import OPTIONS, grouped, make_shots
-from napari_shadowinv import invert, plan_sites, run_stack
+from napari_shadowinv import invert, run_stack
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.stack import _arrivals
 
 

@@ -23,15 +23,9 @@ from distributed.client import FuturesCancelledError
 
 from helpers.slow_reading import die, hang_once
 from helpers.store_content import content, whole_content
-from napari_shadowinv import (
-    FileFormatError,
-    InversionCancelled,
-    InversionOptions,
-    Recipe,
-    invert_stack,
-    read,
-)
+from napari_shadowinv import FileFormatError, InversionOptions, Recipe, invert_stack, read
 from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.stack import _engines
 from napari_shadowinv.stack._engines import engine_for

@@ -18,7 +18,7 @@ import xarray as xr
 
 from helpers.command_line import flat, shadowinv
 from helpers.store_content import content
-from napari_shadowinv import InputError, Recipe, RunOptions, run_stack, synthetic_image
+from napari_shadowinv import InputError, Recipe, run_stack, synthetic_image
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._batch import exit_unless_reliable
 from napari_shadowinv.inversion.result import RetrievedField
@@ -27,7 +27,7 @@ from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
-from napari_shadowinv.pipeline import run_fit, write_recipe
+from napari_shadowinv.pipeline import RunOptions, run_fit, write_recipe
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import invert_stack

@@ -14,7 +14,6 @@ from napari_shadowinv import (
     InversionOptions,
     ProtonSetup,
     Recipe,
-    RunOptions,
     invert,
     invert_stack,
     read,
@@ -22,6 +21,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE, StackStore, read_stack
+from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.preprocessing import (
     GaussianEstimate,
     HighPassFilter,

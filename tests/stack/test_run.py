@@ -17,18 +17,18 @@ from napari_shadowinv import (
     FileFormatError,
     InputError,
     Instrument,
-    InversionCancelled,
     InversionOptions,
     Recipe,
-    RunOptions,
     invert_stack,
     read,
     run_stack,
 )
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion import compilation
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_writing import ShotWriter
+from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import read_shot
 from napari_shadowinv.stack._shots import reader_text

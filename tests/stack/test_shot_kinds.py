@@ -15,7 +15,6 @@ import zarr
 from napari_shadowinv import (
     InversionOptions,
     Recipe,
-    RunOptions,
     invert,
     invert_stack,
     read,
@@ -24,6 +23,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.io.store import DONE
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.stack._shots import find_shots
 
 SHAPE, COUNT = (32, 36), 4

@@ -5,15 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from napari_shadowinv import (
-    InputError,
-    InversionOptions,
-    Recipe,
-    RunOptions,
-    invert_stack,
-    run_stack,
-    stack_statistics,
-)
+from napari_shadowinv import InputError, InversionOptions, Recipe, invert_stack, run_stack
+from napari_shadowinv.pipeline import RunOptions
+from napari_shadowinv.stack import stack_statistics
 
 OPTIONS = InversionOptions(n_sites=100)
 

@@ -19,7 +19,6 @@ from napari_shadowinv import (
     InputError,
     InversionOptions,
     Recipe,
-    RunOptions,
     invert,
     invert_stack,
     read,
@@ -33,6 +32,7 @@ from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.pipeline.rerun import rerun
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_rows
 from napari_shadowinv.preprocessing import Bin, PolynomialEstimate

@@ -17,20 +17,12 @@ from helpers.command_line import flat, shadowinv
 from helpers.night import OPTIONS
 from helpers.store_content import content
 from helpers.watched import IMAGES, SETTLE, SOURCE, Watched, put, watched_once, whole
-from napari_shadowinv import (
-    FileFormatError,
-    InputError,
-    InversionOptions,
-    Recipe,
-    invert,
-    plan_sites,
-    read,
-    watch_stack,
-)
+from napari_shadowinv import FileFormatError, InputError, InversionOptions, Recipe, invert, read
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.cli import _batch
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
-from napari_shadowinv.stack import RunStatus
+from napari_shadowinv.stack import RunStatus, watch_stack
 from napari_shadowinv.stack import watch as watching
 from napari_shadowinv.stack._worker import Attempt, ShotOutcome
 from napari_shadowinv.stack.watch import Watch

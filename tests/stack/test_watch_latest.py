@@ -16,9 +16,11 @@ import zarr
 from helpers.command_line import flat, shadowinv
 from helpers.night import OPTIONS
 from helpers.watched import SETTLE, SOURCE, Watched, put, watched_once
-from napari_shadowinv import InputError, Instrument, WatchOptions, read, run_stack, watch_stack
+from napari_shadowinv import InputError, Instrument, read, run_stack
 from napari_shadowinv.io.store import DONE, FAILED, SKIPPED, StackStore
 from napari_shadowinv.io.store_writing import GrowingStore
+from napari_shadowinv.pipeline import WatchOptions
+from napari_shadowinv.stack import watch_stack
 
 pytestmark = pytest.mark.usefixtures("impatient")
 

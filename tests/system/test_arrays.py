@@ -19,15 +19,14 @@ from napari_shadowinv import (
     Recipe,
     invert,
     invert_stack,
-    plan_sites,
     poisson_invert,
-    project,
+    predict_image,
     run,
     synthetic_image,
-    uncertainty,
 )
 from napari_shadowinv._system.arrays import block_sums, coordinate_spacing, order_by_value
 from napari_shadowinv.fitting.measurements import collect_data
+from napari_shadowinv.inversion import plan_sites, uncertainty
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing.estimates import uniform_source
@@ -164,7 +163,7 @@ def test_stack_with_different_masks_is_refused(burnt: np.ma.MaskedArray[Any, Any
     [
         lambda array: synthetic_image(TRUTH, array),
         lambda array: poisson_invert(array),
-        lambda array: project(TRUTH, SETUP, SETUP, source=array),
+        lambda array: predict_image(TRUTH, SETUP, SETUP, source=array),
         lambda array: synthetic_image(np.ma.stack([array, array])),
         lambda array: SETUP.potential(array),
     ],

@@ -59,13 +59,13 @@ def inversion_layers(
     attributes: Mapping[str, str] | None = None,
     **placement: Any,
 ) -> LayerData:
-    """Describe the layers of a result, with the keywords of `add_inversion`."""
+    """Describe the layers of a result, with the keywords of `add_to_viewer`."""
     setup = inversion.setup if setup is None else setup
     frame = frame_for(inversion.potential.shape, setup, **placement)
     return result_layers(Result(inversion, setup, dict(attributes or {})), frame, name)
 
 
-def add_inversion(
+def add_to_viewer(
     viewer: Any,
     inversion: Inversion,
     setup: Setup | None = None,
@@ -108,7 +108,7 @@ def add_inversion(
     >>> from napari.components import ViewerModel
     >>> from napari_shadowinv import invert
     >>> viewer = ViewerModel()
-    >>> layers = add_inversion(viewer, invert(np.ones((20, 20))), name="blank")
+    >>> layers = add_to_viewer(viewer, invert(np.ones((20, 20))), name="blank")
     >>> [layer.name for layer in layers if layer.visible]
     ['? |d| (px) – blank', '? displacement arrows – blank']
     """

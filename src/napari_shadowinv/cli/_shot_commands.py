@@ -552,14 +552,14 @@ def predict_image(
 ) -> tuple[FloatArray, str]:
     """Return the image, and a sentence with the assumptions."""
     from napari_shadowinv.physics.forward import synthetic_image
-    from napari_shadowinv.physics.projection import default_deflector, project
+    from napari_shadowinv.physics.projection import default_deflector, predict_image
 
     if recorded_with is None or target is None or recorded_with == target:
         return synthetic_image(displacement, source), ""
     # Names of two words have a hyphen on the command line.
     name = deflector and deflector.replace("-", " ")
     name = name or default_deflector(recorded_with, target)
-    image = project(
+    image = predict_image(
         displacement, recorded_with, target, deflector=name, dispersion=dispersion, source=source
     )
     return image, (

@@ -1,4 +1,14 @@
 from ._invert import count_sites, invert, plan_sites
+from .error_bars import Maximum, Uncertainty, uncertainty
 from .result import Inversion, Report
 
-__all__ = ["Inversion", "Report", "count_sites", "invert", "plan_sites"]
+__all__ = [
+    "Inversion",
+    "Maximum",
+    "Report",
+    "Uncertainty",
+    "count_sites",
+    "invert",
+    "plan_sites",
+    "uncertainty",
+]

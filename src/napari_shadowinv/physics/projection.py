@@ -2,7 +2,7 @@
 
 - the displacement in another experiment: `transferred_displacement`; by how much it is larger:
   `displacement_ratio`
-- the image there, from a displacement: `project`; from a potential in SI: `project_potential`
+- the image there, from a displacement: `predict_image`; from a potential in SI: `project_potential`
 - the cause of the deflection, which both experiments have in common: `deflector_titles`
 
 A deflection angle, and with it the potential in m, belongs to a beam. The object is described by a
@@ -48,7 +48,7 @@ _EDGE_TOLERANCE_PX = 1e-6
 _SIZE_TOLERANCE = 1e-9
 
 
-def project(
+def predict_image(
     displacement: ArrayLike,
     recorded_with: Setup,
     setup: Setup,
@@ -117,11 +117,11 @@ def project_potential(
         Potential Φ in m at the centres of the pixels of `recorded_with`, as its `potential` gives
         it; `displacement_from_potential` takes the gradient.
     recorded_with, setup, **keywords
-        As for `project`, whose result and errors this has; also refused is a potential that is
-        no plane.
+        As for `predict_image`, whose result and errors this has; also refused is a potential that
+        is no plane.
     """
     displacement = recorded_with.displacement_from_potential(potential)
-    return project(displacement, recorded_with, setup, **keywords)
+    return predict_image(displacement, recorded_with, setup, **keywords)
 
 
 def transferred_displacement(

@@ -6,15 +6,21 @@ from .film_files import read_pack, write_layers
 from .fit_run import run_comparison, run_fit, run_refinement
 from .inversion_run import Cache, Inputs, collect_inputs, run, run_prepared
 from .left_out import run_leave_one_out
+from .rerun import Rerun, rerun
+from .run_options import RunOptions, WatchOptions
 
 __all__ = [
     "Cache",
     "ExperimentOptions",
     "Inputs",
+    "Rerun",
+    "RunOptions",
+    "WatchOptions",
     "collect_inputs",
     "plan_experiment",
     "read_pack",
     "read_recipe",
+    "rerun",
     "run",
     "run_comparison",
     "run_film",

@@ -42,7 +42,7 @@ from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.physics.projection import project, transferred_displacement
+from napari_shadowinv.physics.projection import predict_image, transferred_displacement
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
@@ -64,7 +64,7 @@ MIDDLE = np.s_[2:42, 11:59]  # of an image, with the whole object
 def images(noise: float = 0.01) -> list[Array]:
     """One magnetic object at two energies."""
     rng = np.random.default_rng(5)
-    planes = [project(TRUTH, SETUPS[0], setup) for setup in SETUPS]
+    planes = [predict_image(TRUTH, SETUPS[0], setup) for setup in SETUPS]
     return [300 * plane * rng.normal(1, noise, plane.shape) for plane in planes]
 
 
@@ -277,7 +277,7 @@ def test_two_fields_are_told_apart_and_named(
 def test_an_unknown_beam_is_fitted_and_shown(window: Any, tool: Any, run: Any) -> None:
     beam = 1 + 0.2 * np.cos(np.pi * np.arange(SHAPE[1]) / SHAPE[1]) * np.ones(SHAPE)
     for setup, layer in zip(SETUPS, window.layers, strict=True):
-        image = project(TRUTH, SETUPS[0], setup, source=300 * beam)
+        image = predict_image(TRUTH, SETUPS[0], setup, source=300 * beam)
         layer.data = image + np.random.default_rng(2).normal(0, 3, SHAPE)
     tool.source.set_kind("unknown")
     run(tool)
@@ -822,7 +822,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     monkeypatch.chdir(tmp_path)
     beam = 300 * (1 + np.arange(SHAPE[1]) * np.ones(SHAPE) / 500)
     paths = [tmp_path / name for name in ("fast.txt", "slow.txt", "beam.txt")]
-    planes = [project(TRUTH, SETUPS[0], setup, source=beam) for setup in SETUPS]
+    planes = [predict_image(TRUTH, SETUPS[0], setup, source=beam) for setup in SETUPS]
     noise = np.random.default_rng(4).normal(0, 3, (2, *SHAPE))
     for path, plane in zip(paths, [*np.add(planes, noise), beam], strict=True):
         np.savetxt(path, plane)

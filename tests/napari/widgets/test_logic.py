@@ -14,11 +14,7 @@ import xarray as xr
 from napari.layers import Image, Labels, Shapes
 
 from helpers.jobs import run_job
-from napari_shadowinv import (
-    InputError,
-    InversionCancelled,
-    InversionOptions,
-)
+from napari_shadowinv import InputError, InversionOptions
 from napari_shadowinv._napari.widgets._editors import format_number, parse_number
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._objects import GridFile
@@ -33,6 +29,7 @@ from napari_shadowinv.analysis.paths import (
     sample_strip,
     table_text,
 )
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion import Inversion, compilation, invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantom_models import BlobRecipe, ToroidRecipe

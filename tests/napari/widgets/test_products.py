@@ -11,7 +11,7 @@ import pytest
 from qtpy.QtWidgets import QFileDialog
 
 from helpers.reports import texts_of
-from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets._products import shape_fields
 from napari_shadowinv.analysis import EnclosedCurrent, analyse, products_in
 from napari_shadowinv.inversion import Inversion, invert
@@ -31,7 +31,7 @@ def inversion() -> Inversion:
 
 @pytest.fixture
 def form(window: Any, open_widget: Any, inversion: Inversion) -> Any:
-    add_inversion(window, inversion, paper_setup(), name="ring")
+    add_to_viewer(window, inversion, paper_setup(), name="ring")
     form = open_widget("Analyse").products
     form.samples.setValue(20)
     return form

@@ -21,7 +21,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     setup_origin_of,
 )
-from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets import _files
 from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
@@ -241,7 +241,7 @@ def test_a_result_of_larger_pixels_is_in_the_units_of_these(
     run(tool)
     recipe = Recipe(steps=(Bin(factor=2),), setup=proton_setup, options=FEW)
     alone = run_recipe(recipe, shot)
-    fresh = add_inversion(ViewerModel(), alone)
+    fresh = add_to_viewer(ViewerModel(), alone)
     mine, expected = (
         next(layer for layer in layers if role_of(layer) == "field")
         for layers in (viewer.layers, fresh)

@@ -13,7 +13,7 @@ from qtpy.QtWidgets import QFileDialog
 
 from helpers.reports import texts_of
 from napari_shadowinv import run_stack
-from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets import _products
 from napari_shadowinv.analysis import Region, analyse_shots
 from napari_shadowinv.inversion import invert
@@ -168,7 +168,7 @@ def test_single_result_has_no_times(form: Any, window: Any, qtbot: Any) -> None:
     form.times.setText("1 ns")
     press(form, qtbot)
     inversion = invert(image_at(0.0), source=np.full((32, 32), 300.0))
-    added = add_inversion(window, inversion, paper_setup(), name="single")
+    added = add_to_viewer(window, inversion, paper_setup(), name="single")
     form.result.layer = next(layer for layer in added if layer in form.result.offered)
     assert not form.times.isVisibleTo(form)
     form.samples.setValue(20)

@@ -23,7 +23,7 @@ from napari_shadowinv._napari.layer_metadata import (
     setup_origin_of,
     source_of,
 )
-from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.fit_images import FitImages
@@ -270,7 +270,7 @@ def test_no_image_is_its_own_source(
 def test_results_are_not_offered_as_shots(
     viewer: ViewerModel, opened: Any, plain: Any, solved: Inversion
 ) -> None:
-    add_inversion(viewer, solved, name="solved")
+    add_to_viewer(viewer, solved, name="solved")
     tool = opened(InvertShot)
     assert tool.image.offered == [plain]
     assert [role_of(layer) for layer in tool.masks.layers.offered] == []
@@ -534,7 +534,7 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     assert tool.setup.note.text() == "Example from the paper."
     typed(tool, 7.0)
     entered = tool.setup.setup()
-    add_inversion(viewer, solved, proton_setup, name="solved")
+    add_to_viewer(viewer, solved, proton_setup, name="solved")
     tool.object.set_kind("layer")
     assert tool.setup.setup() == proton_setup
     tool.object.set_kind("toroid")

@@ -14,7 +14,7 @@ from qtpy.QtWidgets import QFileDialog, QLabel
 
 from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
-from napari_shadowinv._napari.layers import add_inversion
+from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, ModelPicker
 from napari_shadowinv._napari.widgets._qt import Plot
 from napari_shadowinv.analysis.paths import measure_peak
@@ -29,7 +29,7 @@ from napari_shadowinv.physics.phantoms import (
     wakefield,
     wakefield_setup,
 )
-from napari_shadowinv.physics.projection import project
+from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.preprocessing import polynomial_source
 
@@ -163,7 +163,7 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     assert tool.warning.isVisible()
     assert "Caustics" in tool.warning.text()
 
-    add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
+    add_to_viewer(window, solved, proton_setup, name="solved", all_layers=True)
     potential = next(
         result_layer for result_layer in window.layers if role_of(result_layer) == "potential"
     )
@@ -204,7 +204,7 @@ def test_only_what_may_be_a_field_is_offered_and_it_says_what_it_is_taken_for(
 
     window.add_image(shot, name="counts")
     window.add_image(shot, name="beam", metadata=metadata_for("source", "intensity"))
-    add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
+    add_to_viewer(window, solved, proton_setup, name="solved", all_layers=True)
     offered = [tool.potential.itemText(n) for n in range(tool.potential.count())]
     assert len(offered) == 5  # potential, three of the field, and the image of unknown origin
     assert "counts" in offered
@@ -222,7 +222,7 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     window: Any, open_widget: Any, qtbot: Any, messages: list[str], solved: Inversion,
     proton_setup: ProtonSetup,
 ) -> None:  # fmt: skip
-    add_inversion(window, solved, proton_setup, name="solved", all_layers=True)
+    add_to_viewer(window, solved, proton_setup, name="solved", all_layers=True)
     tool = open_widget("Forward model")
     choices = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
     assert choices[1:] == list(deflector_titles().values())
@@ -239,11 +239,11 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
         assert layer.name.startswith("solved image")
         return layer.data
 
-    expected = project(solved.displacement, proton_setup, slow)
+    expected = predict_image(solved.displacement, proton_setup, slow)
     np.testing.assert_allclose(image(), expected)
     assert "only a magnetic field deflects the beam" in tool.warning.text()
     tool.deflector.setCurrentText("electric field")
-    expected = project(solved.displacement, proton_setup, slow, deflector="electric field")
+    expected = predict_image(solved.displacement, proton_setup, slow, deflector="electric field")
     np.testing.assert_allclose(image(), expected)
     tool.setup.show_setup(proton_setup.model_dump())
     np.testing.assert_allclose(image(), synthetic_image(solved.displacement))
@@ -252,7 +252,7 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     tool.potential.layer = potential
     tool.deflector.setCurrentIndex(0)
     tool.setup.show_setup(slow.model_dump())
-    expected = project(displacement_from_potential(solved.potential), proton_setup, slow)
+    expected = predict_image(displacement_from_potential(solved.potential), proton_setup, slow)
     np.testing.assert_allclose(image(), expected, atol=1e-9)
     assert messages == []
 
