@@ -319,7 +319,7 @@ def test_without_samples_the_edge_is_not_computed() -> None:
     """There is no other error that an error by the edge has to exceed."""
     cut = bump(0.7, 8, (0, 30))
     images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
-    result = fit(noisy(images, 0.02), strengths=[1, 0.7], noise=0.02, options=HASTY)
+    result = fit(shots_of(noisy(images, 0.02), strength=[1, 0.7], noise=0.02), options=HASTY)
     assert result.verdict is not Verdict.EDGE
     assert (result.report.parts, result.report.sides) == ({}, ())
 

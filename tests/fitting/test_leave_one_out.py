@@ -177,7 +177,7 @@ def test_two_images_are_too_few() -> None:
 
 def test_images_without_energies_are_told() -> None:
     with pytest.raises(InputError, match="received 5 images and neither strengths nor setups"):
-        checked(noisy([np.ones(SHAPE)] * 5, NOISE), setups=None)
+        checked(noisy([np.ones(SHAPE)] * 5, NOISE), setup=None)
 
 
 def test_the_noise_is_that_of_chi2(static: LeaveOneOut) -> None:
