@@ -40,8 +40,8 @@ def test_growth_rate_of_an_exponential_is_exact():
     results = [analyse(field_of(field_at(time)), REGION)[0] for time in TIMES]
     series = time_series(results, TIMES)
     assert series.growth_rate("rms").value == pytest.approx(RATE, rel=1e-9)
-    assert series.variables["rms"].unit == "T m"
-    ratio = series["peak"].value[1:] / series["peak"].value[:-1]
+    assert series.result.variables["rms"].unit == "T m"
+    ratio = series.result["peak"].value[1:] / series.result["peak"].value[:-1]
     np.testing.assert_allclose(ratio, np.exp(RATE * 1e-9))
 
 
@@ -58,7 +58,7 @@ def test_each_shot_of_a_stack_with_a_field_is_measured():
     (series,) = analyse_shots(stack_of(times, gap=1), REGION, times)
     np.testing.assert_allclose(series.times, times[[0, 2, 3]])
     (last,) = analyse(field_of(field_at(times[3])), REGION)
-    assert series["rms"].value[-1] == pytest.approx(float(last["rms"].value), rel=1e-12)
+    assert series.result["rms"].value[-1] == pytest.approx(float(last["rms"].value), rel=1e-12)
     assert series.growth_rate("rms").value == pytest.approx(RATE, rel=1e-9)
     assert series.result["rms"].value.shape == (3,)
     (by_shot,) = analyse_shots(stack_of(TIMES), REGION)
@@ -70,7 +70,7 @@ def test_band_of_a_growth_rate_follows_from_the_scatter_of_the_shots():
     (exact,) = analyse_shots(stack_of(times), REGION, times)
     for seed in range(200):
         scatter = np.exp(0.05 * np.random.default_rng(seed).normal(size=6))
-        values = Quantity(exact["rms"].value * scatter, np.zeros((0, 6)))
+        values = Quantity(exact.result["rms"].value * scatter, np.zeros((0, 6)))
         series = TimeSeries(replace(exact.result, quantities={"rms": values}))
         low, high = series.growth_rate("rms").band(0.68)
         inside.append(low <= RATE <= high)
@@ -103,10 +103,10 @@ def test_product_without_a_number_is_refused_after_one_shot():
 
 def test_series_states_numbers_in_their_units():
     contrast, region = (analyse_shots(stack_of(TIMES), each)[0] for each in (Contrast(), REGION))
-    first, last = contrast["mu"].value[[0, -1]]
+    first, last = contrast.result["mu"].value[[0, -1]]
     assert contrast.result.facts[0].text == f"{first:.4g} to {last:.4g}, first to last shot"
     texts = {fact.key: fact.text for fact in region.result.facts}
-    first, last = 1e6 * region["centroid_y"].value[[0, -1]]
+    first, last = 1e6 * region.result["centroid_y"].value[[0, -1]]
     assert texts["centroid_y"] == f"{first:.4g} to {last:.4g} µm, first to last shot"
 
 
@@ -117,7 +117,9 @@ def test_growth_in_pixels_is_that_of_the_field_and_not_of_places():
     keys = {fact.key for fact in series.result.facts}
     assert {"growth_mean", "growth_peak", "growth_rms"} <= keys
     assert not {"growth_centroid_y", "growth_centroid_x"} & keys
-    assert series.variables["rms"].unit == series.variables["centroid_y"].unit == "pixel"
+    assert (
+        series.result.variables["rms"].unit == series.result.variables["centroid_y"].unit == "pixel"
+    )
     assert ("centroid_y", "centroid_x") in series.result.curve_groups
 
 

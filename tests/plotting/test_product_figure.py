@@ -69,7 +69,9 @@ def test_series_has_a_panel_for_each_unit():
     assert places.get_xlabel() == "time (ns)"
     lines = {line.get_label(): line for axes in (numbers, places) for line in axes.lines}
     np.testing.assert_allclose(lines["rms"].get_xdata(), [0, 2])
-    np.testing.assert_allclose(lines["centroid_x"].get_ydata(), 1e6 * series["centroid_x"].value)
+    np.testing.assert_allclose(
+        lines["centroid_x"].get_ydata(), 1e6 * series.result["centroid_x"].value
+    )
 
 
 def test_numbers_alone_need_no_panel():

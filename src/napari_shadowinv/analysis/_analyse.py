@@ -24,8 +24,6 @@ from napari_shadowinv.inversion.samples import stratified_numbers
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.results import unpack_result
 
-_MIN_SAMPLES = 20
-
 
 def analyse(
     result: Any,
@@ -98,8 +96,8 @@ def analyse(
         raise InputError("got no product, expected at least one")
     if not isinstance(samples, int | np.integer) or isinstance(samples, bool):
         raise InputError(f"samples is {samples!r}, expected a whole number")
-    if samples < _MIN_SAMPLES:
-        raise InputError(f"samples is {samples}, expected at least {_MIN_SAMPLES}")
+    if samples < 20:
+        raise InputError(f"samples is {samples}, expected at least 20")
     chosen_unit = None if unit is None else field_unit(unit)
     content, own_setup = unpack_result(result)
     fields = sampled_fields(content, setup or own_setup, chosen_unit, deflector)

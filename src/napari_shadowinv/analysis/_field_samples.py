@@ -12,6 +12,7 @@ from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame, FieldUnit
+from napari_shadowinv.analysis.paths import is_inside
 from napari_shadowinv.analysis.product import FieldNoise
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
@@ -37,14 +38,6 @@ Choose = Callable[[FieldNoise | None], Measure]
 
 Callbacks = dict[str, Any]
 """Arguments `on_progress` and `should_stop` by their names."""
-
-_COARSER = 4  # times fewer sites
-_MIN_COARSE_SITES = 16
-_PILOT_SAMPLES = 8
-_MAX_REPEAT_ERROR = 0.02  # of the displacement, r.m.s., between a result and its repetition
-_LEAST_SHARE_OF_NOISE = 0.2  # of the discretisation error, for its cautions to matter
-_MANY_NUMBERS = 20_000  # of all products together
-_LEAST_NOISE = 1e-9  # of the brightest pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +78,8 @@ class StoredSamples(SampledField):
 
     def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:
         report = Reporter(**callbacks)
-        pilot = np.asarray(self.changes[:_PILOT_SAMPLES], dtype=np.float64)
-        measure = choose(FieldNoise(pilot))
+        # Eight suffice for choices by the noise.
+        measure = choose(FieldNoise(np.asarray(self.changes[:8], dtype=np.float64)))
         value = measure(self.potential, self.displacement)
         count = min(samples, len(self.changes))
         scatter = np.empty((count, value.size), sample_type(count, value.size))
@@ -139,26 +132,27 @@ class ResampledInversion(SampledField):
             share = discretisation_share(len(inversion.sites) / len(coarse.sites))
             change = value - measure(coarse.potential, coarse.displacement)
             systematic["discretisation"] = share * change
-        cautions = *self._sample_cautions(scatter), *self._repeat_cautions(scatter.inversion)
         shifted = repeated.samples
         shifted += (value - repeated.value).astype(shifted.dtype)
+        cautions = tuple(self._sample_cautions(scatter))
         return Evaluation(value, shifted, systematic, tuple(causes), cautions)
 
-    def _sample_cautions(self, scatter: Uncertainty) -> Iterator[Caution]:
+    def _sample_cautions(self, scatter: Uncertainty, least: float = 0.2) -> Iterator[Caution]:
+        """Yield those of the samples, if noise is not below a share of the discretisation error."""
         errors = self.inversion.errors
         by_noise = float(np.sqrt((scatter.displacement_std**2).sum(axis=0).mean()))
         # Without noise, samples differ by the tolerance of the solver.
-        if errors is not None and by_noise < _LEAST_SHARE_OF_NOISE * errors.discretisation.rms:
+        if errors is not None and by_noise < least * errors.discretisation.rms:
             return
         yield from (each for each in scatter.warnings if each.code == "samples")
 
     def _coarse_inversion(
         self, options: InversionOptions, mask: BoolArray | None, callbacks: Callbacks
     ) -> Inversion | None:
-        """Invert the image with a quarter of the sites; None if these are too few."""
+        """Invert the image with a quarter of the sites; None if these are fewer than 16."""
         inversion = self.inversion
-        count = (options.n_sites or 0) // _COARSER
-        if count < _MIN_COARSE_SITES:
+        count = (options.n_sites or 0) // 4
+        if count < 16:
             return None
         coarse = invert(
             inversion.image,
@@ -169,16 +163,6 @@ class ResampledInversion(SampledField):
             **callbacks,
         )
         return coarse if len(coarse.sites) < len(inversion.sites) else None
-
-    def _repeat_cautions(self, repeated: Inversion) -> Iterator[Caution]:
-        change = float(np.linalg.norm(repeated.displacement - self.displacement))
-        share = change / max(float(np.linalg.norm(self.displacement)), 1e-300)
-        if share > _MAX_REPEAT_ERROR:
-            yield Caution(
-                "samples",
-                f"the samples belong to an inversion that differs from the result by {share:.0%} "
-                "(r.m.s.): the bands may be too narrow; invert the image again",
-            )
 
 
 def recorded_shot(inversion: Inversion, mask: BoolArray | None) -> tuple[InversionOptions, Any]:
@@ -201,15 +185,12 @@ def recorded_shot(inversion: Inversion, mask: BoolArray | None) -> tuple[Inversi
     noise = ImageNoise(prepared.in_units(), options, inversion.instrument.noise_correlation)
     mean = inversion.source[inversion.mask].mean()
     deviation = mean * np.sqrt(noise.variance(inversion.image / mean))
-    least = _LEAST_NOISE * float(inversion.image.max())
-    return options, np.maximum(deviation, least)
+    return options, np.maximum(deviation, 1e-9 * float(inversion.image.max()))
 
 
 def number_of_inner_sites(inversion: Inversion) -> int:
     """Return the number of sites to ask for: without those in a margin."""
-    size = np.array(inversion.image.shape)
-    is_inside = ((inversion.sites >= -0.5) & (inversion.sites <= size - 0.5)).all(axis=1)
-    return max(int(is_inside.sum()), 4)
+    return max(int(is_inside(inversion.sites, inversion.image.shape).sum()), 4)
 
 
 def has_measured_source(inversion: Inversion) -> bool:
@@ -221,9 +202,9 @@ def has_measured_source(inversion: Inversion) -> bool:
     return errors is None or errors.beam is None or errors.beam_basis not in ("assumed", "outside")
 
 
-def sample_type(count: int, size: int) -> type[Any]:
+def sample_type(count: int, size: int, *, most_double: int = 20_000) -> type[Any]:
     """Return the type of samples, single precision for maps; refuse more than fit in memory."""
-    kind = np.float32 if size > _MANY_NUMBERS else np.float64
+    kind = np.float32 if size > most_double else np.float64
     bytes_of_number = 4 * np.dtype(kind).itemsize  # with copies of it
     check_memory((count, size), bytes_of_number, "the samples of these products")
     return kind

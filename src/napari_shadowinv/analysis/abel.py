@@ -39,8 +39,6 @@ A piece of constant slope errs by its curvature, weighted with 1/√(r² - y²).
 adds up to the Hurwitz zeta function ζ(-½, offset), of which it is the zero.
 """
 
-_MIN_RADII = 4
-_SMOOTHING_SHARE = 0.25  # of the error by noise
 _SMOOTHINGS = tuple(10.0 ** (power / 2) for power in range(-4, 11))
 
 
@@ -124,12 +122,14 @@ def inverse_matrix(matrix: FloatArray, smoothing: float) -> FloatArray:
     return np.asarray(np.linalg.solve(normal, matrix.T))
 
 
-def choose_smoothing(matrix: FloatArray, side: FloatArray, opposite_side: FloatArray) -> float:
+def choose_smoothing(
+    matrix: FloatArray, side: FloatArray, opposite_side: FloatArray, *, share: float = 0.25
+) -> float:
     """Return the largest smoothing whose error is small against that by noise.
 
     The sides of an axisymmetric object differ by their noise, and half of their difference is the
     error of their mean. The profile is smoothed as far as one more smoothing changes it by a
-    quarter of that (r.m.s.), so that bands by noise hold.
+    share of that (r.m.s.), so that bands by noise hold.
 
     Parameters
     ----------
@@ -137,6 +137,8 @@ def choose_smoothing(matrix: FloatArray, side: FloatArray, opposite_side: FloatA
         Such as `deflection_matrix`.
     side, opposite_side : ndarray, shape (slices, m)
         Deflections of the two sides, both positive away from the axis.
+    share : float, default 0.25
+        Largest change by one more smoothing, over the error by noise.
 
     Raises
     ------
@@ -151,7 +153,7 @@ def choose_smoothing(matrix: FloatArray, side: FloatArray, opposite_side: FloatA
         profile = (side + opposite_side) / 2 @ inverse.T
         change = float(np.linalg.norm(profile @ (inverse @ matrix).T - profile))
         noise = float(np.linalg.norm((side - opposite_side) / 2 @ inverse.T))
-        if change > _SMOOTHING_SHARE * noise:
+        if change > share * noise:
             break
         best = smoothing
     return best
@@ -171,8 +173,8 @@ def operators(
 
 def _grid(count: int, offset: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return distances y (count, 1) and radii r (1, count + 1) in px, and ∫ dr / √(r² - y²)."""
-    if count < _MIN_RADII:
-        raise InputError(f"the radius is {count} px, expected at least {_MIN_RADII} px")
+    if count < 4:
+        raise InputError(f"the radius is {count} px, expected at least 4 px")
     y, radii = offset + np.arange(float(count))[:, None], np.arange(count + 1.0)[None, :]
     ratio = np.divide(radii, y, out=np.ones((count, count + 1)), where=y > 0)
     # The integral is arcosh(r / y), zero at r = y.

@@ -16,12 +16,6 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.abel import FIRST_OFFSET
 from napari_shadowinv.analysis.paths import interpolate_cubic
 
-_MAX_TILT = math.radians(20)
-_START_RADIUS = 0.3  # of the side across, while the axis is only sought
-_FITTED_RADIUS = 0.9  # of the largest, so that a shifted axis stays inside
-_TOLERANCE_PX = 1e-3
-_MIN_PLACES = 200  # along a long axis while it is sought: neighbours share their noise
-
 
 @dataclass(frozen=True)
 class Axis:
@@ -113,6 +107,9 @@ def find_axis(
     *,
     start: Axis | None = None,
     find_tilt: bool = True,
+    most_tilt: float = 20.0,
+    radius_share: float = 0.9,
+    places: int = 200,
 ) -> Axis:
     """Return the axis about which the deflection across it is most nearly odd.
 
@@ -126,6 +123,12 @@ def find_axis(
         To refine. Default: the best of all positions along that direction.
     find_tilt : bool
         Whether the axis may be inclined.
+    most_tilt : float, default 20
+        In degrees.
+    radius_share : float, default 0.9
+        Radius over the largest, so that a shifted axis stays inside.
+    places : int, default 200
+        Least number of places along a long axis that are compared: neighbours share their noise.
 
     Returns
     -------
@@ -136,10 +139,10 @@ def find_axis(
     is_free = start is None
     if start is None:
         start = _best_parallel(displacement, direction)
-    radius = max(int(_FITTED_RADIUS * start.max_radius(shape)), 4)
+    radius = max(int(radius_share * start.max_radius(shape)), 4)
     middle = (np.array(start.start) + np.array(start.end)) / 2
     half = start.length / 2
-    every = max(int(start.length) // _MIN_PLACES, 1)
+    every = max(int(start.length) // places, 1)
 
     def axis_at(shift: float, tilt: float) -> Axis:
         along = math.cos(tilt) * start.direction + math.sin(tilt) * start.across
@@ -149,7 +152,7 @@ def find_axis(
 
     def mismatch(choice: FloatArray) -> float:
         shift, tilt = float(choice[0]), float(choice[1]) / half if find_tilt else 0.0
-        if abs(tilt) > _MAX_TILT:
+        if abs(tilt) > math.radians(most_tilt):
             return math.inf
         axis = axis_at(shift, tilt)
         component = component_across(displacement, axis)
@@ -162,7 +165,7 @@ def find_axis(
         mismatch,
         np.zeros(size),
         method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": _TOLERANCE_PX, "fatol": 1e-9},
+        options={"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-9},
     )
     axis = axis_at(float(best.x[0]), float(best.x[1]) / half if find_tilt else 0.0)
     return _inset(axis, shape) if is_free else axis
@@ -180,12 +183,12 @@ def _inset(axis: Axis, shape: tuple[int, ...]) -> Axis:
     return Axis((float(start[0]), float(start[1])), (float(end[0]), float(end[1])))
 
 
-def _best_parallel(displacement: FloatArray, direction: str) -> Axis:
-    """Return the best of all axes along y or x, by whole pixels."""
+def _best_parallel(displacement: FloatArray, direction: str, radius_share: float = 0.3) -> Axis:
+    """Return the best of all axes along y or x, by whole pixels; radii over the side across."""
     height, width = displacement.shape[1:]
     is_vertical = direction == "vertical"
     component = displacement[1] if is_vertical else displacement[0].T
-    radius = max(int(_START_RADIUS * component.shape[1]), 4)
+    radius = max(int(radius_share * component.shape[1]), 4)
     best, best_position = math.inf, component.shape[1] / 2
     power = component**2
     for position in range(radius, component.shape[1] - radius):

@@ -9,7 +9,7 @@ particles. An azimuthal magnetic field is seen along its axis only.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -48,21 +48,22 @@ _B, _E, _N = "path_integrated_b", "path_integrated_e", "line_integrated_density"
 _INDEX = "line_integrated_log_index"
 _LENGTHS = ("displacement", "deflection_angle", _INDEX)
 _MIN_RADIUS_PX = 8
-_DEFAULT_SMOOTHING = 1.0
-_MIN_DENSITY_RATIO = 0.02  # below it a temperature is only noise
-_EDGE_SHARE = 0.06  # of the radius, in which the field should have ended
-_NOTABLE_EDGE = 0.05  # of the largest deflection
-_NOTABLE_ASYMMETRY = 0.1
-_NOTABLE_LENGTH = 0.02  # of the distance to the source
-_PROFILE_END = 0.05  # of the largest value of a profile
-_MIN_DRAWS = 3
-_TILT_ERRORS = 4.0  # of three draws, below which an inclination is not significant
 _AZIMUTHAL = (
     "an azimuthal magnetic field is not visible from the side: its components across the beam "
     "cancel in each line of sight (∫B dz = 0), so it deflects nothing there; view it along its "
     "axis (azimuthal field along the beam), or choose the component of B 'axial' for the field of "
     "a coil"
 )
+
+
+@dataclass(frozen=True)
+class AxisymmetryCheck:
+    """Limits of the cautions of a profile, see tests/analysis/test_axisymmetric.py."""
+
+    edge: float = 0.05  # deflection at the edge, over the largest
+    asymmetry: float = 0.1  # of the halves
+    length: float = 0.02  # of the object along the beam, over the distance to the source
+    profile_end: float = 0.05  # value where the object ends, over the largest
 
 
 class AxisymmetricProfile(Product):
@@ -77,6 +78,7 @@ class AxisymmetricProfile(Product):
     lengths: ClassVar = ("axis_offset",)
     fields: ClassVar = (*_LENGTHS, _N, _E, _B)
     reference: ClassVar = "Daun et al., Appl. Opt. 45, 4638 (2006)"
+    limits: ClassVar = AxisymmetryCheck()
     product: Literal["axisymmetric"] = "axisymmetric"
     axis: tuple[Point, Point] | None = Field(
         default=None,
@@ -180,13 +182,7 @@ class AxisymmetricProfile(Product):
         return Axis(*self.axis)
 
     def _radius_px(self, frame: FieldFrame) -> int:
-        most = self._axis.max_radius(frame.shape)
-        if most < _MIN_RADIUS_PX:
-            raise InputError(
-                f"the axis comes within {most:.3g} px of the edge of the image, expected "
-                f"{_MIN_RADIUS_PX} px or more on both sides: shorten or move it"
-            )
-        return _chosen_radius(self.radius, most, "axis")
+        return _chosen_radius(self.radius, self._axis.max_radius(frame.shape), "axis")
 
     def _sides(
         self, displacement: FloatArray, frame: FieldFrame, shift: float = 0.0
@@ -221,7 +217,8 @@ class AxisymmetricProfile(Product):
         return [int(place) for place in np.unique(np.linspace(0, count, number + 1)[:-1].round())]
 
     def _operators(self, frame: FieldFrame) -> tuple[FloatArray, FloatArray]:
-        smoothing = _DEFAULT_SMOOTHING if self.smoothing is None else self.smoothing
+        # Before it is chosen, only the first operator is used, which does not depend on it.
+        smoothing = 1.0 if self.smoothing is None else self.smoothing
         of_deflection = frame.unit.field != _B
         return operators(self._radius_px(frame), smoothing, of_deflection=of_deflection)
 
@@ -305,7 +302,7 @@ class AxisymmetricProfile(Product):
         right_side, left_side = self._sides(displacement, frame)
         _, inverse = self._operators(frame)
         values = self._profiles((right_side + left_side) / 2 @ inverse.T, frame)
-        scale = self._scale(frame)
+        scale = _scale(frame)
         values["half_difference"] = scale * (right_side - left_side) @ inverse.T
         if not self._has_slices:
             values = {name: profiles[0] for name, profiles in values.items()}
@@ -317,23 +314,10 @@ class AxisymmetricProfile(Product):
         values["axis_offset"] = np.asarray(_axis_offset(right_side, left_side))
         return values
 
-    def _scale(self, frame: FieldFrame) -> float:
-        """Return the first of the profiles for a profile of 1 px."""
-        field, setup, pixel = frame.unit.field, frame.setup, frame.pixel
-        unit_plane = np.ones(1)
-        if field == _B:
-            return 1.0 / pixel
-        if setup is None or not (field in (_E, _N) or _is_index(frame)):
-            return 1.0
-        if field == _E:
-            return float(setup.field_in_si(_E, np.ones((2, 1)))[0, 0])
-        if field == _N:
-            return float(setup.field_in_si(_N, unit_plane)[0]) / pixel
-        return -float(setup.potential(unit_plane)[0]) / pixel
-
-    def _profiles(self, profile: FloatArray, frame: FieldFrame) -> Values:
+    def _profiles(self, profile: FloatArray, frame: FieldFrame, least: float = 0.02) -> Values:
+        """Return the profiles; below a least ratio of densities a temperature is only noise."""
         first, *further = self._profile_variables(frame)
-        change = self._scale(frame) * profile
+        change = _scale(frame) * profile
         values = {first: change}
         if "radial_field" in further:
             # The profile is even at the axis and ends at 0.
@@ -345,7 +329,7 @@ class AxisymmetricProfile(Product):
             values["density"] = self.ambient_density + values["density_change"]
         if self.ambient_temperature is not None and self.ambient_density is not None:
             ratio = values["density"] / self.ambient_density
-            hot = self.ambient_temperature / np.maximum(ratio, _MIN_DENSITY_RATIO)
+            hot = self.ambient_temperature / np.maximum(ratio, least)
             values["temperature"] = hot
         return values
 
@@ -382,20 +366,20 @@ class AxisymmetricProfile(Product):
         points = axis.points(axis.places(), np.arange(-radius + 1.0, radius)).reshape(-1, 2)
         yield from mask_cautions(points, frame, "the object")
         edge, halves = (float(quantities[name].value) for name in ("edge", "asymmetry"))
-        if edge > _NOTABLE_EDGE:
+        if edge > self.limits.edge:
             yield Caution(
                 "edge",
                 f"the deflection at the edge is {edge:.0%} of the largest: the object does not end "
                 "inside the radius, which shifts and bends the profile; use a wider image",
             )
-        if halves > _NOTABLE_ASYMMETRY:
+        if halves > self.limits.asymmetry:
             yield Caution(
                 "misfit",
                 f"the halves of the object differ by {halves:.0%} (r.m.s.): it is not symmetric "
                 "about this axis, and the profile is that of the mean of the halves",
             )
         profile = np.atleast_2d(quantities[next(iter(self._profile_variables(frame)))].value)
-        yield from _length_cautions(np.abs(profile), frame)
+        yield from _length_cautions(np.abs(profile), frame, self.limits)
 
     def remarks(self, frame: FieldFrame) -> Iterator[str]:
         yield (
@@ -451,11 +435,6 @@ class AzimuthalProfile(Product):
     def _radii(self, frame: FieldFrame) -> FloatArray:
         pairs = zip(self.center, frame.shape, strict=True)
         most = min(min(place, count - 1 - place) for place, count in pairs)
-        if most < _MIN_RADIUS_PX:
-            raise InputError(
-                f"the centre is {most:.3g} px from the edge of the image, expected at least "
-                f"{_MIN_RADIUS_PX} px"
-            )
         return np.arange(_chosen_radius(self.radius, most, "centre") + 1.0)
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
@@ -490,12 +469,32 @@ class AzimuthalProfile(Product):
 
 def _chosen_radius(radius: float | None, most: float, middle: str) -> int:
     """Return the radius in px, by default the distance of the axis or centre from the edge."""
+    if most < _MIN_RADIUS_PX:
+        raise InputError(
+            f"the {middle} comes within {most:.3g} px of the edge of the image, expected at least "
+            f"{_MIN_RADIUS_PX} px from the edge: shorten or move it"
+        )
     if radius is not None and radius > most + 0.5:
         raise InputError(
             f"radius is {radius:g} px, expected at most {most:.1f} px: the distance of the "
             f"{middle} from the edge of the image"
         )
     return int(most if radius is None else min(radius, most))
+
+
+def _scale(frame: FieldFrame) -> float:
+    """Return the first of the profiles for a profile of 1 px."""
+    field, setup, pixel = frame.unit.field, frame.setup, frame.pixel
+    unit_plane = np.ones(1)
+    if field == _B:
+        return 1.0 / pixel
+    if setup is None or not (field in (_E, _N) or _is_index(frame)):
+        return 1.0
+    if field == _E:
+        return float(setup.field_in_si(_E, np.ones((2, 1)))[0, 0])
+    if field == _N:
+        return float(setup.field_in_si(_N, unit_plane)[0]) / pixel
+    return -float(setup.potential(unit_plane)[0]) / pixel
 
 
 def _is_index(frame: FieldFrame) -> bool:
@@ -507,11 +506,15 @@ def _is_index(frame: FieldFrame) -> bool:
 
 
 def _found_axis(
-    displacement: FloatArray, noise: FieldNoise | None, direction: str, find_tilt: bool
+    displacement: FloatArray,
+    noise: FieldNoise | None,
+    direction: str,
+    find_tilt: bool,
+    tilt_errors: float = 4.0,  # by few draws, below which an inclination is not significant
 ) -> tuple[Axis, float | None]:
     """Return the axis with its standard error in px; an inclination within its error is none."""
     axis = find_axis(displacement, direction, find_tilt=find_tilt)
-    if noise is None or len(noise.potentials) < _MIN_DRAWS:
+    if noise is None or len(noise.potentials) < 3:
         return axis, None
     ends = []
     for change in noise.potentials:
@@ -520,14 +523,14 @@ def _found_axis(
         ends.append((np.array([shifted.start, shifted.end]) - [axis.start, axis.end]) @ axis.across)
     start, end = np.array(ends).T
     tilt = abs(axis.across[0] if direction == "vertical" else axis.across[1]) * axis.length
-    if find_tilt and tilt < _TILT_ERRORS * float(np.std(end - start, ddof=1)):
+    if find_tilt and tilt < tilt_errors * float(np.std(end - start, ddof=1)):
         return _found_axis(displacement, noise, direction, find_tilt=False)
     return axis, float(np.sqrt((np.var(start, ddof=1) + np.var(end, ddof=1)) / 2))
 
 
-def _end_width(radius: int) -> int:
-    """Return over how many px from the edge the deflection is averaged there."""
-    return max(round(_EDGE_SHARE * radius), 2)
+def _end_width(radius: int, share: float = 0.06) -> int:
+    """Return over how many px from the edge, by which the field should end, it is averaged."""
+    return max(round(share * radius), 2)
 
 
 def _axis_offset(right_side: FloatArray, left_side: FloatArray) -> float:
@@ -540,15 +543,17 @@ def _axis_offset(right_side: FloatArray, left_side: FloatArray) -> float:
     return -float(np.sum((right_side - left_side) * slope)) / (2 * size) if size > 0 else 0.0
 
 
-def _length_cautions(profile: FloatArray, frame: FieldFrame) -> Iterator[Caution]:
+def _length_cautions(
+    profile: FloatArray, frame: FieldFrame, limits: AxisymmetryCheck
+) -> Iterator[Caution]:
     """Warn of an object that is not thin against its distance from a point source."""
     setup = frame.setup
     if setup is None or setup.is_collimated:
         return
-    strong = np.flatnonzero((profile > _PROFILE_END * profile.max()).any(axis=0))
+    strong = np.flatnonzero((profile > limits.profile_end * profile.max()).any(axis=0))
     length = 2 * frame.length(float(strong.max()) if len(strong) else 0.0)
     share = length / setup.source_object_distance
-    if share > _NOTABLE_LENGTH:
+    if share > limits.length:
         yield Caution(
             "setup",
             f"the object is {length_text(length)} long along the beam, {share:.0%} of its distance "

@@ -10,17 +10,12 @@ import numpy as np
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._derivatives import first_derivative, second_derivative
 from napari_shadowinv.analysis.frame import FieldFrame
-from napari_shadowinv.analysis.maps import MIN_SPACINGS, ORDER, Smoothed, smooth
+from napari_shadowinv.analysis.maps import Smoothed, least_width, smooth
 from napari_shadowinv.analysis.product import Values, Variable
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Fact, Level, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import number_field
-
-_MAX_LINEAR = 0.1  # compression up to which the image's contrast is the Laplacian, to some 10 %
-_NEARLY_CROSSED = 0.8
-_CROSSED = 1.0
-_BORDER_PX = 4  # by two derivatives of fourth order
 
 _REGIMES = {
     "linear": "linear: the contrast of the image is the current density, and any inversion will do",
@@ -53,7 +48,7 @@ class Contrast(Smoothed):
 
     def _width(self, plane: FloatArray, noise: FloatArray, spacing: float) -> float:
         # A mean over the image bears more noise than a map, and bands are corrected for it.
-        return max(super()._width(plane, noise, spacing) / 2, MIN_SPACINGS * spacing)
+        return max(super()._width(plane, noise, spacing) / 2, least_width(spacing))
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         return {
@@ -63,22 +58,11 @@ class Contrast(Smoothed):
             "compression": Variable((), "1", "Largest compression of the beam, 1 where rays cross"),
         }
 
-    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
-        return self._measure(potential, frame, ORDER)
-
-    def systematic(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> Values:
-        finer = self._measure(potential, frame, ORDER + 1)
-        values = self._measure(potential, frame, ORDER)
-        return {name: finer[name] - value for name, value in values.items()}
-
-    def _measure(self, potential: FloatArray, frame: FieldFrame, order: int) -> Values:
+    def at_order(self, potential: FloatArray, frame: FieldFrame, order: int) -> Values:
         plane = smooth(potential, self.smoothing or 0.0, order)
         crossed = first_derivative(first_derivative(plane, 0), 1)[2:-2, 2:-2]
-        inner = np.s_[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX]
-        used = frame.mask[inner]
-        inside = [np.s_[2:-2, _BORDER_PX:-_BORDER_PX], np.s_[_BORDER_PX:-_BORDER_PX, 2:-2]]
+        used = frame.mask[4:-4, 4:-4]  # two derivatives of fourth order shorten it by 4 px
+        inside = [np.s_[2:-2, 4:-4], np.s_[4:-4, 2:-2]]
         down, right = (first_derivative(plane, axis)[inside[axis]][used] for axis in (0, 1))
         yy, xx = (second_derivative(plane, axis)[inside[axis]][used] for axis in (0, 1))
         yx, slopes = crossed[used], np.stack([down, right])
@@ -93,8 +77,10 @@ class Contrast(Smoothed):
             "compression": np.asarray(compression.max()),
         }
 
-    def regime(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> str:
-        """Return the regime: "linear", "injective", "caustic" or "diffusive"."""
+    def regime(
+        self, quantities: Mapping[str, Quantity], frame: FieldFrame, *, linear: float = 0.1
+    ) -> str:
+        """Return the regime: "linear" up to a compression, "injective", "caustic", "diffusive"."""
         compression = float(quantities["compression"].value)
         if self.object_length is not None and frame.setup is not None:
             # Inside the object a ray moves by its angle times the length.
@@ -102,9 +88,9 @@ class Contrast(Smoothed):
             angle = float(frame.setup.deflection_angle(pixels))
             if angle * self.object_length > float(quantities["scale"].value):
                 return "diffusive"
-        if compression >= _CROSSED or frame.has_crossed_rays:
+        if compression >= 1 or frame.has_crossed_rays:
             return "caustic"
-        return "linear" if compression < _MAX_LINEAR else "injective"
+        return "linear" if compression < linear else "injective"
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
         regime = self.regime(quantities, frame)
@@ -115,10 +101,11 @@ class Contrast(Smoothed):
             Fact("smoothing", "Smoothing", self.smoothing_text(frame)),
         ]
 
-    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
+    def cautions(
+        self, quantities: Mapping[str, Quantity], frame: FieldFrame, *, near: float = 0.8
+    ) -> list[Caution]:
         compression = float(quantities["compression"].value)
-        is_near = _NEARLY_CROSSED < compression < _CROSSED
-        if not is_near or frame.has_crossed_rays:
+        if not near < compression < 1 or frame.has_crossed_rays:
             return []
         text = (
             f"the beam is compressed by up to {to_figures(compression)}, near 1, where rays cross: "

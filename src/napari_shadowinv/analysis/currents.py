@@ -24,7 +24,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity
 
 _B, _E = "path_integrated_b", "path_integrated_e"
-_STEP_PX = 0.5
 
 
 class Flux(Product):
@@ -74,7 +73,7 @@ class _Enclosed(Outlined):
         return {self.name(): Variable((), self.unit, self.long_name)}
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
-        points, sides = edge_midpoints(self.outline, _STEP_PX)
+        points, sides = edge_midpoints(self.outline)
         _, displacement = frame.at_points(potential, displacement)
         down, right = (interpolate_cubic(plane, points) for plane in displacement)
         # From x to y around the outline, outwards is to the left of the direction.
@@ -82,7 +81,7 @@ class _Enclosed(Outlined):
         return {self.name(): np.asarray(source_by_flux(frame) * outward * frame.pixel)}
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
-        return mask_cautions(edge_midpoints(self.outline, _STEP_PX)[0], frame, "the outline")
+        return mask_cautions(edge_midpoints(self.outline)[0], frame, "the outline")
 
 
 class EnclosedCurrent(_Enclosed):
@@ -120,9 +119,7 @@ class EnclosedCharge(_Enclosed):
 
 def unit_field(frame: FieldFrame) -> FloatArray:
     """Return the field (y, x) in SI units by a displacement of 1 px along x."""
-    unit = np.zeros((2, 1, 1))
-    unit[1] = 1.0
-    return np.asarray(frame.field(np.zeros((1, 1)), unit)).ravel()
+    return np.asarray(frame.field(np.zeros(1), np.array([[0.0], [1.0]]))).ravel()
 
 
 def source_by_flux(frame: FieldFrame) -> float:

@@ -26,7 +26,7 @@ from scipy.optimize import brentq
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
-from napari_shadowinv.analysis.paths import interpolate_cubic
+from napari_shadowinv.analysis.paths import first_below, interpolate_cubic
 from napari_shadowinv.analysis.power_spectra import window_weights
 from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Values, Variable
 from napari_shadowinv.cautions import Caution
@@ -35,18 +35,6 @@ from napari_shadowinv.facts import Fact, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import displacement_from_potential
 
-_TAPER = 0.05
-_STEP_PX = 0.25
-_MIN_LAG_SHARE = 0.4  # of the shorter side, up to which lags are used
-_MIN_ELONGATION = 1.3
-_PEAK_ERRORS = 3.0
-_PEAK_PERCENTILE = 99.0
-_ROUND_RATIO = 1.88  # of the reaches of the autocorrelation of a round Gaussian
-_NEIGHBOURS = 3
-_MULTIPLE_ERROR = 0.1  # of the spacing, up to which a maximum belongs to a multiple of it
-_CONFIRMED, _CONFIRMED_SHARE = 0.2, 0.9  # of the spacing, and of the samples
-_WAVE_ZERO, _WAVE_MARGIN = 0.25, 0.003  # first zero over spacing of a sine wave
-_MERGED = 3.6  # spacing over radius at which filaments merge
 _FWHM = 2 * math.sqrt(2 * math.log(2))
 
 
@@ -69,12 +57,17 @@ def field_autocorrelation(component: FloatArray, weights: FloatArray) -> FloatAr
     waves = np.fft.rfft2(weights * (component - mean), shape)
     overlap = np.fft.irfft2(np.abs(np.fft.rfft2(weights, shape)) ** 2, shape)
     products = np.fft.irfft2(np.abs(waves) ** 2, shape)
-    lags = [int(_MIN_LAG_SHARE * count) for count in component.shape]
+    lags = _largest_lags(component.shape)
     rows, columns = (np.arange(-lag, lag + 1) for lag in lags)
     at = np.ix_(rows, columns)
     covariance = products[at] / np.maximum(overlap[at], 1e-9 * overlap[0, 0])
     variance = float(covariance[lags[0], lags[1]])
     return np.asarray(covariance / variance if variance > 0 else np.zeros_like(covariance))
+
+
+def _largest_lags(shape: tuple[int, ...], share: float = 0.4) -> list[int]:
+    """Return the largest lags along y and x in px."""
+    return [int(share * count) for count in shape]
 
 
 class Filaments(Product):
@@ -107,18 +100,17 @@ class Filaments(Product):
 
     def check(self, frame: FieldFrame) -> None:
         super().check(frame)
-        window_weights(frame.mask, _TAPER)
+        window_weights(frame.mask)
 
     def adapt(self, potential: FloatArray, noise: FieldNoise | None, frame: FieldFrame) -> Self:
         if self.angle is not None:
             return self
         displacement = displacement_from_potential(potential)
-        angle = _direction(displacement, window_weights(frame.mask, _TAPER))
+        angle = _direction(displacement, window_weights(frame.mask))
         return self.model_copy(update={"angle": angle})
 
-    def _lags(self, frame: FieldFrame) -> FloatArray:
-        most = int(_MIN_LAG_SHARE * min(frame.shape)) - 1
-        return np.arange(0.0, most, _STEP_PX)
+    def _lags(self, frame: FieldFrame, step: float = 0.25) -> FloatArray:
+        return np.arange(0.0, min(_largest_lags(frame.shape)) - 1, step)
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         dims, length, unit = ("lag",), frame.length_unit, frame.si_unit
@@ -139,7 +131,7 @@ class Filaments(Product):
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         potential, displacement = frame.at_points(potential, displacement)
-        weights = window_weights(frame.mask, _TAPER)
+        weights = window_weights(frame.mask)
         assert self.angle is not None  # by `adapt`
         radians = math.radians(self.angle)
         across = np.array([math.cos(radians), -math.sin(radians)])
@@ -148,10 +140,10 @@ class Filaments(Product):
         lags = self._lags(frame)
         correlation = _along(plane, across, lags)
         along = _along(plane, np.array([-across[1], across[0]]), lags)
-        zero = _first_below(correlation, lags, 0.0)
+        zero = first_below(lags, correlation, 0.0)
         length, half = _reach(along, lags), _reach(correlation, lags)
-        scatter = _scatter(weights, zero / math.sqrt(2), length)
-        spacing, order = _next_maximum(correlation, lags, _PEAK_ERRORS * scatter)
+        least = _least_maximum(weights, zero / math.sqrt(2), length)
+        spacing, order = _next_maximum(correlation, lags, least)
         radius = _radius(zero, spacing)
         field = frame.field(potential, displacement)
         strength = np.hypot(*field) if field.ndim == 3 else np.abs(field - np.median(field))
@@ -163,18 +155,21 @@ class Filaments(Product):
             "width": np.asarray(frame.length(_FWHM * radius)),
             "spacing": np.asarray(frame.length(spacing)),
             "order": np.asarray(order),
-            "elongation": np.asarray(length / half / _ROUND_RATIO),
+            # Of a round Gaussian the reaches of the autocorrelation have this ratio.
+            "elongation": np.asarray(length / half / 1.88),
             "rms": np.asarray(math.sqrt(float((used**2).mean()))),
-            "peak": np.asarray(np.percentile(used, _PEAK_PERCENTILE)),
+            "peak": np.asarray(np.percentile(used, 99)),
         }
 
-    def refine(self, quantities: dict[str, Quantity]) -> dict[str, Quantity]:
-        """Keep the spacing only if nearly all samples confirm it."""
+    def refine(
+        self, quantities: dict[str, Quantity], error: float = 0.2, least: float = 0.9
+    ) -> dict[str, Quantity]:
+        """Keep the spacing only if nearly all samples, a least share, confirm it to an error."""
         value, samples = quantities["spacing"].value, quantities["spacing"].samples
         if not len(samples):
             return quantities
-        is_confirmed = np.abs(samples / value - 1) < _CONFIRMED
-        if is_confirmed.mean() < _CONFIRMED_SHARE:
+        is_confirmed = np.abs(samples / value - 1) < error
+        if is_confirmed.mean() < least:
             nothing = Quantity(np.asarray(math.nan), np.full_like(samples, math.nan))
             return quantities | {"spacing": nothing, "order": nothing}
         confirmed = np.where(is_confirmed, samples, samples[is_confirmed].mean())
@@ -183,14 +178,16 @@ class Filaments(Product):
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
         return [fact for fact in super().facts(quantities, frame) if fact.key not in self.curves]
 
-    def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Caution]:
+    def cautions(
+        self, quantities: Mapping[str, Quantity], frame: FieldFrame, *, elongation: float = 1.3
+    ) -> Iterator[Caution]:
         if not np.isfinite(quantities["radius"].value):
             yield Caution(
                 "edge",
                 "the autocorrelation does not fall to zero within 40 % of the image: the "
                 "structures are too large for it, and have no size here",
             )
-        elif float(quantities["elongation"].value) < _MIN_ELONGATION:
+        elif float(quantities["elongation"].value) < elongation:
             yield Caution(
                 "misfit",
                 f"structures are only {to_figures(float(quantities['elongation'].value))} times as "
@@ -198,7 +195,7 @@ class Filaments(Product):
                 "nothing",
             )
         spacing, radius = (float(quantities[name].value) for name in ("spacing", "radius"))
-        if abs(math.sqrt(2) * radius / spacing - _WAVE_ZERO) < _WAVE_MARGIN:
+        if _is_wave(math.sqrt(2) * radius, spacing):
             yield Caution(
                 "accuracy",
                 "the filaments nearly merge into a wave, whose first zero does not depend on their "
@@ -227,58 +224,53 @@ def _along(plane: FloatArray, direction: FloatArray, lags: FloatArray) -> FloatA
     return np.asarray(np.where(inside, values, np.nan))
 
 
-def _first_below(values: FloatArray, lags: FloatArray, level: float) -> float:
-    """Return the first lag at which values fall below a level; NaN if none does."""
-    below = np.flatnonzero(values < level)
-    if not len(below) or below[0] == 0:
-        return math.nan
-    last = below[0]
-    step = (values[last - 1] - level) / (values[last - 1] - values[last])
-    return float(lags[last - 1] + step * (lags[last] - lags[last - 1]))
-
-
 def _reach(values: FloatArray, lags: FloatArray) -> float:
     """Return the lag at which values fall below ½; the largest lag if they do not."""
-    lag = _first_below(values, lags, 0.5)
+    lag = first_below(lags, values, 0.5)
     return lag if np.isfinite(lag) else float(lags[-1])
 
 
-def _scatter(weights: FloatArray, radius: float, length: float) -> float:
-    """Return the scatter of the autocorrelation of structures at random places."""
+def _least_maximum(weights: FloatArray, radius: float, length: float, errors: float = 3.0) -> float:
+    """Return some errors of the autocorrelation by the scatter of structures at random places."""
     if not np.isfinite(radius):
-        return 1.0
+        return errors
     count = float(weights.sum()) / max(4 * radius * max(length, radius), 1.0)
-    return 1 / math.sqrt(max(count, 1.0))
+    return errors / math.sqrt(max(count, 1.0))
 
 
-def _radius(zero: float, spacing: float) -> float:
+def _is_wave(zero: float, spacing: float, margin: float = 0.003) -> bool:
+    """Return whether the first zero is that of a sine wave, at a quarter of the spacing."""
+    return abs(zero / spacing - 0.25) < margin
+
+
+def _radius(zero: float, spacing: float, neighbours: int = 3, merged: float = 3.6) -> float:
     """Return the radius that belongs to the first zero, with neighbours at multiples of a spacing.
 
     Close neighbours move the zero inwards; of filaments that merge into a sine wave, with the zero
-    at a quarter of the spacing, it is the lower limit that a lone filament would have.
+    at a quarter of the spacing, `merged` radii, it is the lower limit that a lone filament would
+    have.
     """
     alone = zero / math.sqrt(2)
     if not np.isfinite(spacing):
         return alone
-    offsets = zero - spacing * np.arange(-_NEIGHBOURS, _NEIGHBOURS + 1)
+    offsets = zero - spacing * np.arange(-neighbours, neighbours + 1)
 
     def total(radius: float) -> float:
         squares = (offsets / (2 * radius)) ** 2
         return float(np.sum((1 - 2 * squares) * np.exp(-squares)))
 
-    if (
-        abs(zero / spacing - _WAVE_ZERO) < _WAVE_MARGIN
-        or total(alone) * total(spacing / _MERGED) >= 0
-    ):
+    if _is_wave(zero, spacing) or total(alone) * total(spacing / merged) >= 0:
         return alone
-    return float(brentq(total, alone, spacing / _MERGED))
+    return float(brentq(total, alone, spacing / merged))
 
 
-def _next_maximum(values: FloatArray, lags: FloatArray, least: float) -> tuple[float, float]:
+def _next_maximum(
+    values: FloatArray, lags: FloatArray, least: float, margin: float = 0.1
+) -> tuple[float, float]:
     """Return lag and height of the first maximum beyond the first zero.
 
-    It is above `least`, or its multiple is: the second neighbours of bent filaments may by chance
-    be aligned better than the first.
+    It is above `least`, or its multiple is (within a margin): the second neighbours of bent
+    filaments may by chance be aligned better than the first.
     """
     inner = values[1:-1]
     peaks = 1 + np.flatnonzero((inner >= values[:-2]) & (inner > values[2:]) & (inner > 0))
@@ -287,7 +279,7 @@ def _next_maximum(values: FloatArray, lags: FloatArray, least: float) -> tuple[f
     if not len(high):
         return math.nan, math.nan
     multiple = lags[high[0]] / lags[peaks]
-    is_spacing = np.abs(multiple - np.round(multiple)) < _MULTIPLE_ERROR * np.round(multiple)
+    is_spacing = np.abs(multiple - np.round(multiple)) < margin * np.round(multiple)
     peak = peaks[np.flatnonzero(is_spacing)[0]]
     # The top of the parabola through three values
     before, top, after = (float(value) for value in values[peak - 1 : peak + 2])

@@ -13,6 +13,7 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.analysis._derivatives import finer_field
+from napari_shadowinv.analysis.paths import is_inside
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.beam import SIField
@@ -214,8 +215,7 @@ class FieldFrame:
 
     def check_points(self, points: FloatArray, name: str) -> None:
         """Refuse points (n, 2) of which any is outside the image, with an `InputError`."""
-        size = np.array(self.shape)
-        outside = ~((points >= -0.5) & (points <= size - 0.5)).all(axis=1)
+        outside = ~is_inside(points, self.shape)
         if not np.isfinite(points).all():
             raise InputError(f"{name} has a point that is not finite, expected (y, x) in px")
         if outside.any():

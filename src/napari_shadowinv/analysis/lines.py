@@ -12,6 +12,8 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.paths import (
     interpolate_cubic,
+    is_inside,
+    mean_inside,
     path_directions,
     sample_path,
     sample_strip,
@@ -20,9 +22,6 @@ from napari_shadowinv.analysis.product import Coordinate, Product, Values, Varia
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import number_field
-
-_MAX_POINTS = 10_000
-_STEP_PX = 1.0
 
 
 def _checked_path(path: Any) -> Any:
@@ -37,7 +36,7 @@ def _checked_path(path: Any) -> Any:
 
 
 Path = Annotated[
-    tuple[tuple[float, float], ...], Field(max_length=_MAX_POINTS), AfterValidator(_checked_path)
+    tuple[tuple[float, float], ...], Field(max_length=10_000), AfterValidator(_checked_path)
 ]
 """Corners (y, x) of a line or path in px."""
 
@@ -76,7 +75,7 @@ class LineProfile(Product):
 
     @property
     def _distance(self) -> FloatArray:
-        return sample_path(self.path, _STEP_PX)[1]
+        return sample_path(self.path)[1]
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         name, dims, unit = frame.long_name, ("distance",), frame.si_unit
@@ -102,9 +101,9 @@ class LineProfile(Product):
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         field = frame.field(potential, displacement)
         if not frame.is_vector:
-            return {"value": self._mean_across(field, frame)}
+            return {"value": self._mean_across(field)}
         along = path_directions(self.path, self._distance)
-        components = np.stack([self._mean_across(plane, frame) for plane in field], axis=1)
+        components = np.stack([self._mean_across(plane) for plane in field], axis=1)
         right = np.stack([along[:, 1], -along[:, 0]], axis=1)
         return {
             "magnitude": np.hypot(*components.T),
@@ -127,15 +126,12 @@ class LineProfile(Product):
     def constants(self, frame: FieldFrame) -> Values:
         if frame.image is None:
             return {}
-        return {"intensity": self._mean_across(np.asarray(frame.image, dtype=np.float64), frame)}
+        return {"intensity": self._mean_across(np.asarray(frame.image, dtype=np.float64))}
 
-    def _mean_across(self, plane: FloatArray, frame: FieldFrame) -> FloatArray:
-        """Return means over the points of the strip that are inside the image."""
-        points = sample_strip(self.path, self._distance, self.width, _STEP_PX)
-        size = np.array(frame.shape)
-        inside = ((points >= -0.5) & (points <= size - 0.5)).all(axis=-1)
-        values = interpolate_cubic(plane, np.clip(points, -0.5, size - 0.5))
-        return np.asarray(np.where(inside, values, 0.0).sum(axis=0) / inside.sum(axis=0))
+    def _mean_across(self, plane: FloatArray) -> FloatArray:
+        points = sample_strip(self.path, self._distance, self.width)
+        clipped = np.clip(points, -0.5, np.array(plane.shape) - 0.5)
+        return mean_inside(interpolate_cubic(plane, clipped), is_inside(points, plane.shape))
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Caution]:
-        return mask_cautions(sample_path(self.path, _STEP_PX)[0], frame, "the line")
+        return mask_cautions(sample_path(self.path)[0], frame, "the line")

@@ -41,12 +41,7 @@ from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import length_text
 
 ORDER = 3
-MIN_SPACINGS = 1.5  # of the sites, in widths: finer structures are those of the cells
 _WIDTHS_PX = (0.0, *(0.7 * 2 ** (step / 4) for step in range(23)))
-_MAX_SHARE_OF_SIDE = 0.1
-_MIN_SIDE_PX = 12
-_MAX_LINEAR = 0.3  # of the Laplacian, for a comparison with the image
-_WIDTH_WITHOUT_NOISE_PX = 3.0
 # Wave number times width at which the gain is a half: 1 - (1 - exp(-x²/2))³ = ½.
 _HALF_GAIN = math.sqrt(-2 * math.log(1 - 0.5 ** (1 / ORDER)))
 
@@ -67,7 +62,14 @@ def smooth(plane: FloatArray, width: float, order: int = ORDER) -> FloatArray:
     return np.asarray(idctn(_gain(plane.shape, width, order) * dctn(plane)))
 
 
-def chosen_width(plane: FloatArray, noise: FloatArray, spacing: float) -> float:
+def least_width(spacing: float, spacings: float = 1.5) -> float:
+    """Return the least width for a spacing of sites: finer structures are those of the cells."""
+    return spacings * spacing
+
+
+def chosen_width(
+    plane: FloatArray, noise: FloatArray, spacing: float, *, most_share: float = 0.1
+) -> float:
     """Return the width in px that minimises the expected error of a smoothed plane.
 
     Parameters
@@ -78,11 +80,13 @@ def chosen_width(plane: FloatArray, noise: FloatArray, spacing: float) -> float:
         Samples of the noise.
     spacing : float
         Spacing of the sites in px; structures of single cells are smoothed away in any case.
+    most_share : float, default 0.1
+        Largest width over the shorter side.
     """
     square = dctn(plane, norm="ortho") ** 2
     by_noise = np.mean([dctn(sample, norm="ortho") ** 2 for sample in noise], axis=0)
-    most = max(_MAX_SHARE_OF_SIDE * min(plane.shape), 1.0)
-    least = min(MIN_SPACINGS * spacing, most)
+    most = max(most_share * min(plane.shape), 1.0)
+    least = min(least_width(spacing), most)
     widths = [least, *(width for width in _WIDTHS_PX if least < width <= most)]
 
     def risk(width: float) -> float:
@@ -106,27 +110,40 @@ class Smoothed(Product):
 
     def check(self, frame: FieldFrame) -> None:
         super().check(frame)
-        if min(frame.shape) < _MIN_SIDE_PX:
+        if min(frame.shape) < 12:
             raise InputError(
-                f"the field has {frame.shape[0]} × {frame.shape[1]} px, expected at least "
-                f"{_MIN_SIDE_PX} px each way for its {self.title}"
+                f"the field has {frame.shape[0]} × {frame.shape[1]} px, expected at least 12 px "
+                f"each way for its {self.title}"
             )
 
-    def adapt(self, potential: FloatArray, noise: FieldNoise | None, frame: FieldFrame) -> Self:
+    def adapt(
+        self, potential: FloatArray, noise: FieldNoise | None, frame: FieldFrame, width: float = 3.0
+    ) -> Self:
+        """Choose the smoothing: a width in px where the noise is not known."""
         if self.smoothing is not None:
             return self
-        width = _WIDTH_WITHOUT_NOISE_PX
         if noise is not None and len(noise.potentials):
             samples = np.array([laplacian(sample) for sample in noise.potentials])
             width = self._width(laplacian(potential), samples, noise.spacing)
         return self.model_copy(update={"smoothing": round(width, 3)})
 
+    def at_order(self, potential: FloatArray, frame: FieldFrame, order: int) -> Values:
+        """Measure with a smoothing of an order."""
+        raise NotImplementedError
+
+    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
+        return self.at_order(potential, frame, ORDER)
+
+    def systematic(
+        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
+    ) -> Values:
+        # The next order of the kernel shows what this one takes away.
+        finer = self.at_order(potential, frame, ORDER + 1)
+        values = self.at_order(potential, frame, ORDER)
+        return {name: finer[name] - value for name, value in values.items()}
+
     def _width(self, plane: FloatArray, noise: FloatArray, spacing: float) -> float:
         return chosen_width(plane, noise, spacing)
-
-    def sources(self, potential: FloatArray, order: int = ORDER) -> FloatArray:
-        """Return the smoothed Laplacian of a potential, shape (H, W), without a unit."""
-        return smooth(laplacian(potential), self.smoothing or 0.0, order)
 
     def smoothing_text(self, frame: FieldFrame) -> str:
         """Return the smoothing in words."""
@@ -164,15 +181,9 @@ class _SourceMap(Smoothed):
         # The outward flux of the displacement from a pixel is minus the Laplacian.
         return -source_by_flux(frame) / frame.pixel
 
-    def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
-        return {self.variable: self._per_curvature(frame) * self.sources(potential)}
-
-    def systematic(
-        self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
-    ) -> Values:
-        # The next order of the kernel shows what this one takes away.
-        lost = self.sources(potential, ORDER + 1) - self.sources(potential)
-        return {self.variable: self._per_curvature(frame) * lost}
+    def at_order(self, potential: FloatArray, frame: FieldFrame, order: int) -> Values:
+        sources = smooth(laplacian(potential), self.smoothing or 0.0, order)
+        return {self.variable: self._per_curvature(frame) * sources}
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> list[Fact]:
         name, density = self.variable, quantities[self.variable]
@@ -184,10 +195,10 @@ class _SourceMap(Smoothed):
             *self._linear_facts(density, frame),
         ]
 
-    def _linear_facts(self, density: Quantity, frame: FieldFrame) -> list[Fact]:
-        """Compare with the contrast of the image, which is the same for weak deflections."""
+    def _linear_facts(self, density: Quantity, frame: FieldFrame, most: float = 0.3) -> list[Fact]:
+        """Compare with the image's contrast, nearly the same for Laplacians up to `most`."""
         curvature = density.value / self._per_curvature(frame)
-        if frame.contrast is None or np.abs(curvature[frame.mask]).max() > _MAX_LINEAR:
+        if frame.contrast is None or np.abs(curvature[frame.mask]).max() > most:
             return []
         image = smooth(np.where(frame.mask, frame.contrast, 0.0), self.smoothing or 0.0)
         used = frame.mask

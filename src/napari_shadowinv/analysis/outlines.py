@@ -16,7 +16,6 @@ from napari_shadowinv.analysis.product import Product
 from napari_shadowinv.physics.beam import number_field
 
 Point = tuple[float, float]
-_MAX_CORNERS = 2000
 
 
 def _checked_corners(corners: Any) -> Any:
@@ -46,7 +45,7 @@ class Outlined(Product):
     path: Annotated[tuple[Point, ...] | None, AfterValidator(_checked_corners)] = Field(
         default=None,
         min_length=3,
-        max_length=_MAX_CORNERS,
+        max_length=2000,
         title="Path (px)",
         description="Corners (y, x) of a polygon, in px; the last is joined to the first.",
         json_schema_extra={"metavar": "Y,X Y,X …"},

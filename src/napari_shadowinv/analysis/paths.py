@@ -3,7 +3,8 @@
 - points along a path, and across it within a strip: `sample_path`, `sample_strip`
 - directions along a path, and its pieces: `path_directions`, `edge_midpoints`
 - a circle as a path: `circle_path`
-- values at points: `interpolate`, `interpolate_cubic`
+- values at points: `interpolate`, `interpolate_cubic`; means across a strip: `mean_inside`
+- where values fall below a level: `first_below`
 - the peak of a profile, its width and area: `measure_peak`, `PeakMeasures`
 - profiles as comma-separated text: `Profile`, `table_text`
 
@@ -21,11 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry.compiler import njit
-
-_MAX_SAMPLES = 5000
-_CIRCLE_CORNERS = 720
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,12 +36,16 @@ class Profile:
     averaging: str = ""  # across the line, in words; empty for values on the line
 
 
-def sample_path(vertices: ArrayLike, step: float) -> tuple[FloatArray, FloatArray]:
+def sample_path(vertices: ArrayLike, step: float = 1.0) -> tuple[FloatArray, FloatArray]:
     """Return points (n, 2) along a path, at most a step apart, and their distances along it."""
     corners, cumulative_length = _corners(vertices)
-    count = min(int(np.ceil(cumulative_length[-1] / step - 1e-9)) + 1, _MAX_SAMPLES)
-    distance = np.linspace(0, cumulative_length[-1], max(count, 2))
+    distance = np.linspace(0, cumulative_length[-1], _count(cumulative_length[-1], step, least=2))
     return _points_at(corners, cumulative_length, distance), distance
+
+
+def _count(length: float, step: float, least: int, most: int = 5000) -> int:
+    """Return the number of points at most a step apart."""
+    return min(max(int(np.ceil(length / step - 1e-9)) + least - 1, least), most)
 
 
 def _corners(vertices: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -65,14 +67,14 @@ def _points_at(
 
 
 def sample_strip(
-    vertices: ArrayLike, distance: FloatArray, width: float, step: float
+    vertices: ArrayLike, distance: FloatArray, width: float, step: float = 1.0
 ) -> FloatArray:
     """Return points (m, n, 2) of a strip: at n distances, m points across the path."""
     corners, cumulative_length = _corners(vertices)
     points = _points_at(corners, cumulative_length, distance)
     along_y, along_x = path_directions(vertices, distance).T
     across = np.stack([along_x, -along_y], axis=1)
-    count = min(max(int(np.ceil(width / step - 1e-9)), 1), _MAX_SAMPLES)
+    count = _count(width, step, least=1)
     offsets = width * ((np.arange(count) + 0.5) / count - 0.5)
     return np.asarray(points + offsets[:, None, None] * across)
 
@@ -86,11 +88,20 @@ def interpolate(
     plane = np.asarray(image, dtype=np.float64)
     pixels = to_pixels(points.reshape(-1, 2))
     values = np.asarray(map_coordinates(plane, pixels.T, order=1, mode="nearest"))
-    size = np.array(plane.shape)
-    inside = ((pixels >= -0.5) & (pixels <= size - 0.5)).all(axis=1)
-    rows = np.where(inside, values, 0.0).reshape(-1, points.shape[-2])
-    count = inside.reshape(rows.shape).sum(axis=0)
-    return np.where(count > 0, rows.sum(axis=0) / np.maximum(count, 1), np.nan)
+    shape = (-1, points.shape[-2])
+    return mean_inside(values.reshape(shape), is_inside(pixels, plane.shape).reshape(shape))
+
+
+def is_inside(points: FloatArray, shape: tuple[int, ...]) -> BoolArray:
+    """Return which points (..., 2) in px are inside an image."""
+    return np.asarray(((points >= -0.5) & (points <= np.array(shape) - 0.5)).all(axis=-1))
+
+
+def mean_inside(values: FloatArray, inside: BoolArray) -> FloatArray:
+    """Return means (n,) of values (m, n) inside; NaN where there are none."""
+    count = inside.sum(axis=0)
+    total = np.where(inside, values, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 @dataclass(frozen=True)
@@ -124,18 +135,19 @@ def measure_peak(distance: FloatArray, values: FloatArray) -> PeakMeasures | Non
     top = int(np.abs(values).argmax())
     peak = float(values[top])
     relative = values / peak if peak else np.zeros_like(values)
-    edges = [_half_maximum(distance[top::step], relative[top::step]) for step in (-1, 1)]
+    edges = [first_below(distance[top::step], relative[top::step], 0.5) for step in (-1, 1)]
     area = float(np.trapezoid(values, distance))
     return PeakMeasures(peak, float(distance[top]), edges[1] - edges[0], area)
 
 
-def _half_maximum(distance: FloatArray, relative: FloatArray) -> float:
-    """Return the distance at which a flank, starting at 1, falls to a half; NaN if it does not."""
-    below = np.flatnonzero(relative < 0.5)
+def first_below(places: FloatArray, values: FloatArray, level: float) -> float:
+    """Return the first place at which values fall below a level; NaN if they do not."""
+    below = np.flatnonzero(values < level)
     if not below.size or below[0] == 0:
-        return float("nan")
-    pair = slice(below[0] - 1, below[0] + 1)
-    return float(np.interp(-0.5, -relative[pair], distance[pair]))
+        return math.nan
+    last = below[0]
+    step = (values[last - 1] - level) / (values[last - 1] - values[last])
+    return float(places[last - 1] + step * (places[last] - places[last - 1]))
 
 
 def csv_text(rows: Iterable[Iterable[str]]) -> str:
@@ -171,7 +183,7 @@ def path_directions(vertices: ArrayLike, distance: FloatArray) -> FloatArray:
     return np.asarray((edges / lengths[:, None])[edge])
 
 
-def edge_midpoints(outline: FloatArray, step: float) -> tuple[FloatArray, FloatArray]:
+def edge_midpoints(outline: FloatArray, step: float = 0.5) -> tuple[FloatArray, FloatArray]:
     """Cut the edges of a path into pieces; return their middles and vectors, (n, 2) each."""
     edges = np.diff(outline, axis=0)
     counts = np.maximum(np.ceil(np.hypot(*edges.T) / step - 1e-9), 1).astype(np.int64)
@@ -181,10 +193,10 @@ def edge_midpoints(outline: FloatArray, step: float) -> tuple[FloatArray, FloatA
     return outline[:-1][edge] + (place[:, None] + 0.5) * pieces, pieces
 
 
-def circle_path(center: tuple[float, float], radius: float) -> FloatArray:
+def circle_path(center: tuple[float, float], radius: float, *, corners: int = 720) -> FloatArray:
     """Return corners (n, 2) of a closed polygon with the area of a circle, from x towards y."""
-    angles = np.linspace(0, 2 * np.pi, _CIRCLE_CORNERS + 1)
-    step = 2 * np.pi / _CIRCLE_CORNERS
+    angles = np.linspace(0, 2 * np.pi, corners + 1)
+    step = 2 * np.pi / corners
     corner_radius = radius * np.sqrt(step / np.sin(step))
     directions = np.stack([np.sin(angles), np.cos(angles)], axis=1)
     return np.asarray(np.asarray(center) + corner_radius * directions, dtype=np.float64)

@@ -32,16 +32,10 @@ from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 
-_MIN_SIDE_PX = 32
-_MIN_RINGS = 4
-_EXPONENTS = -12.0, 6.0
-_MARGIN = 0.15  # of the image's side, around a random field
-_CORRECTIONS = 2  # of the spectrum by a response of one phantom, before the final response
-_SMALLEST_RESPONSE = 0.05
-_SMOOTHED_SHARE = 0.1  # of k, over which the response is averaged
+MIN_RINGS = 4  # for a slope
 
 
-def window_weights(mask: BoolArray, taper: float) -> FloatArray:
+def window_weights(mask: BoolArray, taper: float = 0.05) -> FloatArray:
     """Return weights that rise from 0 at the border and at masked pixels to 1.
 
     Parameters
@@ -57,10 +51,10 @@ def window_weights(mask: BoolArray, taper: float) -> FloatArray:
         If the image is smaller than 32 px, or the masked pixels leave nothing.
     """
     side = min(mask.shape)
-    if side < _MIN_SIDE_PX:
+    if side < 32:
         raise InputError(
-            f"the image has {mask.shape[0]} × {mask.shape[1]} px, expected at least {_MIN_SIDE_PX} "
-            "px each way for a spectrum"
+            f"the image has {mask.shape[0]} × {mask.shape[1]} px, expected at least 32 px each way "
+            "for a spectrum"
         )
     width = max(taper * side, 1.0)
     weights = np.ones(mask.shape)
@@ -136,7 +130,9 @@ def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
     return RingSpectrum(at, power, number / 2 * share)
 
 
-def fit_exponent(k: FloatArray, power: FloatArray, modes: FloatArray) -> float:
+def fit_exponent(
+    k: FloatArray, power: FloatArray, modes: FloatArray, bounds: tuple[float, float] = (-12.0, 6.0)
+) -> float:
     """Return the exponent of a power law P = A kᵖ, by maximum likelihood.
 
     The power of each mode is distributed exponentially about its mean (Whittle's likelihood), so
@@ -149,9 +145,9 @@ def fit_exponent(k: FloatArray, power: FloatArray, modes: FloatArray) -> float:
     >>> round(fit_exponent(k, 3 * k**-2.5, np.ones(8)), 3)
     -2.5
     """
-    if len(k) < _MIN_RINGS:
+    if len(k) < MIN_RINGS:
         raise InputError(
-            f"the range of wavenumbers holds {len(k)} rings, expected at least {_MIN_RINGS} for a "
+            f"the range of wavenumbers holds {len(k)} rings, expected at least {MIN_RINGS} for a "
             "slope: widen it"
         )
     centre = float(np.exp(np.average(np.log(k), weights=modes)))
@@ -162,7 +158,7 @@ def fit_exponent(k: FloatArray, power: FloatArray, modes: FloatArray) -> float:
 
     best = minimize_scalar(
         lambda exponent: np.log(amplitude(exponent)) + exponent * np.sum(share * np.log(ratio)),
-        bounds=_EXPONENTS,
+        bounds=bounds,
         method="bounded",
         options={"xatol": 1e-6},
     )
@@ -220,6 +216,8 @@ def measure_response(
     phantoms: int,
     seed: int,
     report: Reporter,
+    corrections: int = 2,
+    least: float = 0.05,
 ) -> Response:
     """Measure how an inversion changes a spectrum, on random fields with that spectrum.
 
@@ -241,6 +239,10 @@ def measure_response(
     seed : int
     report : Reporter
         Called before each random field.
+    corrections : int, default 2
+        Number of first fields, by which the spectrum is corrected.
+    least : float, default 0.05
+        Smallest response by which it is corrected.
 
     Raises
     ------
@@ -249,16 +251,12 @@ def measure_response(
     """
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0
-    # Means over neighbouring rings, weighted by their modes
-    numbers = np.arange(1, len(spectrum.k) + 1)
-    reach = np.maximum(1.0, _SMOOTHED_SHARE * numbers)[:, None]
-    smooth = np.where(np.abs(numbers[:, None] - numbers) <= reach, spectrum.modes, 0.0)
-    smooth /= smooth.sum(axis=1, keepdims=True)
-    total, done = _CORRECTIONS + phantoms, 0
-    for count in (*(1,) * _CORRECTIONS, phantoms):
+    smooth = _mean_over_rings(spectrum.modes)
+    total, done = corrections + phantoms, 0
+    for count in (*(1,) * corrections, phantoms):
         # The same random numbers in each pass, so that the passes differ by the spectrum alone.
         rng = np.random.default_rng(seed)
-        power = spectrum.power / np.maximum(ratio, _SMALLEST_RESPONSE)
+        power = spectrum.power / np.maximum(ratio, least)
         pairs = []
         for _ in range(count):
             report("response", done, total)
@@ -276,6 +274,14 @@ def measure_response(
     return Response(ratio, spread, contrast)
 
 
+def _mean_over_rings(modes: FloatArray, share: float = 0.1) -> FloatArray:
+    """Return the matrix of means over rings within a share of k, weighted by their modes."""
+    numbers = np.arange(1, len(modes) + 1)
+    reach = np.maximum(1.0, share * numbers)[:, None]
+    smooth = np.where(np.abs(numbers[:, None] - numbers) <= reach, modes, 0.0)
+    return np.asarray(smooth / smooth.sum(axis=1, keepdims=True))
+
+
 def _phantom_spectra(
     k: FloatArray,
     power: FloatArray,
@@ -283,11 +289,12 @@ def _phantom_spectra(
     n_sites: int,
     rng: np.random.Generator,
     report: Reporter,
+    margin: float = 0.15,  # around the random field, over the image's side
 ) -> tuple[RingSpectrum, RingSpectrum, float]:
     """Return the spectra of a random field and of its inversion, and its r.m.s. divergence."""
-    margins = [int(np.ceil(_MARGIN * count)) for count in weights.shape]
+    margins = [int(np.ceil(margin * count)) for count in weights.shape]
     height, width = (count + 2 * m for count, m in zip(weights.shape, margins, strict=True))
-    inner = tuple(slice(margin, -margin) for margin in margins)
+    inner = tuple(slice(width, -width) for width in margins)
     density = np.maximum(power, 0.0) / (2 * np.pi * k)  # none beyond the rings
     potential, displacement = random_displacement(
         lambda at: np.interp(at, k, density, right=0.0), (height, width), rng

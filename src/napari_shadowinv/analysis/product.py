@@ -32,9 +32,6 @@ BANDS = 0.68, 0.95
 """Shares of probability of the bands that files, tables and figures have."""
 
 _NO_PREFIX = ("", "1", PIXEL, "m⁻²", "m⁻³")
-_MIN_SAMPLES = 2
-_NOTABLE_MASK = 0.02
-_NOTABLE_BIAS = 0.3  # of the standard deviation
 
 
 @dataclass(frozen=True)
@@ -227,13 +224,15 @@ def at_peak(quantity: Quantity) -> Quantity:
     return Quantity(np.asarray(quantity.value.ravel()[place]), samples[:, place])
 
 
-def mask_cautions(points: AnyArray, frame: FieldFrame, name: str) -> list[Caution]:
-    """Warn if points (n, 2) lie at masked pixels."""
+def mask_cautions(
+    points: AnyArray, frame: FieldFrame, name: str, *, notable: float = 0.02
+) -> list[Caution]:
+    """Warn if a notable share of points (n, 2) lies at masked pixels."""
     rows, columns = (
         np.clip(np.rint(points[:, axis]).astype(int), 0, frame.shape[axis] - 1) for axis in (0, 1)
     )
     share = 1 - float(frame.mask[rows, columns].mean())
-    if share <= _NOTABLE_MASK:
+    if share <= notable:
         return []
     text = (
         f"{share:.0%} of {name} is at masked pixels, where the field is only a smooth continuation"
@@ -243,7 +242,7 @@ def mask_cautions(points: AnyArray, frame: FieldFrame, name: str) -> list[Cautio
 
 def has_bands(quantity: Quantity) -> bool:
     """Return whether a quantity has samples for a band."""
-    return len(quantity.samples) >= _MIN_SAMPLES
+    return len(quantity.samples) >= 2
 
 
 def shown_unit(unit: str, frame: FieldFrame, largest: float) -> tuple[float, str]:
@@ -259,11 +258,11 @@ def shown_unit(unit: str, frame: FieldFrame, largest: float) -> tuple[float, str
     return factor, f"{prefix}{unit}"
 
 
-def corrected(quantity: Quantity) -> FloatArray:
+def corrected(quantity: Quantity, *, notable: float = 0.3) -> FloatArray:
     """Return values without the bias by noise, where it is a notable part of their errors."""
     if not has_bands(quantity):
         return quantity.value
-    is_biased = np.abs(quantity.bias) > _NOTABLE_BIAS * quantity.std
+    is_biased = np.abs(quantity.bias) > notable * quantity.std
     return np.asarray(quantity.value - np.where(is_biased, quantity.bias, 0.0))
 
 

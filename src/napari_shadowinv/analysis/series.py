@@ -35,9 +35,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-_MIN_SHOTS = 2
-_LEAST = 1e-300
-_SAMPLES = 1000  # of a growth rate by the scatter of the shots
 _TIME, _SHOT = SERIES_AXES
 _AXES = {"s": (_TIME, "time"), "": (_SHOT, "number of the shot")}
 
@@ -61,19 +58,6 @@ class TimeSeries:
         (places,) = self.result.coordinates.values()
         return np.asarray(places.values)
 
-    @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Values (n,) in SI units by the names of the numbers."""
-        return self.result.quantities
-
-    @property
-    def variables(self) -> dict[str, Variable]:
-        """Unit and long name of each number."""
-        return self.result.variables
-
-    def __getitem__(self, name: str) -> Quantity:
-        return self.quantities[name]
-
     def growth_rate(self, name: str) -> Quantity:
         """Return the rate γ in 1/s of exponential growth, such as of the r.m.s. of a region.
 
@@ -86,39 +70,40 @@ class TimeSeries:
         InputError
             If there is no such number, or it does not keep its sign.
         """
-        if name not in self.quantities:
-            names = ", ".join(self.quantities)
-            raise InputError(f"got the number {name!r}, expected one of {names}")
-        if not _keeps_sign(self.quantities[name]):
+        quantities = self.result.quantities
+        if name not in quantities:
+            raise InputError(f"got the number {name!r}, expected one of {', '.join(quantities)}")
+        if not _keeps_sign(quantities[name]):
             raise InputError(
                 f"{name} is zero or changes its sign in the series: expected numbers that grow or "
                 "decay, such as an r.m.s."
             )
-        return _growth_rate(self.quantities[name], self.times)
+        return _growth_rate(quantities[name], self.times)
 
 
 def _keeps_sign(quantity: Quantity) -> bool:
     return bool((np.sign(quantity.value[0]) * quantity.value > 0).all())
 
 
-def _growth_rate(quantity: Quantity, times: FloatArray) -> Quantity:
+def _growth_rate(quantity: Quantity, times: FloatArray, *, samples: int = 1000) -> Quantity:
+    """Return the rate, by the scatter of the shots with a number of samples."""
     sign, count = np.sign(quantity.value[0]), len(times)
     weights = np.ones(count)
     if has_bands(quantity):
-        weights = (quantity.value / np.maximum(quantity.std, _LEAST)) ** 2
+        weights = (quantity.value / np.maximum(quantity.std, 1e-300)) ** 2
     from_middle = times - (weights * times).sum() / weights.sum()
     factors = weights * from_middle / (weights * from_middle**2).sum()
 
     def slope(values: FloatArray) -> FloatArray:
-        return np.asarray(np.log(np.maximum(sign * values, _LEAST)) @ factors)
+        return np.asarray(np.log(np.maximum(sign * values, 1e-300)) @ factors)
 
     rate = slope(quantity.value)
-    if has_bands(quantity) or count <= _MIN_SHOTS:
+    if has_bands(quantity) or count <= 2:
         return Quantity(rate, slope(quantity.samples))
     logarithms = np.log(sign * quantity.value)
     residual = logarithms - logarithms.mean() - rate * from_middle
     error = np.sqrt((residual**2).sum() / (count - 2) / (from_middle**2).sum())
-    normal = np.random.default_rng(0).standard_t(count - 2, _SAMPLES)
+    normal = np.random.default_rng(0).standard_t(count - 2, samples)
     return Quantity(rate, rate + error * normal)
 
 
@@ -154,7 +139,7 @@ def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None
 
 def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> TimeSeries:
     """Join results at times in s, or at numbers of shots."""
-    if len(results) < _MIN_SHOTS or places.shape != (len(results),):
+    if len(results) < 2 or places.shape != (len(results),):
         raise InputError(
             f"got {len(results)} results and times of shape {places.shape}, expected a time for "
             "each of at least two shots"
@@ -236,7 +221,7 @@ def _rate_unit(rate: float, unit: str) -> tuple[float, str]:
     """Return the factor from a rate to one in a handy unit, and that unit."""
     if not unit:
         return 1.0, "per shot"
-    factor, prefix = prefix_for(1 / max(abs(rate), _LEAST))
+    factor, prefix = prefix_for(1 / max(abs(rate), 1e-300))
     return 1 / factor, f"1/{prefix}{unit}"
 
 
@@ -330,7 +315,7 @@ def analyse_shots(
         if len(shots) == 1:
             for result in shots[0]:
                 _single_numbers(result)  # the other shots would be measured in vain
-    if len(shots) < _MIN_SHOTS:
+    if len(shots) < 2:
         raise InputError(f"{len(shots)} of {count} shots have a field, expected at least two")
     unit_of_places = "" if times is None else "s"
     return [_join(results, places[used], unit_of_places) for results in zip(*shots, strict=True)]

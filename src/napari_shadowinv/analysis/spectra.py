@@ -27,6 +27,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -38,6 +39,7 @@ from napari_shadowinv._system.validation import CombinationError
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.power_spectra import (
+    MIN_RINGS,
     RingSpectrum,
     fit_exponent,
     measure_response,
@@ -57,17 +59,20 @@ _PLANES = (_N, "line_integrated_log_index")
 _ENERGY_FACTORS = {_B: math.pi, _E: 2 * math.pi, _N: math.pi}
 _RMS_FACTORS = {_B: 2.0, _E: 2.0, _N: 1.0}  # ⟨|B|²⟩ over ∫E dk
 _SYMBOLS = {_B: ("T", "Magnetic field"), _E: ("V/m", "Electric field"), _N: ("m⁻³", "Density")}
-_MAX_CONTRAST = 1.0
-_MAX_RAW_CONTRAST = 0.8  # as the inversion returns less
-_MIN_RINGS = 4
-_LEAST_RING = 3  # three wavelengths in the window
-_MAX_NOISE = 0.25  # of the power
-_RESPONSE_RANGE = 0.5, 2.0
-_RESPONSE_SPREAD = 0.25
-_MAX_K = 0.5  # of the Nyquist frequency
-_MIN_SPACINGS = 4.0  # wavelength, in spacings of the sites
-_MIN_SUBWINDOW_PX = 64
-_SUBWINDOWS = 3  # along each axis, overlapping by half
+
+
+@dataclass(frozen=True)
+class TrustedRings:
+    """Limits of what can be trusted; `benchmarks/spectra.py` measures slopes and bands by them."""
+
+    contrast: float = 1.0  # most for a slope from one image
+    raw_contrast: float = 0.8  # the same as the inversion returns it, which is less
+    first: int = 3  # three wavelengths in the window
+    noise: float = 0.25  # of the power
+    response: tuple[float, float] = (0.5, 2.0)
+    response_spread: float = 0.25
+    nyquist: float = 0.5  # wavenumber over the Nyquist frequency
+    spacings: float = 4.0  # of the sites in a wavelength
 
 
 class TurbulenceSpectrum(Product):
@@ -86,6 +91,7 @@ class TurbulenceSpectrum(Product):
     curves: ClassVar = ("power", "noise")
     lengths: ClassVar = ("correlation_length",)
     is_logarithmic: ClassVar = True
+    limits: ClassVar = TrustedRings()
     product: Literal["spectrum"] = "spectrum"
     path_length: float | None = number_field(
         "Path length (m)",
@@ -216,7 +222,7 @@ class TurbulenceSpectrum(Product):
             changes["response_spread"] = tuple(map(float, response.spread))
             product = self.model_copy(update=changes)
         contrast = max(product._contrast(spectrum), phantom_contrast)
-        most = _MAX_CONTRAST if product.response else _MAX_RAW_CONTRAST
+        most = self.limits.contrast if product.response else self.limits.raw_contrast
         if self.slope and is_inversion and contrast > most:
             raise InputError(
                 f"the contrast of the image is {to_figures(contrast)}, expected at most {most:g} "
@@ -227,10 +233,10 @@ class TurbulenceSpectrum(Product):
         ends = (int(trusted[0]), int(trusted[-1])) if len(trusted) else (0, 0)
         product = product.model_copy(update={"rings": ends})
         count = int(product._range(spectrum).sum())
-        if self.slope and count < _MIN_RINGS:
+        if self.slope and count < MIN_RINGS:
             raise InputError(
                 f"the range has {count} trusted rings of wavenumbers, expected at least "
-                f"{_MIN_RINGS} for a slope: noise, a spacing of the sites of "
+                f"{MIN_RINGS} for a slope: noise, a spacing of the sites of "
                 f"{to_figures(product.resolution)} px and crossed rays end the range; ask for the "
                 "spectrum without a slope"
             )
@@ -246,7 +252,7 @@ class TurbulenceSpectrum(Product):
         if not self.response:
             return signal
         response = np.array(self.response)
-        low, high = _RESPONSE_RANGE
+        low, high = self.limits.response
         return np.asarray(signal / np.clip(response, low / 2, 2 * high))
 
     def _contrast(self, spectrum: RingSpectrum) -> float:
@@ -257,22 +263,22 @@ class TurbulenceSpectrum(Product):
     def _resolved(self, spectrum: RingSpectrum) -> BoolArray:
         """Return the rings above the noise and within the resolution."""
         k = spectrum.k
-        rings = k <= _MAX_K * np.pi
+        rings = k <= self.limits.nyquist * np.pi
         if self.resolution:
-            rings &= k <= 2 * np.pi / (_MIN_SPACINGS * self.resolution)
+            rings &= k <= 2 * np.pi / (self.limits.spacings * self.resolution)
         if self.noise_power:
-            rings &= np.array(self.noise_power) <= _MAX_NOISE * spectrum.power
+            rings &= np.array(self.noise_power) <= self.limits.noise * spectrum.power
         return np.asarray(rings)
 
     def _trusted(self, spectrum: RingSpectrum) -> BoolArray:
         """Return the rings whose response is near 1, too: the longest range without a gap."""
         rings = self._resolved(spectrum)
         if self.response:
-            response, (low, high) = np.array(self.response), _RESPONSE_RANGE
+            response, (low, high) = np.array(self.response), self.limits.response
             rings &= (response >= low) & (response <= high)
         if self.response_spread:
-            rings &= np.array(self.response_spread) <= _RESPONSE_SPREAD
-        rings[: _LEAST_RING - 1] = False
+            rings &= np.array(self.response_spread) <= self.limits.response_spread
+        rings[: self.limits.first - 1] = False
         return _longest_run(rings)
 
     def _range(self, spectrum: RingSpectrum) -> BoolArray:
@@ -286,21 +292,14 @@ class TurbulenceSpectrum(Product):
             rings &= k <= 2 * np.pi / self.shortest * (1 + 1e-9)
         return rings
 
-    def _scale(self, frame: FieldFrame) -> float:
-        """Return the field for a displacement of 1 px; of a plane for a potential of 1 px · m."""
-        field = frame.unit.field
-        if frame.setup is None or field == "displacement":
-            return 1.0
-        if field in _PLANES:
-            return abs(float(frame.setup.field_in_si(field, np.ones(1))[0])) / frame.pixel
-        return float(np.abs(frame.setup.field_in_si(field, np.ones((2, 1)))).max())
-
     def _in_si(self, spectrum: RingSpectrum, power: FloatArray, frame: FieldFrame) -> FloatArray:
         """Convert the power of the displacement, for rad/px, to the field's, for rad/m."""
-        in_si = self._scale(frame) ** 2 * frame.pixel * power
-        if frame.unit.field in _PLANES:  # of the potential instead of its gradient
-            in_si = in_si / (spectrum.k / frame.pixel) ** 2
-        return np.asarray(in_si)
+        # The field by a displacement of 1 px; of a plane, by a potential of 1 px · m instead.
+        scale = float(np.abs(frame.field(np.ones(1), np.ones((2, 1)))).max())
+        if frame.unit.field not in _PLANES:
+            return np.asarray(scale**2 * frame.pixel * power)
+        in_si = (scale / frame.pixel) ** 2 * frame.pixel * power
+        return np.asarray(in_si / (spectrum.k / frame.pixel) ** 2)
 
     def variables(self, frame: FieldFrame) -> dict[str, Variable]:
         dims, unit, name = ("k",), frame.si_unit, frame.long_name.lower()
@@ -421,23 +420,23 @@ class TurbulenceSpectrum(Product):
         return errors
 
     def _slope_error(
-        self, potential: FloatArray, spectrum: RingSpectrum, frame: FieldFrame
+        self, potential: FloatArray, spectrum: RingSpectrum, frame: FieldFrame, parts: int = 3
     ) -> float:
-        """Return the standard error of the slope, by its scatter over parts of the image."""
+        """Return the standard error of the slope, by its scatter over parts of 64 px or more."""
         rings = self._range(spectrum)
         k_range = spectrum.k[rings][[0, -1]]
         size = [count // 2 for count in potential.shape]
         slopes, modes = [], 0.0
-        steps = [np.linspace(0, count - side, _SUBWINDOWS).astype(int)
+        steps = [np.linspace(0, count - side, parts).astype(int)
                  for count, side in zip(potential.shape, size, strict=True)]  # fmt: skip
         for row, column in itertools.product(*steps):
             part = np.s_[row : row + size[0], column : column + size[1]]
-            if min(size) < _MIN_SUBWINDOW_PX or not frame.mask[part].all():
+            if min(size) < 64 or not frame.mask[part].all():
                 continue
             window = ring_spectrum(potential[part], window_weights(frame.mask[part], 0.5))
             inside = (window.k >= k_range[0]) & (window.k <= k_range[1])
-            inside[: _LEAST_RING - 1] = False
-            if inside.sum() < _MIN_RINGS:
+            inside[: self.limits.first - 1] = False
+            if inside.sum() < MIN_RINGS:
                 continue
             power = self._interpolated(window, spectrum)
             slopes.append(fit_exponent(window.k[inside], power[inside], window.modes[inside]))
@@ -446,7 +445,7 @@ class TurbulenceSpectrum(Product):
         logarithm, weights = np.log(spectrum.k[rings]), spectrum.modes[rings]
         mean = np.average(logarithm, weights=weights)
         expected = float(1 / np.sqrt(np.sum(weights * (logarithm - mean) ** 2)))
-        if len(slopes) < _SUBWINDOWS:
+        if len(slopes) < parts:
             return expected
         # The parts hold fewer modes than the window as a whole.
         ratio = modes / float(weights.sum())
@@ -474,11 +473,11 @@ class TurbulenceSpectrum(Product):
             yield Fact("range", "Trusted range", "none", Level.DOUBTFUL)
 
     def cautions(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Caution]:
-        contrast = float(quantities["contrast"].value)
-        if contrast > _MAX_CONTRAST and self.resolution:
+        contrast, most = float(quantities["contrast"].value), self.limits.contrast
+        if contrast > most and self.resolution:
             yield Caution(
                 "folds",
-                f"the contrast is {to_figures(contrast)}, above {_MAX_CONTRAST:g}: rays cross so "
+                f"the contrast is {to_figures(contrast)}, above {most:g}: rays cross so "
                 "often that the spectrum of one image is too weak, and its slope wrong; fit "
                 "several images",
             )
