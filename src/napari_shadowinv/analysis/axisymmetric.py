@@ -32,9 +32,9 @@ from napari_shadowinv.analysis.paths import interpolate_cubic
 from napari_shadowinv.analysis.product import (
     Coordinate,
     FieldNoise,
+    Measurand,
     Product,
     Values,
-    Variable,
     mask_cautions,
 )
 from napari_shadowinv.cautions import Caution
@@ -242,7 +242,7 @@ class AxisymmetricProfile(Product):
             product = product.model_copy(update={"smoothing": smoothing})
         return product
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         profiles = self._profile_variables(frame)
         first = next(iter(profiles.values()))
         difference = f"{first.long_name}, right half minus left half"
@@ -250,33 +250,33 @@ class AxisymmetricProfile(Product):
         offset = "Symmetry axis of the field, offset from the axis"
         return profiles | {
             "half_difference": replace(first, long_name=difference),
-            "asymmetry": Variable((), "1", halves),
-            "edge": Variable((), "1", "Deflection at the edge, relative to the largest"),
-            "axis_offset": Variable((), PIXEL, offset),
+            "asymmetry": Measurand((), "1", halves),
+            "edge": Measurand((), "1", "Deflection at the edge, relative to the largest"),
+            "axis_offset": Measurand((), PIXEL, offset),
         }
 
-    def _profile_variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def _profile_variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         dims = ("along", "radius") if self._has_slices else ("radius",)
         field = frame.unit.field
         if field == _B:
-            return {"axial_field": Variable(dims, "T", "Axial magnetic field")}
+            return {"axial_field": Measurand(dims, "T", "Axial magnetic field")}
         if field == _E:
             return {
-                "electric_potential": Variable(dims, "V", "Electric potential"),
-                "radial_field": Variable(dims, "V/m", "Radial electric field"),
+                "electric_potential": Measurand(dims, "V", "Electric potential"),
+                "radial_field": Measurand(dims, "V/m", "Radial electric field"),
             }
         if field == _N:
-            return {"electron_density": Variable(dims, "m⁻³", "Electron density")}
+            return {"electron_density": Measurand(dims, "m⁻³", "Electron density")}
         if not _is_index(frame):
             long_name = "Deflection potential for each pixel along the beam"
-            return {"profile": Variable(dims, PIXEL, long_name)}
-        profiles = {"refractive_index": Variable(dims, "1", "Change of the refractive index")}
+            return {"profile": Measurand(dims, PIXEL, long_name)}
+        profiles = {"refractive_index": Measurand(dims, "1", "Change of the refractive index")}
         if self.gladstone_dale is not None:
-            profiles["density_change"] = Variable(dims, "kg/m³", "Change of the density")
+            profiles["density_change"] = Measurand(dims, "kg/m³", "Change of the density")
         if self.ambient_density is not None:
-            profiles["density"] = Variable(dims, "kg/m³", "Density")
+            profiles["density"] = Measurand(dims, "kg/m³", "Density")
         if self.ambient_temperature is not None:
-            profiles["temperature"] = Variable(dims, "K", "Temperature at constant pressure")
+            profiles["temperature"] = Measurand(dims, "K", "Temperature at constant pressure")
         return profiles
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
@@ -437,12 +437,12 @@ class AzimuthalProfile(Product):
         most = min(min(place, count - 1 - place) for place, count in pairs)
         return np.arange(_chosen_radius(self.radius, most, "centre") + 1.0)
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         dims = ("radius",)
         return {
-            "azimuthal_field": Variable(dims, "T m", "Path-integrated azimuthal magnetic field"),
-            "current": Variable(dims, "A m", "Path-integrated enclosed current"),
-            "variation": Variable(dims, "T m", "Variation of the field along the circle (r.m.s.)"),
+            "azimuthal_field": Measurand(dims, "T m", "Path-integrated azimuthal magnetic field"),
+            "current": Measurand(dims, "A m", "Path-integrated enclosed current"),
+            "variation": Measurand(dims, "T m", "Variation of the field along the circle (r.m.s.)"),
         }
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:

@@ -11,7 +11,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._derivatives import first_derivative, second_derivative
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.maps import Smoothed, least_width, smooth
-from napari_shadowinv.analysis.product import Values, Variable
+from napari_shadowinv.analysis.product import Measurand, Values
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Fact, Level, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -50,12 +50,14 @@ class Contrast(Smoothed):
         # A mean over the image bears more noise than a map, and bands are corrected for it.
         return max(super()._width(plane, noise, spacing) / 2, least_width(spacing))
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         return {
-            "mu": Variable((), "1", "Contrast parameter µ", "contrast µ"),
-            "displacement": Variable((), frame.length_unit, "Displacement, r.m.s."),
-            "scale": Variable((), frame.length_unit, "Scale over which the displacement varies"),
-            "compression": Variable((), "1", "Largest compression of the beam, 1 where rays cross"),
+            "mu": Measurand((), "1", "Contrast parameter µ", "contrast µ"),
+            "displacement": Measurand((), frame.length_unit, "Displacement, r.m.s."),
+            "scale": Measurand((), frame.length_unit, "Scale over which the displacement varies"),
+            "compression": Measurand(
+                (), "1", "Largest compression of the beam, 1 where rays cross"
+            ),
         }
 
     def at_order(self, potential: FloatArray, frame: FieldFrame, order: int) -> Values:

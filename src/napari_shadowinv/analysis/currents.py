@@ -18,7 +18,7 @@ from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.lines import Path, path_field
 from napari_shadowinv.analysis.outlines import Outlined
 from napari_shadowinv.analysis.paths import edge_midpoints, interpolate_cubic
-from napari_shadowinv.analysis.product import Product, Values, Variable, mask_cautions
+from napari_shadowinv.analysis.product import Measurand, Product, Values, mask_cautions
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -54,8 +54,8 @@ class Flux(Product):
         super().check(frame)
         frame.check_points(np.array(self.path), "the path")
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        return {"flux": Variable((), "Wb", "Magnetic flux across the line")}
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
+        return {"flux": Measurand((), "Wb", "Magnetic flux across the line")}
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         start, end = interpolate_cubic(potential, np.array([self.path[0], self.path[-1]]))
@@ -69,8 +69,8 @@ class _Enclosed(Outlined):
     unit: ClassVar[str]
     long_name: ClassVar[str]
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        return {self.name(): Variable((), self.unit, self.long_name)}
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
+        return {self.name(): Measurand((), self.unit, self.long_name)}
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         points, sides = edge_midpoints(self.outline)

@@ -28,7 +28,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.paths import first_below, interpolate_cubic
 from napari_shadowinv.analysis.power_spectra import window_weights
-from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Values, Variable
+from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Measurand, Product, Values
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, to_figures
@@ -112,18 +112,20 @@ class Filaments(Product):
     def _lags(self, frame: FieldFrame, step: float = 0.25) -> FloatArray:
         return np.arange(0.0, min(_largest_lags(frame.shape)) - 1, step)
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         dims, length, unit = ("lag",), frame.length_unit, frame.si_unit
         return {
-            "autocorrelation": Variable(dims, "1", "Autocorrelation of the field across filaments"),
-            "along": Variable(dims, "1", "Autocorrelation of that component along the filaments"),
-            "radius": Variable((), length, "Radius of a filament's Gaussian potential"),
-            "width": Variable((), length, "Width of a filament's potential at half its height"),
-            "spacing": Variable((), length, "Spacing of the filaments"),
-            "order": Variable((), "1", "Autocorrelation at the spacing"),
-            "elongation": Variable((), "1", "Length of filaments over their width"),
-            "rms": Variable((), unit, f"{frame.long_name} of the filaments, r.m.s."),
-            "peak": Variable((), unit, f"{frame.long_name} of the filaments, strongest per cent"),
+            "autocorrelation": Measurand(
+                dims, "1", "Autocorrelation of the field across filaments"
+            ),
+            "along": Measurand(dims, "1", "Autocorrelation of that component along the filaments"),
+            "radius": Measurand((), length, "Radius of a filament's Gaussian potential"),
+            "width": Measurand((), length, "Width of a filament's potential at half its height"),
+            "spacing": Measurand((), length, "Spacing of the filaments"),
+            "order": Measurand((), "1", "Autocorrelation at the spacing"),
+            "elongation": Measurand((), "1", "Length of filaments over their width"),
+            "rms": Measurand((), unit, f"{frame.long_name} of the filaments, r.m.s."),
+            "peak": Measurand((), unit, f"{frame.long_name} of the filaments, strongest per cent"),
         }
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:

@@ -18,7 +18,7 @@ from napari_shadowinv.analysis.paths import (
     sample_path,
     sample_strip,
 )
-from napari_shadowinv.analysis.product import Coordinate, Product, Values, Variable, mask_cautions
+from napari_shadowinv.analysis.product import Coordinate, Measurand, Product, Values, mask_cautions
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import number_field
@@ -77,22 +77,22 @@ class LineProfile(Product):
     def _distance(self) -> FloatArray:
         return sample_path(self.path)[1]
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         name, dims, unit = frame.long_name, ("distance",), frame.si_unit
         if not frame.is_vector:
-            variables = {"value": Variable(dims, unit, name)}
+            variables = {"value": Measurand(dims, unit, name)}
         else:
             variables = {
-                "magnitude": Variable(dims, unit, f"{name}, magnitude"),
-                "along": Variable(
+                "magnitude": Measurand(dims, unit, f"{name}, magnitude"),
+                "along": Measurand(
                     dims, unit, f"{name}, component along the line", "component along"
                 ),
-                "normal": Variable(
+                "normal": Measurand(
                     dims, unit, f"{name}, component to the right of the line", "component across"
                 ),
             }
         if frame.image is not None:
-            variables["intensity"] = Variable(dims, "1", "Intensity of the image")
+            variables["intensity"] = Measurand(dims, "1", "Intensity of the image")
         return variables
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:

@@ -29,9 +29,9 @@ from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.product import (
     Coordinate,
     FieldNoise,
+    Measurand,
     Product,
     Values,
-    Variable,
     at_peak,
     quantity_text,
 )
@@ -167,8 +167,8 @@ class _SourceMap(Smoothed):
     long_name: ClassVar[str]
     variable: ClassVar[str] = "density"
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
-        return {self.variable: Variable(("y", "x"), self.unit, self.long_name)}
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
+        return {self.variable: Measurand(("y", "x"), self.unit, self.long_name)}
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
         return {

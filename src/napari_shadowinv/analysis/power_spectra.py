@@ -200,7 +200,7 @@ def random_displacement(
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
+class SpectralResponse:
     """Spectrum of an inversion relative to the field's, in the rings of a spectrum."""
 
     ratio: FloatArray  # (n,); retrieved over true power
@@ -218,7 +218,7 @@ def measure_response(
     report: Reporter,
     corrections: int = 2,
     least: float = 0.05,
-) -> Response:
+) -> SpectralResponse:
     """Measure how an inversion changes a spectrum, on random fields with that spectrum.
 
     Rays cross, and small structures are lost, the more the stronger the field. Random fields are
@@ -271,7 +271,7 @@ def measure_response(
         if count > 1:
             spread = smoothed.std(axis=0, ddof=1) / count**0.5
             spread = np.sqrt(smooth @ spread**2)  # itself known from few phantoms
-    return Response(ratio, spread, contrast)
+    return SpectralResponse(ratio, spread, contrast)
 
 
 def _mean_over_rings(modes: FloatArray, share: float = 0.1) -> FloatArray:

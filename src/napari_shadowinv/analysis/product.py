@@ -1,4 +1,4 @@
-"""The base class of all products, and what describes their numbers: `Product`, `Variable`.
+"""The base class of all products, and what describes their numbers: `Product`, `Measurand`.
 
 - a number with its bands in words: `quantity_text`, `value_text`
 """
@@ -35,7 +35,7 @@ _NO_PREFIX = ("", "1", PIXEL, "m⁻²", "m⁻³")
 
 
 @dataclass(frozen=True)
-class Variable:
+class Measurand:
     """Number, or array of numbers, of a product.
 
     Attributes
@@ -152,7 +152,7 @@ class Product(Choice):
         """
         return self
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         """Describe the numbers that `measure` and `constants` return."""
         raise NotImplementedError
 

@@ -10,7 +10,7 @@ import numpy as np
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.outlines import Outlined
-from napari_shadowinv.analysis.product import Values, Variable, mask_cautions
+from napari_shadowinv.analysis.product import Measurand, Values, mask_cautions
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -37,25 +37,25 @@ class Region(Outlined):
                 "the region has no pixel's centre inside, expected a region of at least one pixel"
             )
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         unit, length, name = frame.si_unit, frame.length_unit, frame.long_name
         of_what = f"{name}, magnitude" if frame.is_vector else name
         variables = {
-            "mean": Variable((), unit, f"{of_what}, mean"),
-            "peak": Variable((), unit, f"{of_what}, peak"),
-            "rms": Variable((), unit, f"{of_what}, r.m.s."),
+            "mean": Measurand((), unit, f"{of_what}, mean"),
+            "peak": Measurand((), unit, f"{of_what}, peak"),
+            "rms": Measurand((), unit, f"{of_what}, r.m.s."),
         }
         if frame.is_vector:
             variables |= {
-                f"mean_{axis}": Variable((), unit, f"{name}, mean of its {axis} component")
+                f"mean_{axis}": Measurand((), unit, f"{name}, mean of its {axis} component")
                 for axis in "yx"
             }
         variables |= {
-            f"centroid_{axis}": Variable((), length, f"Centroid of the magnitude, {axis}")
+            f"centroid_{axis}": Measurand((), length, f"Centroid of the magnitude, {axis}")
             for axis in "yx"
         }
         if frame.image is not None:
-            variables["intensity"] = Variable((), "1", "Intensity of the image, mean")
+            variables["intensity"] = Measurand((), "1", "Intensity of the image, mean")
         return variables
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:

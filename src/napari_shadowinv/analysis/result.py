@@ -20,7 +20,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldUnit, field_unit, si_unit_of
 from napari_shadowinv.analysis.kinds import product_from_dict
 from napari_shadowinv.analysis.paths import csv_text
-from napari_shadowinv.analysis.product import BANDS, Coordinate, Product, Variable, has_bands
+from napari_shadowinv.analysis.product import BANDS, Coordinate, Measurand, Product, has_bands
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, Summarised
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -52,7 +52,7 @@ class ProductResult(Summarised):
     quantities : dict of str to Quantity
         Values in SI units, by the names of `variables`; with samples if the errors of the field
         are known and the product was not read from a file.
-    variables : dict of str to Variable
+    variables : dict of str to Measurand
         Axes, unit and long name of each.
     coordinates : dict of str to Coordinate
         Places along the axes.
@@ -72,7 +72,7 @@ class ProductResult(Summarised):
     field: str
     unit: FieldUnit
     quantities: dict[str, Quantity]
-    variables: dict[str, Variable]
+    variables: dict[str, Measurand]
     coordinates: dict[str, Coordinate]
     facts: tuple[Fact, ...]
     limits: tuple[str, ...]
@@ -271,7 +271,7 @@ def _from_entry(dataset: xarray.Dataset, entry: dict[str, Any]) -> ProductResult
         values = np.asarray(numbers_of(dataset, f"{name}_{variable}"), dtype=np.float64)
         values = values.reshape(array.shape)
         dims = tuple(str(axis).removeprefix(f"{name}_") for axis in array.dims)
-        variables[variable] = Variable(dims, array.attrs["units"], array.attrs["long_name"])
+        variables[variable] = Measurand(dims, array.attrs["units"], array.attrs["long_name"])
         quantities[variable] = Quantity(values, np.zeros((0, *values.shape)))
         if f"{name}_{variable}_std" in dataset:
             stored[variable] = {

@@ -19,8 +19,8 @@ from napari_shadowinv.analysis._analyse import analyse
 from napari_shadowinv.analysis.product import (
     BANDS,
     Coordinate,
+    Measurand,
     Product,
-    Variable,
     has_bands,
     value_text,
 )
@@ -176,7 +176,7 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Ti
     return TimeSeries(replace(result, facts=tuple(_facts(result, places, unit))))
 
 
-def _single_numbers(result: ProductResult) -> dict[str, Variable]:
+def _single_numbers(result: ProductResult) -> dict[str, Measurand]:
     """Return the variables that can be followed over the shots, or raise an `InputError`."""
     variables = {
         name: variable

@@ -46,7 +46,7 @@ from napari_shadowinv.analysis.power_spectra import (
     ring_spectrum,
     window_weights,
 )
-from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Product, Values, Variable
+from napari_shadowinv.analysis.product import Coordinate, FieldNoise, Measurand, Product, Values
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, to_figures
@@ -301,42 +301,42 @@ class TurbulenceSpectrum(Product):
         in_si = (scale / frame.pixel) ** 2 * frame.pixel * power
         return np.asarray(in_si / (spectrum.k / frame.pixel) ** 2)
 
-    def variables(self, frame: FieldFrame) -> dict[str, Variable]:
+    def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         dims, unit, name = ("k",), frame.si_unit, frame.long_name.lower()
         length = frame.length_unit
         squared = f"({unit})²"
         variables = {
-            "power": Variable(dims, f"{squared} {length}", f"Ring-summed spectrum P(k), {name}"),
-            "density": Variable(
+            "power": Measurand(dims, f"{squared} {length}", f"Ring-summed spectrum P(k), {name}"),
+            "density": Measurand(
                 dims, f"{squared} {length}²", f"Ring-averaged density P(k)/2πk, {name}"
             ),
-            "trusted": Variable(dims, "1", "Whether the ring is in the range of the slope"),
-            "rms": Variable((), unit, f"{frame.long_name}, r.m.s. in the range"),
-            "contrast": Variable((), "1", "Contrast, r.m.s. divergence of the displacement"),
-            "correlation_length": Variable(
+            "trusted": Measurand(dims, "1", "Whether the ring is in the range of the slope"),
+            "rms": Measurand((), unit, f"{frame.long_name}, r.m.s. in the range"),
+            "contrast": Measurand((), "1", "Contrast, r.m.s. divergence of the displacement"),
+            "correlation_length": Measurand(
                 (), length, "Correlation length in the range, (π/2) ∫E/k dk / ∫E dk"
             ),
         }
         if self.noise_power:
-            variables["noise"] = Variable(
+            variables["noise"] = Measurand(
                 dims, f"{squared} {length}", "Ring-summed spectrum of the noise"
             )
         if self.response:
-            variables["ratio"] = Variable(
+            variables["ratio"] = Measurand(
                 dims, "1", "Response of the inversion, retrieved over true power"
             )
         if self.slope:
-            variables["slope_power"] = Variable((), "1", "Slope of the ring-summed spectrum P(k)")
-            variables["slope"] = Variable((), "1", "Slope of the energy spectrum E(k) ∝ k P(k)")
+            variables["slope_power"] = Measurand((), "1", "Slope of the ring-summed spectrum P(k)")
+            variables["slope"] = Measurand((), "1", "Slope of the energy spectrum E(k) ∝ k P(k)")
         if self.path_length is not None:
             symbol, title = _SYMBOLS[frame.unit.field]
-            variables["energy"] = Variable(
+            variables["energy"] = Measurand(
                 dims, f"({symbol})² {length}", f"{title}, energy spectrum E(k)"
             )
-            variables["rms_field"] = Variable(
+            variables["rms_field"] = Measurand(
                 (), symbol, f"{title}, r.m.s., by ∫E dk over the path length"
             )
-            variables["rms_by_correlation"] = Variable(
+            variables["rms_by_correlation"] = Measurand(
                 (), symbol, f"{title}, r.m.s., by path and correlation length"
             )
         return variables
