@@ -11,16 +11,16 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
 _STEP = 0.25  # the largest for which the iteration is known to converge in two dimensions
-_TOLERANCE = 1e-7  # change of the energy in one step, as a share of the energy at the start
 
 
 def least_variation(
-    image: FloatArray, weight: float, iterations: int, report: Reporter
+    image: FloatArray, weight: float, iterations: int, report: Reporter, tolerance: float = 1e-7
 ) -> FloatArray:
     """Return the u that minimises ½∑(u - image)² + weight·∑|∇u|, with forward differences.
 
     Chambolle's fixed-point iteration for the dual field p, u being the image plus the divergence
-    of p: Journal of Mathematical Imaging and Vision 20, 89 (2004), equation (9).
+    of p: Journal of Mathematical Imaging and Vision 20, 89 (2004), equation (9). The tolerance is a
+    change of the energy in one step, as a share of the energy at the start.
     """
     image = np.ascontiguousarray(image)
     dual_y, dual_x = np.zeros_like(image), np.zeros_like(image)
@@ -30,7 +30,7 @@ def least_variation(
         energy = float(_step(image, dual_y, dual_x, weight))
         if step == 0:
             first = energy
-        elif abs(previous - energy) < _TOLERANCE * first:
+        elif abs(previous - energy) < tolerance * first:
             break
         previous = energy
     smooth = np.empty_like(image)

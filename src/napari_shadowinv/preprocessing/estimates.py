@@ -51,9 +51,6 @@ from napari_shadowinv.preprocessing.filters import low_pass
 from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
-_MIN_SUPPORT = 1e-6
-_MIN_WAVE_BLUR_PX = 2.0  # a Gaussian that is narrower has waves too short for the pixels
-
 
 class Estimate(Choice):
     """A way to estimate the undisturbed beam from the shot."""
@@ -222,17 +219,17 @@ class LowPassEstimate(Estimate):
 
 
 def _blur_masked(
-    values: FloatArray, usable: BoolArray, width: float, report: Reporter
+    values: FloatArray, usable: BoolArray, width: float, report: Reporter, least: float = 1e-6
 ) -> tuple[FloatArray, BoolArray]:
-    """Blur the usable pixels; return also where enough of them are within reach."""
+    """Blur the usable pixels; return also where at least a share of them is within reach."""
     blur: Callable[[FloatArray], FloatArray] = partial(low_pass, width=width)
-    if width < _MIN_WAVE_BLUR_PX:  # its time, unlike the other's, depends on the width
+    if width < 2:  # px, with waves too short for the pixels; its time depends on the width
         blur = partial(scipy.ndimage.gaussian_filter, sigma=width, mode="reflect")
     report("source", 0, 2)
     support = blur(usable.astype(np.float64))
     report("source", 1, 2)
     blurred = blur(np.where(usable, values, 0.0))
-    return blurred / np.maximum(support, _MIN_SUPPORT), support >= _MIN_SUPPORT
+    return blurred / np.maximum(support, least), support >= least
 
 
 def total_variation_source(
@@ -268,9 +265,7 @@ def total_variation_source(
     weight = pixels.checked_number("weight", weight, above=0, unit="px")
     iterations = pixels.checked_integer("iterations", iterations, least=1)
     report = Reporter(None, should_stop)
-    complete = (
-        values if usable.all() else pixels.fill_masked(values, usable, pixels.FILL_WIDTH, 2, report)
-    )
+    complete = values if usable.all() else pixels.fill_masked(values, usable, report)
     mean = values[usable].mean()
     beam = mean * least_variation(complete / mean, weight, iterations, report)
     return pixels.with_flux_of(beam, values, usable)
@@ -343,18 +338,11 @@ class KrigedEstimate(Estimate):
         return kriged_prior(image, mask, should_stop=should_stop)
 
 
-_MAX_FITTED_PIXELS = 2**16
-_MAX_FITS = 10
-_NOTABLE_EXTRAPOLATION = 1.5  # times the brightest pixel seen
-# Of a fitted Gaussian: height over the image's mean, and sides from the image's middle.
-_MAX_HEIGHT = 1e3
-_MAX_DISTANCE = 3.0
-
-
 def gaussian_source(
     image: ArrayLike,
     *,
     mask: ArrayLike | None = None,
+    notable: float = 1.5,
     should_stop: ShouldStop | None = None,
     on_caution: OnCaution | None = None,
 ) -> FloatArray:
@@ -366,6 +354,8 @@ def gaussian_source(
     ----------
     image : array_like, shape (H, W)
     mask, should_stop : optional
+    notable : float, default 1.5
+        Rise under the mask, over the brightest pixel that was fitted, above which it is doubtful.
     on_caution : callable, optional
         Receives a `Caution` if the fit is doubtful. Default: `warnings.warn` with its text.
 
@@ -398,7 +388,7 @@ def gaussian_source(
         )
         report_caution(Caution("source", text))
         return uniform_source(image, mask=mask)
-    if rise > _NOTABLE_EXTRAPOLATION:
+    if rise > notable:
         text = (
             f"the Gaussian beam rises to {to_figures(rise)} times the fitted data under the mask: "
             "compare it with another estimate, or mask less"
@@ -417,10 +407,10 @@ class GaussianEstimate(Estimate):
 
 
 def _block_samples(
-    values: FloatArray, usable: BoolArray
+    values: FloatArray, usable: BoolArray, most: int = 2**16
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return positions y, x and means of blocks of usable pixels, few enough for a fit."""
-    block = int(np.ceil(np.sqrt(values.size / _MAX_FITTED_PIXELS)))
+    block = int(np.ceil(np.sqrt(values.size / most)))
     share = block_means(usable.astype(np.float64), block)
     means = block_means(np.where(usable, values, 0.0), block)
     # A block is used only if it is complete, since a part of it has another middle.
@@ -433,12 +423,11 @@ def _block_samples(
 
 def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter) -> FloatArray:
     """Fit the parameters of `_gaussian` to samples, by repeated robust least squares."""
-    # Without bounds it may hide behind a mask.
-    steepest = math.sqrt(_MAX_FITTED_PIXELS)  # one over the width of a block of pixels
+    # Without bounds it may hide behind a mask: see the notes of `gaussian_source`.
     ranges = [
-        *[(0, _MAX_HEIGHT)] * 2,
-        *((axis.mean() - _MAX_DISTANCE, axis.mean() + _MAX_DISTANCE) for axis in (y, x)),
-        *[(-steepest, steepest)] * 3,
+        *[(0, 1e3)] * 2,
+        *((axis.mean() - 3, axis.mean() + 3) for axis in (y, x)),
+        *[(-256.0, 256.0)] * 3,
     ]
     bounds = tuple(np.transpose(ranges))
 
@@ -456,7 +445,7 @@ def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Repo
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
     parameters = fitted(np.clip(_guess_gaussian(y, x, sample), *bounds), "linear", 1.0)
     scale = 0.0
-    for _ in range(_MAX_FITS):
+    for _ in range(10):
         residual = _gaussian(parameters, y, x) - sample
         previous, scale = scale, max(NORMAL_MAD * float(np.median(np.abs(residual))), 1e-6)
         if abs(scale - previous) < 1e-2 * scale:
@@ -507,9 +496,6 @@ def _gaussian_slopes(parameters: FloatArray, y: FloatArray, x: FloatArray) -> Fl
     return np.stack(slopes, axis=1)
 
 
-_NOTABLE_FALL = 0.01  # of the fluence, from the brightest pixel to the dimmest
-
-
 def centre_within(
     shape: tuple[int, ...],
     matrix: FloatArray | None = None,
@@ -524,7 +510,11 @@ def centre_within(
 
 
 def uniform_warnings(
-    shape: tuple[int, int], setup: Setup | None, *, centre: tuple[float, float] | None = None
+    shape: tuple[int, int],
+    setup: Setup | None,
+    *,
+    centre: tuple[float, float] | None = None,
+    notable: float = 0.01,
 ) -> tuple[Caution, ...]:
     """Warn if a point source would light an image too unevenly to count as uniform.
 
@@ -536,11 +526,13 @@ def uniform_warnings(
         The experiment; no warning if it is unknown.
     centre : tuple of float, optional
         Pixel (y, x) in which the detector faces the point. Default: the middle of the image.
+    notable : float, default 0.01
+        Fall of the fluence of an isotropic point source, from the brightest pixel to the dimmest.
 
     Returns
     -------
     tuple of Caution
-        Empty where the fluence of an isotropic point source varies by 1 % at most.
+        Empty where it does not fall by more.
     """
     if setup is None or setup.is_collimated:
         return ()
@@ -551,7 +543,7 @@ def uniform_warnings(
     far = [max(place, side - 1 - place) for place, side in places]
     highest, lowest = ((1 + (math.hypot(*r) / distance) ** 2) ** -1.5 for r in (near, far))
     fall = 1 - lowest / highest
-    if fall <= _NOTABLE_FALL:
+    if fall <= notable:
         return ()
     text = (
         f"the source is assumed uniform, but a point source {setup.source_object_distance:.3g} m "

@@ -323,12 +323,6 @@ def _apply_gain(values: FloatArray, gain: FloatArray) -> FloatArray:
     return np.asarray(scipy.fft.idctn(gain * scipy.fft.dctn(values, norm="ortho"), norm="ortho"))
 
 
-_NORMAL_MEAN = 1.2533  # standard deviation over mean absolute deviation, normal noise
-_PIXELS_PER_NOISE_BIN = 400
-_MAX_NOISE_BINS = 16
-_MIN_PEER_SHARE = 0.5  # share of the threshold by which a pixel differs from its nearest peers
-
-
 class HotPixelFilter(Filter):
     """Replace broken pixels."""
 
@@ -363,6 +357,7 @@ def remove_hot_pixels(
     *,
     threshold: float = 6.0,
     size: int = 3,
+    peers: float = 0.5,
     should_stop: ShouldStop | None = None,
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
     """Replace outlying pixels by the median of their neighbourhood.
@@ -376,6 +371,8 @@ def remove_hot_pixels(
     size : int, default 3
         Side of the neighbourhood in px, odd. Clusters of up to an eighth of its area plus one
         are found: pairs with 3, four pixels with 5.
+    peers : float, default 0.5
+        Share of the threshold by which a pixel differs from all neighbours but so many.
     should_stop : callable, optional
         Asked at each step; when it returns true the search ends.
 
@@ -428,8 +425,8 @@ def remove_hot_pixels(
     local, bright, dark = _neighbours(values, size, Reporter(None, should_stop))
     difference = values - local
     limit = threshold * _noise(difference, local)
-    hot = (difference > limit) & (values - bright > _MIN_PEER_SHARE * limit)
-    dead = (difference < -limit) & (dark - values > _MIN_PEER_SHARE * limit)
+    hot = (difference > limit) & (values - bright > peers * limit)
+    dead = (difference < -limit) & (dark - values > peers * limit)
     return np.where(hot | dead, local, values), hot, dead
 
 
@@ -453,14 +450,16 @@ def _neighbours(
     return median, rank_filter(n - 1 - broken, "mirror"), rank_filter(broken, "mirror")
 
 
-def _noise(difference: FloatArray, brightness: FloatArray) -> FloatArray:
-    """Return the standard deviation of each pixel's difference, by its brightness."""
-    n_bins = min(max(difference.size // _PIXELS_PER_NOISE_BIN, 1), _MAX_NOISE_BINS)
+def _noise(
+    difference: FloatArray, brightness: FloatArray, least: int = 400, most: int = 16
+) -> FloatArray:
+    """Return the deviation of each pixel's difference, by groups of at least so many pixels."""
+    n_bins = min(max(difference.size // least, 1), most)
     groups = np.array_split(np.argsort(brightness, axis=None, kind="stable"), n_bins)
     flat, positive = difference.ravel(), np.maximum(brightness, 0).ravel()
     sizes = (np.abs(flat[group]) for group in groups)
-    # In few-bit images more than half the pixels can equal their median.
-    deviations = [NORMAL_MAD * np.median(size) or _NORMAL_MEAN * size.mean() for size in sizes]
+    # In few-bit images more than half the pixels can equal their median: by the mean, √(π/2).
+    deviations = [NORMAL_MAD * np.median(size) or 1.2533 * size.mean() for size in sizes]
     variance = np.array([float(deviation) ** 2 for deviation in deviations])
     if not variance.any():
         return np.zeros_like(difference)

@@ -22,22 +22,19 @@ from napari_shadowinv._system.arrays import (
     block_means,
     check_mask,
     check_plane,
+    complete_block_means,
     unpack_shot,
 )
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-FILL_WIDTH = 5.0  # px
-_COARSEST_SIDE_PX = 32
-_TOLERANCE = 1e-6
-
 
 def interpolated_source(
     image: ArrayLike,
     mask: ArrayLike,
     *,
-    width: float = FILL_WIDTH,
+    width: float = 5.0,
     kind: Literal["biharmonic", "laplace"] = "biharmonic",
     should_stop: ShouldStop | None = None,
 ) -> FloatArray:
@@ -79,12 +76,12 @@ def interpolated_source(
     width = checked_number("width", width, above=0, unit="px")
     power = 2 if kind == "biharmonic" else 1
     report = Reporter(None, should_stop)
-    beam = np.where(usable, values, fill_masked(values, usable, width, power, report))
+    beam = np.where(usable, values, fill_masked(values, usable, report, width, power))
     return with_flux_of(beam, values, usable)
 
 
 def fill_masked(
-    values: FloatArray, usable: BoolArray, width: float, power: int, report: Reporter
+    values: FloatArray, usable: BoolArray, report: Reporter, width: float = 5.0, power: int = 2
 ) -> FloatArray:
     """Fit a smoothing spline to the usable pixels and continue it over the others."""
     mean = values[usable].mean()
@@ -96,7 +93,7 @@ def _spline(
     weighted: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
 ) -> FloatArray:
     """Minimise ∑ share·(u - value)² + width^2p ∑ u(-Δ)ᵖu, `weighted` being share·value."""
-    if min(weighted.shape) < _COARSEST_SIDE_PX:
+    if min(weighted.shape) < 32:
         start = np.full(weighted.shape, weighted.sum() / share.sum())
     else:  # from pixels twice as large
         coarse = _spline(block_means(weighted, 2), block_means(share, 2), width / 2, power, report)
@@ -123,7 +120,7 @@ def _spline(
         weighted.ravel(),
         x0=start.ravel(),
         M=scipy.sparse.linalg.LinearOperator(shape, matvec=nearly_inverse, dtype=np.float64),
-        rtol=_TOLERANCE,
+        rtol=1e-6,
         maxiter=500,
     )
     return np.asarray(solution.reshape(weighted.shape))
@@ -137,11 +134,8 @@ def _double_rows(coarse: FloatArray, side: int) -> FloatArray:
     return np.asarray(rows.reshape(-1, coarse.shape[1])[:side])
 
 
-_MAX_DEGREE = 10
-_MAX_REWEIGHTINGS = 50
-# As a share of the mean: the floor to which an inversion raises an image's dark pixels.
-_MIN_BEAM_SHARE = 1e-3
 MAX_EXTRAPOLATION = 10.0  # times the brightest pixel seen
+LEAST_LIGHT = 0.05  # of the mean, to be compared with other light
 
 
 def checked_pixels(image: ArrayLike, mask: ArrayLike | None = None) -> tuple[FloatArray, BoolArray]:
@@ -185,6 +179,11 @@ def checked_integer(name: str, value: int, *, least: int, most: int | None = Non
     return number
 
 
+def complete_blocks(mask: BoolArray, block: int, share: float = 0.999) -> BoolArray:
+    """Return which blocks of pixels are usable, by a least share of their pixels."""
+    return complete_block_means(mask, block) > share
+
+
 def check_kind(kind: str, *kinds: str) -> None:
     """Raise an `InputError` unless a kind is one of those that there are."""
     if kind not in kinds:
@@ -203,10 +202,13 @@ def beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, B
     return values, usable
 
 
-def with_flux_of(beam: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:
-    """Return a beam, positive and with the flux of an image over its usable pixels."""
+def with_flux_of(
+    beam: FloatArray, values: FloatArray, usable: BoolArray, floor: float = 1e-3
+) -> FloatArray:
+    """Return a beam with the flux of an image over its usable pixels, above a share of the mean."""
+    # The floor is that to which an inversion raises an image's dark pixels.
     mean = values[usable].mean()
-    positive = np.maximum(beam, _MIN_BEAM_SHARE * mean)
+    positive = np.maximum(beam, floor * mean)
     source = np.asarray(positive * (mean / positive[usable].mean()))
     brightest = float(values[usable].max())
     if not source.max() <= MAX_EXTRAPOLATION * brightest:
@@ -250,7 +252,7 @@ def fit_polynomial(
         If image, mask or degree cannot be used, or usable pixels are fewer than coefficients.
     """
     values, usable = checked_pixels(image, mask)
-    degree = checked_integer("degree", degree, least=0, most=_MAX_DEGREE)
+    degree = checked_integer("degree", degree, least=0, most=10)
     terms = (degree + 1) * (degree + 2) // 2
     if usable.sum() < terms:
         raise InputError(
@@ -263,7 +265,7 @@ def fit_polynomial(
     fit = _weighted_fit(values, usable.astype(np.float64), rows, columns)
     rounding = 1e-12 * float(np.abs(values).max())
     report = Reporter(None, should_stop)
-    for step in range(_MAX_REWEIGHTINGS):
+    for step in range(50):
         report("fit", step)
         residual = values - fit
         scale = NORMAL_MAD * float(np.median(np.abs(residual[usable])))

@@ -27,10 +27,6 @@ if TYPE_CHECKING:
     from napari_shadowinv._system.progress import ShouldStop
 
 
-_MIN_SIDE_PX = 4  # px of a crop
-_MIN_DATA_SHARE = 0.999  # of a rotated pixel that must have data
-
-
 class Choice(CheckedModel):
     """One of several ways to do something, with its parameters."""
 
@@ -236,14 +232,15 @@ class Rotate(Step):
         rotated = self._interpolate(shot) if turns is None else shot.map_planes(turn, turn)
         return rotated.add_notes(f"rotated by {self.angle:g}°")
 
-    def _interpolate(self, shot: Shot) -> Shot:
+    def _interpolate(self, shot: Shot, least: float = 0.999) -> Shot:
+        """Rotate by any angle; a pixel can be used if a least share of it has data."""
         usable = shot.usable
         share = self._move(usable.astype(np.float64))
-        mask = share > _MIN_DATA_SHARE
+        mask = share > least
 
         def values(image: FloatArray) -> FloatArray:
             moved = self._move(np.where(usable, image, 0.0))
-            return np.where(mask, moved / np.maximum(share, _MIN_DATA_SHARE), 0.0)
+            return np.where(mask, moved / np.maximum(share, least), 0.0)
 
         rotated = shot.map_planes(values, lambda bare: self._move(bare.astype(float)) > 0.5)
         return replace(rotated, mask=mask)
@@ -320,10 +317,10 @@ class Crop(Step):
             for part, side in zip((self.y, self.x), shape, strict=True)
         )
         height, width = rows.stop - rows.start, columns.stop - columns.start
-        if min(height, width) < _MIN_SIDE_PX:
+        if min(height, width) < 4:
             raise InputError(
                 f"the crop contains {max(width, 0)} × {max(height, 0)} pixels of the image, "
-                f"expected at least {_MIN_SIDE_PX} × {_MIN_SIDE_PX}: choose a larger rectangle"
+                "expected at least 4 × 4: choose a larger rectangle"
             )
         return rows, columns
 
