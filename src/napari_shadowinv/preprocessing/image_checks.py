@@ -34,50 +34,63 @@ from scipy import ndimage
 from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.preprocessing.pixels import nonnegative_fit
+from napari_shadowinv.preprocessing.pixels import LEAST_LIGHT, complete_blocks, nonnegative_fit
 
-# Gaps of detectors
-_TYPE_BITS = (15, 16, 20, 24, 31, 32)  # the largest numbers mark gaps, and three below bad pixels
-_MAX_LIGHT = 0.5  # of the mark, for all other pixels
-_MAX_MARKS = 3  # negative ones, in one image
-_MIN_GAP_SHARE, _GAP_SIDE_PX = 0.5, 3  # of the pixels with a mark, in squares
+_WINDOW_PX = 4  # side of the squares in which noise is measured
+_INDEPENDENT_SHARE = 4 / 9  # of the differences in them, which share pixels
 
-# Dark pixels, by their means over squares
-_SIDES_PX = 3, 9  # for darkness, and for noise
-_DARK, _DIM = 0.03, 0.1  # of the light elsewhere: without doubt, and if noise exceeds it
-_MIN_NOISE = 0.8  # of the light, per pixel
-_LIT = 0.3  # of the light elsewhere, just outside the sharp edge of a window
-_MAX_PILE = 1.5  # there, unless the light was deflected out of a hollow
-_EDGE_PX, _SHARP_EDGE_PX = (6, 9), (2, 4)  # outside a dark region, and without a source
-_LIT_SHARPLY = 0.4  # there without a source: a beam may fall smoothly
 
-# Saturation
-_MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE = 10, 5e-4
-_PLATEAU_RISE = 1.15  # of the maximum over the median
-_BELOW_PLATEAU = 0.02  # of the range from median to maximum
-_PLATEAU_EXCESS = 4.0  # pixels at the maximum over those just below
+@dataclass(frozen=True)
+class GapCheck:
+    """Limits of the marks by which a detector shows its gaps (`benchmarks/wrong_inputs.py`)."""
 
-# Hot and dead pixels
-_STRAY_RATIO, _STRAY_DEVIATIONS = 1.5, 10.0
-_MAX_NEIGHBOUR_DIFFERENCE = 0.3  # of the surroundings' brightness, by which a neighbour may differ
-_STRAY_STEP = 0.05  # of the mean, from the pixel on the left
-_NOISE_SAMPLES = 50_000
+    # Of types whose largest numbers mark gaps, and three below bad pixels
+    bits: tuple[int, ...] = (15, 16, 20, 24, 31, 32)
+    light: float = 0.5  # most of all other pixels, over the mark
+    marks: int = 3  # most negative ones, in one image
+    filled: float = 0.5  # least share of the pixels with a mark, in squares
+    side: int = 3  # of these squares, px
 
-# Negatives
-# Of film that is exposed in its middle: the rim's width over the shorter side, its least brightness
-# over the brightest, and the middle's greatest over the rim's.
-_RIM, _AS_BRIGHT, _DARKER = 0.05, 0.9, 0.8
-_FALLING_DEVIATIONS = 4.0  # of the slope of the noise's variance with the brightness
 
-# Reference
-_COARSE_SIDE_PX = 128
-_MIN_BLOCKS = 16
-_MIN_USABLE_SHARE = 0.999  # share of a block's pixels
-_RING_SHARE = 0.2  # of the side: there is rarely an object
-_MIN_CONTRAST = 0.01  # of the mean
-_NEGATIVE_CORRELATION = -0.4
-_DETAIL_BLOCKS = 9  # coarse pixels
-_MIN_SWAPPED_RATIO = 0.75  # see `is_swapped`
+@dataclass(frozen=True)
+class DarkCheck:
+    """Limits of pixels without light, over the light elsewhere (`benchmarks/wrong_inputs.py`)."""
+
+    sides: tuple[int, int] = (3, 9)  # of the squares for darkness, and for noise, px
+    dark: float = 0.03  # without doubt
+    dim: float = 0.1  # if the noise exceeds it
+    noise: float = 0.8  # of the light, per pixel
+    edge: tuple[int, int] = (6, 9)  # px outside a dark region, where a window is lit
+    lit: float = 0.3  # there
+    # Without a source a beam may fall smoothly, and an object pile up light around a hollow.
+    sharp_edge: tuple[int, int] = (2, 4)
+    sharply_lit: tuple[float, float] = (0.4, 1.5)
+
+
+@dataclass(frozen=True)
+class SaturationCheck:
+    """Limits of a plateau at the maximum (`benchmarks/wrong_inputs.py`)."""
+
+    pixels: int = 10  # fewest on it
+    share: float = 5e-4  # least of all pixels
+    rise: float = 1.15  # of the maximum over the median
+    below: float = 0.02  # of the range from median to maximum, that counts as just below
+    excess: float = 4.0  # pixels at the maximum over those just below
+
+
+@dataclass(frozen=True)
+class DarkLevelCheck:
+    """Limits of an offset in the noise (`benchmarks/wrong_inputs.py`); gains are of relative χ²."""
+
+    level: float = LEAST_LIGHT  # least of the offset, and of the dimmest brightness, over the mean
+    least_range: float = 1.3  # of brightness
+    wide_range: float = 2.0
+    gain: float = 8.0  # of one image
+    shared_gain: float = 11.0  # of image and source
+    narrow_gain: float = 40.0  # of either, if the range is not wide
+    free_gain: float = 1.0  # if any noise in proportion to the signal is allowed
+    chi2: float = 5.0  # most per degree of freedom
+    pattern: float = 2.0  # standard deviations of the uneven pixels that both share
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,6 +99,9 @@ class CheckedImage:
 
     image: FloatArray  # 0 at pixels that are not usable
     usable: BoolArray
+    saturation: SaturationCheck = SaturationCheck()
+    bins: int = 20  # of brightness, in which noise is measured
+    left_out: float = 0.05  # share of the brightest pixels there: bright lines are not smooth
 
     @classmethod
     def of(cls, image: FloatArray, mask: BoolArray | None = None) -> CheckedImage:
@@ -106,23 +122,23 @@ class CheckedImage:
     @cached_property
     def saturated(self) -> float:
         """Share of the other pixels on a plateau at the maximum; 0 if there is none."""
-        used = self.usable & ~self.stray
+        used, check = self.usable & ~self.stray, self.saturation
         values = self.image.ravel() if used.all() else self.image[used]
         top = float(values.max())
         at_top = int((values == top).sum())
-        if at_top < max(_MIN_PLATEAU_PIXELS, _MIN_PLATEAU_SHARE * values.size):
+        if at_top < max(check.pixels, check.share * values.size):
             return 0.0
         median = float(np.median(values))
-        if not top > _PLATEAU_RISE * median:
+        if not top > check.rise * median:
             return 0.0
-        just_below = int((values > top - _BELOW_PLATEAU * (top - median)).sum()) - at_top
-        return at_top / values.size if at_top > _PLATEAU_EXCESS * just_below else 0.0
+        just_below = int((values > top - check.below * (top - median)).sum()) - at_top
+        return at_top / values.size if at_top > check.excess * just_below else 0.0
 
     @cached_property
     def _local(self) -> tuple[FloatArray, FloatArray]:
         """Means of 4 × 4 usable pixels, and differences in which smooth structure cancels."""
         image, usable = self.image, self.usable
-        lines = max(1, image.size // _MAX_NOISE_SAMPLES)  # of long images, lines far apart
+        lines = max(1, image.size // 80_000)  # of long images, lines far apart
         last = len(image) - _WINDOW_PX + 1
         first, second, third, fourth = (image[k : last + k : lines] for k in range(_WINDOW_PX))
         steps = second - third
@@ -148,14 +164,19 @@ class CheckedImage:
         """
         brightness, differences = self._local
         order = order_by_value(brightness)
-        order = order[: int((1 - _BRIGHTEST_LEFT_OUT) * order.size)]
-        parts = np.array_split(order, _N_BRIGHTNESS_BINS)
+        parts = np.array_split(order[: int((1 - self.left_out) * order.size)], self.bins)
         levels = np.array([brightness[part].mean() for part in parts])
         sizes = (np.abs(differences[part]) for part in parts)
         clipped = (size[size <= _clip_limit(size)] for size in sizes)
-        noise = np.sqrt([float((size**2).mean()) / _CLIPPED_VARIANCE for size in clipped])
+        # Normal numbers that are clipped at three deviations have this variance.
+        noise = np.sqrt([float((size**2).mean()) / 0.9733 for size in clipped])
         counts = np.array([len(part) for part in parts]) * _INDEPENDENT_SHARE
         return np.array([levels, noise, noise / np.sqrt(counts)])
+
+    @property
+    def shows_noise(self) -> bool:
+        """Whether it has pixels enough to measure the noise."""
+        return min(self.image.shape) >= _WINDOW_PX and self.brightness.size >= 4000
 
     @cached_property
     def noise_slope(self) -> float:
@@ -164,7 +185,7 @@ class CheckedImage:
         Noise of reading, of counting, and of an uneven response do not fall with the light, but
         that of a negative does.
         """
-        if min(self.image.shape) < _WINDOW_PX or self.brightness.size < _MIN_PIXELS:
+        if not self.shows_noise:
             return 0.0
         levels, noise, uncertainty = self.noise_bins
         if not ((noise > 0).all() and np.ptp(levels) > 0):
@@ -181,7 +202,7 @@ class CheckedImage:
     def relative_differences(self) -> FloatArray:
         """Differences over the brightness, clipped."""
         brightness, differences = self._local
-        values = differences / np.maximum(brightness, _MIN_DARK * abs(float(brightness.mean())))
+        values = differences / np.maximum(brightness, LEAST_LIGHT * abs(float(brightness.mean())))
         limit = _clip_limit(np.abs(values))
         return np.clip(values, -limit, limit)
 
@@ -209,17 +230,19 @@ def mask_gaps(
     return usable & ~gaps, [Caution("unlit", text)]
 
 
-def _marked_pixels(plane: FloatArray, usable: BoolArray) -> BoolArray | None:
+def _marked_pixels(
+    plane: FloatArray, usable: BoolArray, check: GapCheck = GapCheck()
+) -> BoolArray | None:
     """Return the usable pixels with one more mark; None if there is none."""
     if not usable.any():
         return None
     values = plane[usable]
     highest, lowest = float(values.max()), float(values.min())
-    if any(-1 <= 2.0**bits - highest <= 3 for bits in _TYPE_BITS):
+    if any(-1 <= 2.0**bits - highest <= 3 for bits in check.bits):
         marked = usable & (plane > highest - 3)
         others = values[values <= highest - 3]
         is_gap = ndimage.binary_erosion(marked, np.ones((2, 2))).any()
-        if is_gap and others.size and others.max() < _MAX_LIGHT * highest:
+        if is_gap and others.size and others.max() < check.light * highest:
             return marked
     if not lowest < 0:
         return None
@@ -227,9 +250,9 @@ def _marked_pixels(plane: FloatArray, usable: BoolArray) -> BoolArray | None:
     for mark in (negative[-1], lowest):
         marked = usable & (plane <= mark)
         marks = negative[negative <= mark]
-        if len(marks) <= _MAX_MARKS and (marks == np.rint(marks)).all():
-            filled = ndimage.binary_opening(marked, np.ones((_GAP_SIDE_PX, _GAP_SIDE_PX)))
-            if filled.sum() >= _MIN_GAP_SHARE * marked.sum():
+        if len(marks) <= check.marks and (marks == np.rint(marks)).all():
+            filled = ndimage.binary_opening(marked, np.ones((check.side, check.side)))
+            if filled.sum() >= check.filled * marked.sum():
                 return marked
     return None
 
@@ -259,37 +282,39 @@ def mask_dark(
     return usable & ~dark, [Caution("unlit", text)]
 
 
-def _dark_pixels(planes: Sequence[FloatArray], usable: BoolArray) -> BoolArray:
+def _dark_pixels(
+    planes: Sequence[FloatArray], usable: BoolArray, check: DarkCheck = DarkCheck()
+) -> BoolArray:
     """Return the pixels that are dark in all planes, the source first if it was recorded."""
     dark, noisy, dim, lights = usable, usable, usable, []
     # Quick for most images: no mean is less than the least value.
-    if any(plane.min() >= _DIM * plane.max() for plane in planes):
+    if any(plane.min() >= check.dim * plane.max() for plane in planes):
         return np.zeros_like(usable)
     for plane in planes:
-        light = _mean_around(plane, usable, _SIDES_PX[1])
+        light = _mean_around(plane, usable, check.sides[1])
         bright = light[usable & (light >= plane[usable].mean())]
         if not bright.size or not bright.mean() > 0:
             return np.zeros_like(usable)
         level = float(bright.mean())
-        limit = _DARK if len(planes) > 1 else _DIM
-        dark = dark & (_mean_around(plane, usable, _SIDES_PX[0]) < limit * level)
-        noisy = noisy & (light < _DIM * level)
+        limit = check.dark if len(planes) > 1 else check.dim
+        dark = dark & (_mean_around(plane, usable, check.sides[0]) < limit * level)
+        noisy = noisy & (light < check.dim * level)
         if noisy.any():
-            squares = _mean_around((plane / level) ** 2, usable, _SIDES_PX[1])
-            noisy &= squares >= (1 + _MIN_NOISE**2) * (light / level) ** 2
+            squares = _mean_around((plane / level) ** 2, usable, check.sides[1])
+            noisy &= squares >= (1 + check.noise**2) * (light / level) ** 2
         if not (dark.any() or noisy.any()):
             return dark
-        dim = dim & (plane < _LIT * level)
+        dim = dim & (plane < check.lit * level)
         lights.append(light / level)
     square = np.ones((3, 3))
     noisy = ndimage.binary_opening(noisy, square)
     regions, count = ndimage.label(noisy | dark)
     is_dark = np.zeros(count + 1, bool)
     for number, box in enumerate(ndimage.find_objects(regions), 1):
-        is_dark[number] = _is_dark_region(regions == number, box, noisy, lights, usable)
+        is_dark[number] = _is_dark_region(regions == number, box, noisy, lights, usable, check)
     core = is_dark[regions]
     if core.any():
-        core = ndimage.binary_dilation(core, square, iterations=_EDGE_PX[1], mask=dim)
+        core = ndimage.binary_dilation(core, square, iterations=check.edge[1], mask=dim)
     return np.asarray(core)
 
 
@@ -308,11 +333,12 @@ def _is_dark_region(
     noisy: BoolArray,
     lights: Sequence[FloatArray],
     usable: BoolArray,
+    check: DarkCheck,
 ) -> bool:
     """Return whether a region was dark before any deflection, by its noise and its edge."""
     if len(lights) > 1 and noisy[region].mean() > 0.5:
         return True
-    least, most = _EDGE_PX if len(lights) > 1 else _SHARP_EDGE_PX
+    least, most = check.edge if len(lights) > 1 else check.sharp_edge
     around = tuple(slice(max(side.start - most, 0), side.stop + most) for side in box)
     distance = ndimage.distance_transform_edt(~region[around])
     ring = usable[around] & (distance > least) & (distance <= most)
@@ -320,10 +346,10 @@ def _is_dark_region(
         return False
     at_edge = float(np.median(lights[0][around][ring]))
     if len(lights) > 1:
-        return at_edge > _LIT
+        return at_edge > check.lit
     # Shorter than the image's sides, it could be the object's.
     is_rim = region[1:-1, 1:-1].sum() < region.sum() >= min(region.shape)
-    return _LIT_SHARPLY < at_edge < _MAX_PILE and bool(is_rim)
+    return check.sharply_lit[0] < at_edge < check.sharply_lit[1] and bool(is_rim)
 
 
 def image_warnings(
@@ -398,48 +424,62 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
         )
 
 
-def _sign_of_negative(image: CheckedImage, source: CheckedImage, pair: ReferencePair) -> str:
+def _sign_of_negative(
+    image: CheckedImage, source: CheckedImage, pair: ReferencePair, *, least_fall: float = 4.0
+) -> str:
     """Return what shows that an image, or it and its source, is a negative; empty if nothing."""
     if pair.is_negative:
         return "the image is dark where it should be bright"
-    # A modelled or smoothed source has no noise, but bends, which are steepest beside its peak.
+    # A modelled or smoothed source has no noise, but bends, which are steepest beside its peak. The
+    # fall of the noise with the brightness is in standard deviations.
     falling = -(image.noise_slope + source.noise_slope) / math.sqrt(2)
-    if falling > _FALLING_DEVIATIONS and image.noise_slope < 0:
+    if falling > least_fall and image.noise_slope < 0:
         return "image and source are noisier where they are darker"
     if is_lit_around(source.image) and is_lit_around(image.image):
         return "the rims of image and source are brighter than all the beam"
     return ""
 
 
-def is_lit_around(image: FloatArray) -> bool:
-    """Return whether all four sides are as bright as the brightest part, the middle darker."""
+def is_lit_around(
+    image: FloatArray, *, width: float = 0.05, bright: float = 0.9, middle: float = 0.8
+) -> bool:
+    """Return whether all four sides, of a width, are as bright as the brightest, the middle darker.
+
+    So is film that is exposed in its middle.
+    """
     # Light or particles that are deflected out of the middle make something else brighter.
-    height, width = image.shape
-    rim = max(1, round(_RIM * min(height, width)))
+    rows, columns = image.shape
+    rim = max(1, round(width * min(rows, columns)))
     sides = (image[:rim], image[-rim:], image[:, :rim], image[:, -rim:])
     dimmest = min(float(np.median(side)) for side in sides)
-    middle = image[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    return bool(
-        np.median(middle) < _DARKER * dimmest and _AS_BRIGHT * np.percentile(image, 99) < dimmest
-    )
+    inner = image[rows // 4 : rows - rows // 4, columns // 4 : columns - columns // 4]
+    return bool(np.median(inner) < middle * dimmest and bright * np.percentile(image, 99) < dimmest)
 
 
-def stray_pixels(image: FloatArray, usable: BoolArray) -> BoolArray:
+def stray_pixels(
+    image: FloatArray,
+    usable: BoolArray,
+    *,
+    ratio: float = 1.5,  # of the brightness, to all neighbours
+    deviations: float = 10.0,  # of the noise, from all neighbours
+    step: float = 0.05,  # of the mean, from the pixel on the left
+    difference: float = 0.3,  # of a neighbour from its surroundings, over their brightness
+) -> BoolArray:
     """Return the pixels that are far brighter, or darker, than each of their neighbours.
 
     A quick look for broken pixels; `remove_hot_pixels` searches more thoroughly. Pixels with a
     neighbour that is not usable are left out.
     """
     stray = np.zeros(image.shape, bool)
-    part = image[:: max(1, image.size // _NOISE_SAMPLES)]
+    part = image[:: max(1, image.size // 50_000)]
     mean = float(image.mean() if usable.all() else image[usable].mean())
     if not mean > 0:
         return stray
     bends = part[:, 3:] - 3 * part[:, 2:-1] + 3 * part[:, 1:-2] - part[:, :-3]
     noise = NORMAL_MAD * float(np.median(np.abs(bends))) / math.sqrt(20)
-    step = np.abs(image[1:-1, 1:-1] - image[1:-1, :-2])
+    steps = np.abs(image[1:-1, 1:-1] - image[1:-1, :-2])
     # Few pixels differ enough from the one on their left to be compared with all.
-    rows, columns = np.nonzero(step > max(_STRAY_DEVIATIONS * noise, _STRAY_STEP * mean))
+    rows, columns = np.nonzero(steps > max(deviations * noise, step * mean))
     if not rows.size:
         return stray
     rows, columns = rows + 1, columns + 1
@@ -447,9 +487,9 @@ def stray_pixels(image: FloatArray, usable: BoolArray) -> BoolArray:
     neighbours = np.stack([image[rows + y, columns + x] for y, x in next_to])
     centre, highest, lowest = image[rows, columns], neighbours.max(axis=0), neighbours.min(axis=0)
     # Noise of counting grows with the brightness.
-    limit = _STRAY_DEVIATIONS * noise * np.sqrt(np.maximum(highest / mean, 1.0))
-    is_hot = centre - highest > np.maximum(limit, (_STRAY_RATIO - 1) * highest)
-    is_dead = (lowest - centre > limit) & (lowest > _STRAY_RATIO * centre)
+    limit = deviations * noise * np.sqrt(np.maximum(highest / mean, 1.0))
+    is_hot = centre - highest > np.maximum(limit, (ratio - 1) * highest)
+    is_dead = (lowest - centre > limit) & (lowest > ratio * centre)
     # A focus lifts its neighbours, too; a broken pixel is alone.
     height, width = image.shape
     ring = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if max(abs(y), abs(x)) == 2]
@@ -457,8 +497,8 @@ def stray_pixels(image: FloatArray, usable: BoolArray) -> BoolArray:
         (np.clip(rows + y, 0, height - 1), np.clip(columns + x, 0, width - 1)) for y, x in ring
     ]
     level = np.median([image[place] for place in inside], axis=0)
-    difference = np.abs(neighbours - level).max(axis=0)
-    alone = difference < limit / 3 + _MAX_NEIGHBOUR_DIFFERENCE * np.abs(level)
+    most = np.abs(neighbours - level).max(axis=0)
+    alone = most < limit / 3 + difference * np.abs(level)
     stray[rows, columns] = (is_hot | is_dead) & alone
     if not usable.all():
         stray &= ndimage.binary_erosion(usable, np.ones((3, 3)))
@@ -480,17 +520,28 @@ class ReferencePair:
     image: FloatArray
     source: FloatArray
     mask: BoolArray
+    side: int = 128  # most blocks along the longer side
+    least_blocks: int = 16  # that are usable
+    least_contrast: float = 0.01  # of the structure, over the mean
+    negative_correlation: float = -0.4
+    detail: int = 9  # blocks, of the structure of an object
+    swapped_share: float = 0.75  # see `is_swapped`
 
     @cached_property
     def is_negative(self) -> bool:
         """Whether the image is dark at its borders where its beam is bright."""
-        if not self._has_border:
+        shot, beam, usable = self._blocks
+        ring = usable & border_ring(usable.shape)
+        if ring.sum() < self.least_blocks:
             return False
-        shot, beam = (plane[self._ring] - plane[self._ring].mean() for plane in self._blocks[:2])
+        # Structure that neighbouring blocks share is free of noise.
+        if math.sqrt(max(_neighbour_covariance(beam, beam, ring), 0.0)) < self.least_contrast:
+            return False
+        shot, beam = (plane[ring] - plane[ring].mean() for plane in (shot, beam))
         # Not by BLAS, whose threads would wait in circles.
         product = float((shot * beam).sum())
         size = float(np.sqrt((shot**2).sum() * (beam**2).sum()))
-        return product / max(size, 1e-300) < _NEGATIVE_CORRELATION
+        return product / max(size, 1e-300) < self.negative_correlation
 
     @cached_property
     def is_swapped(self) -> bool:
@@ -501,52 +552,32 @@ class ReferencePair:
         beam it is half and half; where the two are swapped, the source has it all.
         """
         shot, beam, usable = self._blocks
-        if usable.sum() < _MIN_BLOCKS:
+        if usable.sum() < self.least_blocks:
             return False
         difference, beam = (np.where(usable, plane, 0.0) for plane in (shot - beam, beam - 1))
-        difference -= ndimage.uniform_filter(difference, _DETAIL_BLOCKS)
-        beam -= ndimage.uniform_filter(beam, _DETAIL_BLOCKS)
+        difference -= ndimage.uniform_filter(difference, self.detail)
+        beam -= ndimage.uniform_filter(beam, self.detail)
         size = _neighbour_covariance(difference, difference, usable)
-        if size < _MIN_CONTRAST**2:
+        if size < self.least_contrast**2:
             return False
-        return -_neighbour_covariance(difference, beam, usable) > _MIN_SWAPPED_RATIO * size
+        return -_neighbour_covariance(difference, beam, usable) > self.swapped_share * size
 
     @cached_property
     def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Image and source in blocks of pixels, of mean 1, and the blocks that are usable."""
-        step = _coarse_step(self.image.shape)
-        usable = complete_block_means(self.mask, step) > _MIN_USABLE_SHARE
+        step = max(1, -(-max(self.image.shape) // self.side))
+        usable = complete_blocks(self.mask, step)
         planes = [complete_block_means(plane, step) for plane in (self.image, self.source)]
         shot, beam = (plane / max(float(plane[usable].mean()), 1e-300) for plane in planes)
         return shot, beam, usable
 
-    @cached_property
-    def _ring(self) -> BoolArray:
-        """Usable blocks near the border, where there is rarely an object."""
-        usable = self._blocks[2]
-        return usable & border_ring(usable.shape)
 
-    @cached_property
-    def _has_border(self) -> bool:
-        """Whether the source has structure at its borders by which to compare the image."""
-        if self._ring.sum() < _MIN_BLOCKS:
-            return False
-        beam = self._blocks[1]
-        # Structure that neighbouring blocks share is free of noise.
-        variance = _neighbour_covariance(beam, beam, self._ring)
-        return math.sqrt(max(variance, 0.0)) >= _MIN_CONTRAST
-
-
-def border_ring(shape: tuple[int, ...]) -> BoolArray:
+def border_ring(shape: tuple[int, ...], share: float = 0.2) -> BoolArray:
     """Return the part of an image near its border, where an object displaces least."""
     ring = np.ones(shape, dtype=bool)
-    depth = [max(2, round(_RING_SHARE * side)) for side in shape]
+    depth = [max(2, round(share * side)) for side in shape]
     ring[depth[0] : -depth[0], depth[1] : -depth[1]] = False
     return ring
-
-
-def _coarse_step(shape: tuple[int, ...]) -> int:
-    return max(1, -(-max(shape) // _COARSE_SIDE_PX))
 
 
 def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArray) -> float:
@@ -558,25 +589,7 @@ def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArr
     return float(np.mean([((a - a.mean()) * (b - b.mean())).mean() for a, b in (forth, back)]))
 
 
-_WINDOW_PX = 4  # side of the squares in which noise is measured
-_MAX_NOISE_SAMPLES = 80_000
-_N_BRIGHTNESS_BINS = 20
-_BRIGHTEST_LEFT_OUT = 0.05  # share of the pixels: bright lines are not smooth
-_CLIP_DEVIATIONS = 3.0
-_CLIPPED_VARIANCE = 0.9733  # of normal numbers that are clipped there
-_MIN_PIXELS = 4000
-_INDEPENDENT_SHARE = 4 / 9  # of the differences, which share pixels
-_WIDE_RANGE, _MIN_RANGE = 2.0, 1.3  # brightest over dimmest bin
-_MIN_DARK = 0.05  # of the mean
-# Difference of χ² without and with an offset, over χ² per degree of freedom: of one image, of
-# image and source, of either if the range is narrow, and if any noise in proportion to the signal
-# is allowed.
-_MIN_GAIN, _MIN_SHARED_GAIN, _MIN_GAIN_NARROW, _MIN_GAIN_FREE = 8.0, 11.0, 40.0, 1.0
-_MAX_CHI2 = 5.0  # per degree of freedom
-_PATTERN_DEVIATIONS = 2.0
-
-
-def dark_level(planes: Sequence[CheckedImage]) -> float:
+def dark_level(planes: Sequence[CheckedImage], check: DarkLevelCheck = DarkLevelCheck()) -> float:
     """Estimate an offset that was left in an image, as a share of its mean, from its noise.
 
     Parameters
@@ -584,6 +597,8 @@ def dark_level(planes: Sequence[CheckedImage]) -> float:
     planes : sequence of CheckedImage
         The image, and the recorded beam, if any, in the same unit. It has an offset of its own, or
         shares the image's.
+    check : DarkLevelCheck
+        Limits.
 
     Returns
     -------
@@ -591,36 +606,35 @@ def dark_level(planes: Sequence[CheckedImage]) -> float:
         0 unless the noise cannot be explained without an offset, by any sum of a constant
         variance, one in proportion to the signal, and one to its square.
     """
-    is_small = min(planes[0].image.shape) < _WINDOW_PX
-    if is_small or any(plane.brightness.size < _MIN_PIXELS for plane in planes):
+    if not all(plane.shows_noise for plane in planes):
         return 0.0
     mean = float(planes[0].brightness.mean())
     if not mean > 0:
         return 0.0
-    offsets = [_offset(plane.noise_bins / mean, math.inf, _MIN_GAIN) for plane in planes]
+    offsets = [_offset(plane.noise_bins / mean, math.inf, check.gain, check) for plane in planes]
     if len(planes) > 1:
         both = np.concatenate([plane.noise_bins for plane in planes], axis=1) / mean
         # Most relative variance that both may have in common, as by uneven pixels
         product = planes[0].relative_differences * planes[1].relative_differences
         error = float(product.std()) / math.sqrt(_INDEPENDENT_SHARE * len(product))
-        pattern = max(float(product.mean()), 0.0) + _PATTERN_DEVIATIONS * error
-        offsets.append(_offset(both, pattern, _MIN_SHARED_GAIN))
+        pattern = max(float(product.mean()), 0.0) + check.pattern * error
+        offsets.append(_offset(both, pattern, check.shared_gain, check))
     return max(offsets)
 
 
 def _clip_limit(sizes: FloatArray) -> float:
-    """Return the largest absolute difference that counts."""
-    return _CLIP_DEVIATIONS * NORMAL_MAD * float(np.median(sizes))
+    """Return the largest absolute difference that counts: three standard deviations."""
+    return 3 * NORMAL_MAD * float(np.median(sizes))
 
 
-def _offset(bins: FloatArray, max_pattern: float, min_gain: float) -> float:
+def _offset(bins: FloatArray, max_pattern: float, min_gain: float, check: DarkLevelCheck) -> float:
     """Return the brightness where the noise vanishes; 0 if zero is as likely.
 
     `max_pattern` is the largest variance in proportion to the square of the brightness.
     """
     levels, noise, uncertainty = bins
     lowest, highest = float(levels.min()), float(levels.max())
-    if not (lowest > _MIN_DARK and highest >= _MIN_RANGE * lowest and (noise > 0).all()):
+    if not (lowest > check.level and highest >= check.least_range * lowest and (noise > 0).all()):
         return 0.0
     variances, weights = noise**2, 1 / (noise * uncertainty)
     powers = np.stack([np.ones_like(levels), levels, levels**2], axis=1) * weights[:, None]
@@ -637,8 +651,8 @@ def _offset(bins: FloatArray, max_pattern: float, min_gain: float) -> float:
     with_offset = float(((gain * line[:, 0] + offset * line[:, 1] - weighted) ** 2).sum())
     dark = float(offset / gain)
     chi2 = max(1.0, with_offset / (len(levels) - 2))
-    least = (min_gain if highest > _WIDE_RANGE * lowest else _MIN_GAIN_NARROW) * chi2
+    least = (min_gain if highest > check.wide_range * lowest else check.narrow_gain) * chi2
     # Noise in proportion to the signal that differs between shots, as of speckle, has no line.
-    explained = chi2 < _MAX_CHI2 and freely**2 - with_offset > _MIN_GAIN_FREE * chi2
+    explained = chi2 < check.chi2 and freely**2 - with_offset > check.free_gain * chi2
     explained &= distance**2 - with_offset > least
-    return dark if explained and dark > _MIN_DARK else 0.0
+    return dark if explained and dark > check.level else 0.0
