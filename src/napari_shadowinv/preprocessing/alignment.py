@@ -23,6 +23,7 @@ J. D. Angrist and J.-S. Pischke, *Mostly Harmless Econometrics* (Princeton, 2009
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -33,38 +34,43 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.options import DEFAULT_REGISTRATION, REFERENCE_BEAM, BeamPrior, Instrument
 from napari_shadowinv.preprocessing.image_checks import border_ring
-
-_SIDE_PX, _COARSE_SIDE_PX = 384, 64  # of the planes that are compared
-_CELLS = 24  # along the longer side
-_DEPTHS = 1, 2, 4  # cells, of the borders
-_AGREEING_ERRORS = 1.5  # of the shift by a border, for a deeper one to count
-# Of the beams over the expected one, and of structure of a quarter of its length.
-_DIFFERENCES = (1.0, 0.0), (1.0, 2.0), (1.0, 8.0), (4.0, 0.0), (4.0, 8.0)
-_LEAST_NOISE = 1e-5  # of a cell
-_LEAST_LIGHT = 0.05  # of the mean
-_FINE_PX, _COARSE_PX = 1.0, 4.0
-_PARTS = 8  # along each side
-_PART_DEVIATIONS = 4.0  # of the finest structure that image and source share
-_UNKNOWN_PX = 1e3
-# Of a shift by whole pixels: blur over the longer side, least common share of the borders, largest
-# misfit over that without it, which is half and more for beams that merely differ.
-_COARSE_BLUR, _MIN_OVERLAP, _COARSE_MISFIT = 0.03, 0.5, 0.4
-_MAX_STEPS, _LONGEST_STEP_PX = 12, 3.0
-_SIGNIFICANT_ERRORS = 4.0
-_MIN_SHIFT_PX = 0.05  # interpolation would change more than it mends
+from napari_shadowinv.preprocessing.pixels import LEAST_LIGHT, complete_blocks
 
 
-class Shift(NamedTuple):
+@dataclass(frozen=True)
+class ShiftSearch:
+    """How a shift is searched for, as tests/preprocessing/test_alignment.py needs it."""
+
+    side: int = 384  # most blocks of pixels along the longer side that are compared
+    steps: int = 12
+    longest: float = 3.0  # first step at most, in blocks; later ones are shorter
+    coarse_side: int = 64  # the same, for a shift by whole blocks
+    blur: float = 0.03  # of these, over the longer side
+    overlap: float = 0.5  # of their borders
+    misfit: float = 0.4  # over that without a shift, half and more for beams that merely differ
+    cells: int = 24  # along the longer side, for the borders
+    depths: tuple[int, ...] = (1, 2, 4)  # of the borders, in cells
+    agreeing: float = 1.5  # errors of the shift by a border, for a deeper one to count
+    # Of the beams over the expected one, and of structure of a quarter of its length
+    differences: tuple[tuple[float, float], ...] = ((1, 0), (1, 2), (1, 8), (4, 0), (4, 8))
+    blurs: tuple[float, float] = (1.0, 4.0)  # px, between which structure is the finest
+    parts: int = 8  # along each side, for the finest structure
+    deviations: float = 4.0  # of structure that image and source share
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
     """Shift of a source to its place in an image, (y, x) in px, with its standard deviations."""
 
     value: FloatArray
     error: FloatArray
+    errors: float = 4.0  # above which it is significant
+    least: float = 0.05  # px, below which interpolation would change more than it mends
 
     @property
     def is_significant(self) -> BoolArray:
         """Whether it is above four times its error and 0.05 px, along each axis."""
-        limits = np.maximum(_SIGNIFICANT_ERRORS * self.error, _MIN_SHIFT_PX)
-        return np.abs(self.value) > limits
+        return np.abs(self.value) > np.maximum(self.errors * self.error, self.least)
 
     @property
     def significant(self) -> FloatArray:
@@ -74,7 +80,7 @@ class Shift(NamedTuple):
     @property
     def text(self) -> str:
         """The shift with its errors, such as "y +2.01 ± 0.10, x -0.96 ± 0.12 px"."""
-        (y, x), (y_error, x_error) = self
+        (y, x), (y_error, x_error) = self.value, self.error
         return f"y {y:+.2f} ± {y_error:.2f}, x {x:+.2f} ± {x_error:.2f} px"
 
     def left(self, expected: float) -> float:
@@ -128,7 +134,7 @@ def register_source(
         is_assumed = instrument.registration is None and error == expected
         return RegisteredSource(source, error, is_assumed=is_assumed)
     moved = np.where(usable, move(source, shift.significant), 0.0)
-    if np.abs(shift.significant).max() < _SIGNIFICANT_ERRORS * expected:
+    if np.abs(shift.significant).max() < shift.errors * expected:
         return RegisteredSource(moved, error)
     text = (
         f"register: the source was moved by {shift.text} to fit the image; what is left of the "
@@ -151,6 +157,7 @@ def measure_shift(
     source: FloatArray,
     mask: BoolArray | None = None,
     beam: BeamPrior = REFERENCE_BEAM,
+    search: ShiftSearch = ShiftSearch(),
 ) -> Shift:
     """Measure the shift of a source to its place in an image.
 
@@ -162,6 +169,7 @@ def measure_shift(
         True at usable pixels.
     beam : BeamPrior
         Expected difference of the beams of image and source.
+    search : ShiftSearch
 
     Returns
     -------
@@ -176,47 +184,49 @@ def measure_shift(
     image, source = (np.asarray(plane, dtype=np.float64) for plane in (image, source))
     check_shape("the source", source.shape, image.shape, "the image")
     usable = np.ones(image.shape, bool) if mask is None else mask
-    block = -(-max(image.shape) // _SIDE_PX)
-    whole = complete_block_means(usable, block) > 1 - 1e-9
+    block = -(-max(image.shape) // search.side)
+    whole = complete_blocks(usable, block)
     planes = (complete_block_means(plane, block) for plane in (image, source))
     if not whole.any():
-        return Shift(np.zeros(2), np.full(2, _UNKNOWN_PX))
+        return Shift(np.zeros(2), np.full(2, 1e3))
     shot, reference = (np.where(whole, p / max(p[whole].mean(), 1e-300), 1.0) for p in planes)
-    value = _coarse_shift(shot, reference, whole)
-    for step in range(_MAX_STEPS):
+    value = _coarse_shift(shot, reference, whole, search)
+    for step in range(search.steps):
         moved = (
             ndimage.shift(reference, value, order=3, mode="nearest") if any(value) else reference
         )
-        steps = _by_borders(shot, moved, whole, beam), _by_finest(shot, moved, whole)
+        both = shot, moved, whole
+        steps = _by_borders(*both, beam, search), _by_finest(*both, search)
         weights = [np.linalg.inv(covariance) for _, covariance in steps]
         covariance = np.linalg.inv(sum(weights))
         found = covariance @ sum(w @ move for w, (move, _) in zip(weights, steps, strict=True))
         error = np.sqrt(np.diag(covariance))
         is_settled = (np.abs(found) < (0.1 if step else 2.0) * error).all()
-        longest = _LONGEST_STEP_PX / (1 + step)
+        longest = search.longest / (1 + step)
         value = value + (found if is_settled else np.clip(found, -longest, longest))
-        if is_settled or error.max() > _LONGEST_STEP_PX:
+        if is_settled or error.max() > search.longest:
             break
     return Shift(block * value, block * error)
 
 
-def _coarse_shift(shot: FloatArray, source: FloatArray, usable: BoolArray) -> FloatArray:
+def _coarse_shift(
+    shot: FloatArray, source: FloatArray, usable: BoolArray, search: ShiftSearch
+) -> FloatArray:
     """Return the shift at which borders correlate best, in coarse pixels; 0 if none fits better."""
     from skimage.registration import phase_cross_correlation
 
-    block = -(-max(shot.shape) // _COARSE_SIDE_PX)
-    border = complete_block_means(usable, block) > 1 - 1e-9
+    block = -(-max(shot.shape) // search.coarse_side)
+    border = complete_blocks(usable, block)
     border &= border_ring(border.shape)
-    blur = _COARSE_BLUR * max(border.shape)
     shot, source = (
-        ndimage.gaussian_filter(complete_block_means(plane, block), blur)
+        ndimage.gaussian_filter(complete_block_means(plane, block), search.blur * max(border.shape))
         for plane in (shot, source)
     )
     if not (np.ptp(shot[border]) > 0 and np.ptp(source[border]) > 0):
         return np.zeros(2)
     correlate: Callable[..., tuple[FloatArray, float, float]] = phase_cross_correlation
     found, *_ = correlate(
-        shot, source, reference_mask=border, moving_mask=border, overlap_ratio=_MIN_OVERLAP
+        shot, source, reference_mask=border, moving_mask=border, overlap_ratio=search.overlap
     )
 
     shift = np.asarray(found, dtype=np.float64)
@@ -229,22 +239,24 @@ def _coarse_shift(shot: FloatArray, source: FloatArray, usable: BoolArray) -> Fl
     # Where they overlap, a beam without structure must not fit as well.
     moved = misfit(ndimage.shift(source, shift, order=1), both)
     unmoved = min(misfit(source, border), misfit(np.ones_like(source), both))
-    return block * shift if moved < _COARSE_MISFIT * unmoved else np.zeros(2)
+    return block * shift if moved < search.misfit * unmoved else np.zeros(2)
 
 
 Step = tuple[FloatArray, FloatArray]
 """A shift, (2,), and its covariance, (2, 2)."""
 
-_NO_STEP: Step = (np.zeros(2), _UNKNOWN_PX**2 * np.eye(2))
+_NO_STEP: Step = (np.zeros(2), 1e6 * np.eye(2))
 
 
-def _by_borders(shot: FloatArray, source: FloatArray, usable: BoolArray, beam: BeamPrior) -> Step:
+def _by_borders(
+    shot: FloatArray, source: FloatArray, usable: BoolArray, beam: BeamPrior, search: ShiftSearch
+) -> Step:
     """Return the shift by the ratio of image and source near the borders."""
-    cell = max(2, -(-max(shot.shape) // _CELLS))
+    cell = max(2, -(-max(shot.shape) // search.cells))
     if min(shot.shape) < 3 * cell:
         return _NO_STEP
     level = complete_block_means(source, cell)
-    lit = (complete_block_means(usable, cell) > 1 - 1e-9) & (level > _LEAST_LIGHT)
+    lit = complete_blocks(usable, cell) & (level > LEAST_LIGHT)
     level = np.where(lit, level, 1.0)
     ratio = complete_block_means(shot, cell) / level - 1
     patterns = [
@@ -255,10 +267,10 @@ def _by_borders(shot: FloatArray, source: FloatArray, usable: BoolArray, beam: B
     depths = np.minimum(
         np.minimum(down, right), np.minimum(lit.shape[0] - down, lit.shape[1] - right) - 1
     )
-    places = np.argwhere(lit & (depths < max(_DEPTHS)))
+    places = np.argwhere(lit & (depths < max(search.depths)))
     places = places[np.argsort(depths[tuple(places.T)], kind="stable")]
     order = tuple(places.T)
-    counts = [count for depth in _DEPTHS if (count := int((depths[order] < depth).sum())) > 8]
+    counts = [count for depth in search.depths if (count := int((depths[order] < depth).sum())) > 8]
     if not counts:
         return _NO_STEP
     of_source, of_shot = (
@@ -266,11 +278,13 @@ def _by_borders(shot: FloatArray, source: FloatArray, usable: BoolArray, beam: B
         for both in patterns
     )
     columns = np.column_stack([of_source, of_shot, ratio[order]])
-    noise = max(_noise_of(ratio, lit), _LEAST_NOISE**2)
+    noise = max(_noise_of(ratio, lit), 1e-5**2)
     best = _NO_STEP
-    for found in _likeliest_shifts(columns, cell / min(shot.shape) * places, counts, noise, beam):
+    places = cell / min(shot.shape) * places
+    shifts = _likeliest_shifts(columns, places, counts, noise, beam, search)
+    for found in shifts:
         # Deeper borders show more, until they reach the object.
-        allowed = _AGREEING_ERRORS * np.sqrt(np.diag(best[1]))
+        allowed = search.agreeing * np.sqrt(np.diag(best[1]))
         if best is _NO_STEP or (np.abs(found[0] - best[0]) < allowed).all():
             best = min(best, found, key=lambda step: float(np.trace(step[1])))
     return best
@@ -285,7 +299,12 @@ def _noise_of(ratio: FloatArray, lit: BoolArray) -> float:
 
 
 def _likeliest_shifts(
-    columns: FloatArray, places: FloatArray, counts: list[int], noise: float, beam: BeamPrior
+    columns: FloatArray,
+    places: FloatArray,
+    counts: list[int],
+    noise: float,
+    beam: BeamPrior,
+    search: ShiftSearch,
 ) -> list[Step]:
     """Return the shift by the first cells, so many each time.
 
@@ -296,7 +315,7 @@ def _likeliest_shifts(
     long = np.exp(-squares / (2 * beam.length**2))
     short = long**16  # a quarter of the length
     best, likeliest = [_NO_STEP] * len(counts), [-np.inf] * len(counts)
-    for of_beam, of_rest in _DIFFERENCES:
+    for of_beam, of_rest in search.differences:
         covariance = beam.rms**2 * (of_beam**2 * long + of_rest**2 * short)
         covariance += noise * np.eye(len(places))
         # Its first rows are the root of the first cells' covariance.
@@ -318,26 +337,29 @@ def _likeliest_shifts(
     return best
 
 
-def _by_finest(shot: FloatArray, source: FloatArray, usable: BoolArray) -> Step:
+def _by_finest(
+    shot: FloatArray, source: FloatArray, usable: BoolArray, search: ShiftSearch
+) -> Step:
     """Return the shift by the finest structure, with an error by the scatter of parts."""
+    side, (fine_blur, coarse_blur) = search.parts, search.blurs
     fine, sharp = (
-        ndimage.gaussian_filter(plane, _FINE_PX) - ndimage.gaussian_filter(plane, _COARSE_PX)
+        ndimage.gaussian_filter(plane, fine_blur) - ndimage.gaussian_filter(plane, coarse_blur)
         for plane in (source, shot)
     )
     inner = ndimage.minimum_filter(usable, 9, mode="constant", cval=False)
-    rows, columns = (np.arange(side) * _PARTS // side for side in shot.shape)
-    parts = (rows[:, None] * _PARTS + columns)[inner]
+    rows, columns = (np.arange(count) * side // count for count in shot.shape)
+    parts = (rows[:, None] * side + columns)[inner]
     difference = (sharp - fine)[inner]
     slopes, instruments = ([-g[inner] for g in np.gradient(plane)] for plane in (sharp, fine))
 
     def sums(first: list[FloatArray], second: list[FloatArray]) -> FloatArray:
         """Return sums of products over each part, (parts, first, second)."""
-        products = [[np.bincount(parts, a * b, _PARTS**2) for b in second] for a in first]
+        products = [[np.bincount(parts, a * b, side**2) for b in second] for a in first]
         return np.moveaxis(np.array(products), 2, 0)
 
-    count = np.bincount(parts, minlength=_PARTS**2)
+    count = np.bincount(parts, minlength=side**2)
     is_filled = count > 0
-    if is_filled.sum() < _PARTS:
+    if is_filled.sum() < side:
         return _NO_STEP
     normal = sums(instruments, slopes)[is_filled]
     normal = (normal + normal.transpose(0, 2, 1)) / 2
@@ -351,7 +373,7 @@ def _by_finest(shot: FloatArray, source: FloatArray, usable: BoolArray) -> Step:
         total = np.einsum("t,tij->ij", weights, normal)
         spread = weights[:, None, None] * normal - total / len(count)
         by_chance = np.sqrt((spread**2).sum(axis=0).max())
-        if not np.linalg.eigvalsh(total)[0] > _PART_DEVIATIONS * by_chance:
+        if not np.linalg.eigvalsh(total)[0] > search.deviations * by_chance:
             return _NO_STEP
         shift = np.linalg.solve(total, weights @ products)
     scores = weights[:, None] * (products - normal @ shift)
