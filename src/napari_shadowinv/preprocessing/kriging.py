@@ -25,29 +25,25 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import BeamComponents, BeamPrior
-from napari_shadowinv.preprocessing.pixels import beam_pixels, with_flux_of
+from napari_shadowinv.preprocessing.pixels import beam_pixels, complete_blocks, with_flux_of
 
-_GRID = 64  # blocks along the longer side
-_DOMAIN = 1.5  # sides of the image
 _LENGTHS = np.geomspace(0.1, 1.2, 12)  # shorter sides; errors are too small with half of them
-_SHORTEST_WAVE = 3.6  # in units of 1/L: the spectrum has fallen to 1/650
 _RATIOS = np.geomspace(1e-4, 1e8, 97)  # variance of the beam over the noise of a block
-_TREND = 1.0  # expected size of the terms of a quadratic in the logarithm
 _LOG_2PI = math.log(2 * math.pi)
 _TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of y and x
-_MIN_NOISE = 1e-4  # of a block: smooth beams are no exact sums of waves
-_MIN_WEIGHT = 0.02  # of a length, to count
-_MAX_COMPONENTS, _LEFT_OUT = 32, 1e-3  # share of the variance
-_COMPLETE, _MIN_USED_SHARE = 0.999, 0.5  # of a block's pixels
-_DIMMEST = 1e-2  # of the mean
-_MIN_BARE_SHARE = 0.1  # of the blocks
-_MIN_BLOCKS = 20
-_RIM_SHARE = 0.15  # of the largest distance to a hidden block
-_MIN_RIM_BLOCKS = 1.5
-_SHARE_OF_CHANGE, _MAX_CHANGES = 0.9, 6  # of the variance, in this number of shapes
-_MAX_PLACES = 400
-_MIN_CHANGE = 1e-4  # of the logarithm, r.m.s.
-_MAX_CHANCE = 1e-4
+_LEAST_CHANGE = 1e-4  # of the logarithm, as smooth beams are no exact sums of waves
+
+
+@dataclass(frozen=True)
+class HaloCheck:
+    """Limits of what the beam next to hidden blocks shows (tests/preprocessing/test_kriging.py)."""
+
+    rim: float = 0.15  # its width over the largest distance to a hidden block
+    rim_blocks: float = 1.5  # at least
+    places: int = 400  # most hidden blocks that are compared
+    share: float = 0.9  # of the variance, in shapes that are compared
+    shapes: int = 6  # at most
+    chance: float = 1e-4  # of a larger difference
 
 
 def kriged_source(
@@ -84,9 +80,9 @@ def kriged_source(
 
 
 def kriged_prior(
-    image: ArrayLike, mask: ArrayLike, *, should_stop: ShouldStop | None = None
+    image: ArrayLike, mask: ArrayLike, *, should_stop: ShouldStop | None = None, most: int = 32
 ) -> BeamPrior:
-    """Return the prior of the error of `kriged_source`."""
+    """Return the prior of the error of `kriged_source`, in at most so many components."""
     blocks = _Blocks.of(image, mask)
     with _one_thread():
         fits = blocks.fits(Reporter(None, should_stop))
@@ -99,10 +95,10 @@ def kriged_prior(
             for weight, fit in likely
         ]
         flat = np.concatenate(columns, axis=2).reshape(mean.size, -1)
-        # Few of the many columns matter.
+        # Few of the many columns matter: the others hold a thousandth of the variance.
         powers, turned = scipy.linalg.eigh(flat.T @ flat)
-        beyond = np.cumsum(powers) < _LEFT_OUT * powers.sum()
-        chosen = turned[:, ~beyond][:, -_MAX_COMPONENTS:]
+        beyond = np.cumsum(powers) < 1e-3 * powers.sum()
+        chosen = turned[:, ~beyond][:, -most:]
         # The sum of their squares is the variance of the beam in each block.
         patterns = np.ascontiguousarray((flat @ chosen).T.reshape(-1, *mean.shape))
     light, variance = np.exp(mean), (patterns**2).sum(axis=0)
@@ -126,8 +122,10 @@ class _Blocks:
     counts: FloatArray  # (h, w), weights by the light
 
     @classmethod
-    def of(cls, image: ArrayLike, mask: ArrayLike) -> _Blocks:
-        """Return the blocks, or raise an `InputError` if too few of them show the beam."""
+    def of(
+        cls, image: ArrayLike, mask: ArrayLike, *, side: int = 64, dimmest: float = 0.01
+    ) -> _Blocks:
+        """Return at most so many blocks along a side; refuse an image where few show the beam."""
         if not np.any(mask):
             raise InputError(
                 "no pixel is free of the object, so the beam behind it cannot be predicted: mask "
@@ -139,18 +137,16 @@ class _Blocks:
                 "the mask hides no pixel, so the object would be taken for the beam: mask the "
                 "object with its halo"
             )
-        block = -(-max(values.shape) // _GRID)
+        block = -(-max(values.shape) // side)
         share = block_means(usable.astype(np.float64), block)
         means = block_means(np.where(usable, values, 0.0), block) / np.maximum(share, 1e-300)
         # A part of a block has another middle.
-        bare = share > _COMPLETE
-        for axis, side in enumerate(values.shape):
-            if side % block:
-                bare[(slice(None),) * axis + (-1,)] = False
+        whole = complete_blocks(usable, block)
+        bare = np.pad(whole, [(0, n - m) for n, m in zip(share.shape, whole.shape, strict=True)])
         if bare.sum() < _least_blocks(bare):
-            bare = share > _MIN_USED_SHARE
+            bare = share > 0.5
         if bare.any():
-            bare &= means > _DIMMEST * means[bare].mean()
+            bare &= means > dimmest * means[bare].mean()
         if bare.sum() < _least_blocks(bare):
             raise InputError(
                 f"{bare.mean():.0%} of the image is free of the object, too little to predict the "
@@ -171,20 +167,21 @@ class _Blocks:
         return fits
 
 
-def _least_blocks(bare: BoolArray) -> float:
-    return max(_MIN_BARE_SHARE * bare.size, _MIN_BLOCKS)
+def _least_blocks(bare: BoolArray, share: float = 0.1, count: int = 20) -> float:
+    """Return how many blocks must show the beam."""
+    return max(share * bare.size, count)
 
 
-def _halo_caution(blocks: _Blocks, fit: _Fit) -> Caution | None:
+def _halo_caution(blocks: _Blocks, fit: _Fit, check: HaloCheck = HaloCheck()) -> Caution | None:
     """Warn if blocks next to the hidden ones change their prediction by more than its variance."""
     hidden = ~blocks.bare
     if not hidden.any():
         return None
     rows, columns = np.nonzero(hidden)
-    step = -(-len(rows) // _MAX_PLACES)
+    step = -(-len(rows) // check.places)
     places = rows[::step], columns[::step]
     depth, distance = (scipy.ndimage.distance_transform_edt(part) for part in (hidden, ~hidden))
-    farther = blocks.bare & (distance > max(_RIM_SHARE * float(depth.max()), _MIN_RIM_BLOCKS))
+    farther = blocks.bare & (distance > max(check.rim * float(depth.max()), check.rim_blocks))
     if farther.sum() < _least_blocks(farther):
         return None
     without_rim = _Fit.to(fit.waves, farther, blocks.logs[farther], blocks.counts[farther])
@@ -194,12 +191,12 @@ def _halo_caution(blocks: _Blocks, fit: _Fit) -> Caution | None:
     powers, shapes = scipy.linalg.eigh(wider @ wider.T - spread @ spread.T)
     powers, shapes = powers[::-1], shapes[:, ::-1]
     share = np.cumsum(np.maximum(powers, 0)) / max(float(powers[powers > 0].sum()), 1e-300)
-    count = min(int(np.searchsorted(share, _SHARE_OF_CHANGE)) + 1, _MAX_CHANGES)
+    count = min(int(np.searchsorted(share, check.share)) + 1, check.shapes)
     amplitudes = shapes[:, :count].T @ change
-    least = _MIN_CHANGE**2 * len(change)  # of an image without noise
+    least = _LEAST_CHANGE**2 * len(change)  # of an image without noise
     square = float((amplitudes**2 / np.maximum(powers[:count], least)).sum())
     chance = scipy.special.gammaincc(count / 2, square / 2)  # of a larger χ²
-    if chance > _MAX_CHANCE:
+    if chance > check.chance:
         return None
     text = (
         "the image next to the source mask is not as the beam farther away predicts it, by "
@@ -217,12 +214,14 @@ class _Waves:
     block: int
     length: float
     terms: int  # of a quadratic about which they vary
+    domain: float = 1.5  # sides of the image
+    shortest: float = 3.6  # wave number in units of 1/L, where the spectrum has fallen to 1/650
 
     @cached_property
     def _numbers(self) -> list[FloatArray]:
         """Wave numbers along y and x, rad/px."""
-        steps = [np.pi / (_DOMAIN * side) for side in self.shape]
-        counts = [max(2, int(_SHORTEST_WAVE / (self.length * step)) + 1) for step in steps]
+        steps = [np.pi / (self.domain * side) for side in self.shape]
+        counts = [max(2, int(self.shortest / (self.length * step)) + 1) for step in steps]
         return [step * np.arange(float(n)) for step, n in zip(steps, counts, strict=True)]
 
     @cached_property
@@ -230,14 +229,14 @@ class _Waves:
         """Variance of each product of cosines, 0 for those that are not used."""
         along_y, along_x = self._numbers
         squares = self.length**2 * (along_y[:, None] ** 2 + along_x**2)
-        variances = np.where(squares <= _SHORTEST_WAVE**2, np.exp(-0.5 * squares), 0.0)
+        variances = np.where(squares <= self.shortest**2, np.exp(-0.5 * squares), 0.0)
         return np.asarray(variances / variances.sum())
 
     def cosines(self, block: int) -> list[FloatArray]:
         """Return cosines with a mean square of 1 at blocks along y and x, shape (blocks, waves)."""
         return [
             np.where(numbers > 0, math.sqrt(2), 1.0)
-            * np.cos(np.outer(_middles(side, block) + 0.5 + (_DOMAIN - 1) / 2 * side, numbers))
+            * np.cos(np.outer(_middles(side, block) + 0.5 + (self.domain - 1) / 2 * side, numbers))
             for side, numbers in zip(self.shape, self._numbers, strict=True)
         ]
 
@@ -324,7 +323,7 @@ class _Fit:
         gain = _RATIOS[:, None] / (1 + _RATIOS[:, None] * powers)
         freedom = len(data) - terms.shape[1]
         noise = (data @ data - gain @ pull**2) / freedom
-        noise = np.maximum(noise, _MIN_NOISE**2)
+        noise = np.maximum(noise, _LEAST_CHANGE**2)
         evidences = -0.5 * (
             np.log1p(_RATIOS[:, None] * powers).sum(axis=1)
             + freedom * (np.log(noise) + 1 + _LOG_2PI)
@@ -346,21 +345,21 @@ class _Fit:
         )
 
 
-def _evidence_of_trend(terms: FloatArray, trend: FloatArray) -> float:
-    """Return the log-density of the data under a trend, relative to the constant."""
+def _evidence_of_trend(terms: FloatArray, trend: FloatArray, size: float = 1.0) -> float:
+    """Return the log-density of data under a trend with terms of a size, over the constant's."""
     constant, slopes = terms[:, :1], terms[:, 1:]
     slopes = slopes - constant @ (constant.T @ slopes) / (constant**2).sum()
-    _, log_volume = np.linalg.slogdet(_TREND**2 * slopes.T @ slopes)
+    _, log_volume = np.linalg.slogdet(size**2 * slopes.T @ slopes)
     count = slopes.shape[1]
-    square = float((trend[1:] ** 2).sum()) / _TREND**2
+    square = float((trend[1:] ** 2).sum()) / size**2
     return float(-0.5 * (log_volume + count * _LOG_2PI + square))
 
 
-def _weights(fits: list[_Fit]) -> FloatArray:
-    """Return the weights of processes by their evidence, 0 for those that do not count."""
+def _weights(fits: list[_Fit], least: float = 0.02) -> FloatArray:
+    """Return the weights of processes by their evidence, 0 for those below a least weight."""
     evidence = np.array([fit.evidence for fit in fits])
     weights = np.exp(evidence - evidence.max())
-    weights[weights < _MIN_WEIGHT * weights.sum()] = 0.0
+    weights[weights < least * weights.sum()] = 0.0
     return np.asarray(weights / weights.sum())
 
 
