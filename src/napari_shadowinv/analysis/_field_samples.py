@@ -138,7 +138,7 @@ class ResampledInversion(SampledField):
         return Evaluation(value, shifted, systematic, tuple(causes), cautions)
 
     def _sample_cautions(self, scatter: Uncertainty, least: float = 0.2) -> Iterator[Caution]:
-        """Yield those of the samples, if noise is not below a share of the discretisation error."""
+        """Yield doubts about samples, if noise is not below a share of the discretisation error."""
         errors = self.inversion.errors
         by_noise = float(np.sqrt((scatter.displacement_std**2).sum(axis=0).mean()))
         # Without noise, samples differ by the tolerance of the solver.

@@ -241,7 +241,7 @@ def _least_maximum(weights: FloatArray, radius: float, length: float, errors: fl
 
 
 def _is_wave(zero: float, spacing: float, margin: float = 0.003) -> bool:
-    """Return whether the first zero is that of a sine wave, at a quarter of the spacing."""
+    """Return whether the first zero belongs to a sine wave, at a quarter of the spacing."""
     return abs(zero / spacing - 0.25) < margin
 
 

@@ -63,7 +63,7 @@ def smooth(plane: FloatArray, width: float, order: int = ORDER) -> FloatArray:
 
 
 def least_width(spacing: float, spacings: float = 1.5) -> float:
-    """Return the least width for a spacing of sites: finer structures are those of the cells."""
+    """Return the least width for a spacing of sites: finer structures belong to the cells."""
     return spacings * spacing
 
 

@@ -372,7 +372,7 @@ def remove_hot_pixels(
         Side of the neighbourhood in px, odd. Clusters of up to an eighth of its area plus one
         are found: pairs with 3, four pixels with 5.
     peers : float, default 0.5
-        Share of the threshold by which a pixel differs from all neighbours but so many.
+        Share of the threshold by which a pixel differs from its neighbours, see the notes.
     should_stop : callable, optional
         Asked at each step; when it returns true the search ends.
 
@@ -453,7 +453,7 @@ def _neighbours(
 def _noise(
     difference: FloatArray, brightness: FloatArray, least: int = 400, most: int = 16
 ) -> FloatArray:
-    """Return the deviation of each pixel's difference, by groups of at least so many pixels."""
+    """Return the deviation of each pixel's difference, by groups of `least` pixels or more."""
     n_bins = min(max(difference.size // least, 1), most)
     groups = np.array_split(np.argsort(brightness, axis=None, kind="stable"), n_bins)
     flat, positive = difference.ravel(), np.maximum(brightness, 0).ravel()

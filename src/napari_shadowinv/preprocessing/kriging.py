@@ -82,7 +82,7 @@ def kriged_source(
 def kriged_prior(
     image: ArrayLike, mask: ArrayLike, *, should_stop: ShouldStop | None = None, most: int = 32
 ) -> BeamPrior:
-    """Return the prior of the error of `kriged_source`, in at most so many components."""
+    """Return the prior of the error of `kriged_source`, in `most` components or fewer."""
     blocks = _Blocks.of(image, mask)
     with _one_thread():
         fits = blocks.fits(Reporter(None, should_stop))
@@ -125,7 +125,7 @@ class _Blocks:
     def of(
         cls, image: ArrayLike, mask: ArrayLike, *, side: int = 64, dimmest: float = 0.01
     ) -> _Blocks:
-        """Return at most so many blocks along a side; refuse an image where few show the beam."""
+        """Return `side` blocks or fewer along a side; refuse an image where few show the beam."""
         if not np.any(mask):
             raise InputError(
                 "no pixel is free of the object, so the beam behind it cannot be predicted: mask "
