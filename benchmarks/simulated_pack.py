@@ -6,9 +6,9 @@
 A point source sends protons through an object at 1 cm onto a pack at 10 cm. Each ray is displaced
 by the exact formula and counts where it lands on the scan of a film that lies askew; nothing is
 interpolated between the pixels of a film and those of its scan. Of the package, only the dose that
-a proton leaves in each film is used (`Response`). Straight rays cross the pack: energy loss is that
-along the axis, and protons neither scatter nor straggle. Counting noise is that of each film alone,
-although the same protons cross several.
+a proton leaves in each film is used (`ResponseMatrix`). Straight rays cross the pack: energy loss
+is that along the axis, and protons neither scatter nor straggle. Counting noise is that of each
+film alone, although the same protons cross several.
 
 Arrays are [y, x]. Pixels of the object are those of the first film over its magnification. Lengths
 are in m and energies in MeV, unless stated otherwise.
@@ -28,7 +28,7 @@ import tifffile
 from numba import njit
 from numpy.typing import NDArray
 
-from napari_shadowinv.film import Pack, PackLayer, Response, Slab
+from napari_shadowinv.film import Pack, PackLayer, ResponseMatrix, Slab
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -375,7 +375,7 @@ def simulate(
     folder.mkdir(parents=True, exist_ok=True)
     rng = np.random.default_rng(seed)
     pack = _pack(layers)
-    response = Response.of(pack, np.arange(SLOWEST, FASTEST, 0.002) + 0.001)
+    response = ResponseMatrix.of(pack, np.arange(SLOWEST, FASTEST, 0.002) + 0.001)
     energies = np.array([band.peak for band in response.bands])
     distances = TO_FILM + _depths(pack)
     angle = PITCH / TO_FILM  # by 1 px on the first film
@@ -474,7 +474,7 @@ def _depths(pack: Pack) -> Array:
 
 
 def _fractions(
-    scene: Scene, response: Response, layer: int, strata: int
+    scene: Scene, response: ResponseMatrix, layer: int, strata: int
 ) -> tuple[tuple[Array, Array], float]:
     """Energies and what they leave in a film, by all protons; and what one leaves, on average."""
     ends = [SLOWEST, *scene.energies, FASTEST]

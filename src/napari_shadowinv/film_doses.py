@@ -49,7 +49,6 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "corners": ("corners", ("layer", "corner", "component"), PIXEL, "Corners on the scan"),
 }
 _BANDS = ("peak", "energy_low", "energy_high")  # columns of `FilmDoses.bands`
-_MIN_TIME_IN_NS = 1e-9  # s; shorter times are in ps
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -197,9 +196,7 @@ class FilmDoses(Summarised):
         cells = {"film": self.pack.layers[k].film, "energy": f"{self.energies[k]:.3g} MeV"}
         if self.setups:
             time = self.setups[k].time_of_flight
-            cells["flight"] = (
-                f"{1e12 * time:.3g} ps" if time < _MIN_TIME_IN_NS else f"{1e9 * time:.3g} ns"
-            )
+            cells["flight"] = f"{1e12 * time:.3g} ps" if time < 1e-9 else f"{1e9 * time:.3g} ns"
         usable = self.usable[k]
         if not usable.any():
             return {**cells, "median dose": "", "usable": "0%", "shift": ""}

@@ -12,7 +12,7 @@ import tifffile
 from scipy.ndimage import binary_erosion
 
 import simulated_pack
-from napari_shadowinv.film import Pack, PackLayer, Response, Slab
+from napari_shadowinv.film import Pack, PackLayer, ResponseMatrix, Slab
 from simulated_pack import PITCH, Placement, Scene, Truth, simulate
 
 SHAPE = (90, 120)
@@ -119,7 +119,7 @@ def test_films_see_all_protons_that_reach_them(truth: Truth) -> None:
     steel = (Slab(material="Al", thickness=13e-6), Slab(material="Fe", thickness=25e-6))
     mylar = [(Slab(material="Mylar", thickness=thickness),) for thickness in (100e-6, 200e-6)]
     layers = [PackLayer(film="HDV2", filters=filters) for filters in (steel, *mylar)]
-    response = Response.of(Pack(layers=tuple(layers)), np.linspace(2, 45, 40_001))
+    response = ResponseMatrix.of(Pack(layers=tuple(layers)), np.linspace(2, 45, 40_001))
     bare = replace(truth, scene=replace(truth.scene, b_scale=0.0, e_scale=0.0))
     for k in range(3):
         all_energies = response.doses[k] * truth.scene.spectrum(response.energies)

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from helpers.public_data import public_file
 from helpers.srim import TABLES
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film import Material, Pack, PackLayer, Response, Slab
+from napari_shadowinv.film import Material, Pack, PackLayer, ResponseMatrix, Slab
 from napari_shadowinv.film.unfolding import check_increasing, relative_strengths, unfold
 from napari_shadowinv.physics.setup import ProtonSetup
 
@@ -37,7 +37,7 @@ def designed() -> tuple[list[PackLayer], np.ndarray]:
 def test_a_real_pack_sees_the_energies_of_its_design(tables: bool) -> None:
     layers, energies = designed()
     srim = {name: Material(table=public_file(file)) for name, file in TABLES.items()}
-    bands = Response.of(Pack(layers=tuple(layers), materials=srim if tables else {})).bands
+    bands = ResponseMatrix.of(Pack(layers=tuple(layers), materials=srim if tables else {})).bands
     check_increasing(bands)
     peaks = np.array([band.peak for band in bands])
     # The design's own filters in front of films 6 to 8 come to somewhat more.
@@ -49,7 +49,9 @@ def test_energy_is_conserved() -> None:
     """What is lost in a pack of one thick film is all that protons have."""
     film = {"film": "thick"}
     kinds = {"thick": {"active": {"material": "Al", "thickness": 0.01}}}
-    response = Response.of(Pack.model_validate({"layers": [film], "films": kinds}), [1.0, 5.0, 30])
+    response = ResponseMatrix.of(
+        Pack.model_validate({"layers": [film], "films": kinds}), [1.0, 5.0, 30]
+    )
     np.testing.assert_allclose(response.deposits, [[1.0, 5.0, 30.0]], rtol=1e-9)
     # 1 MeV in 1 m² of 27 kg.
     assert response.doses[0, 0] == pytest.approx(1.602e-13 / 26.99, rel=1e-3)
@@ -57,7 +59,7 @@ def test_energy_is_conserved() -> None:
 
 def test_a_band_is_where_half_as_much_is_lost() -> None:
     pack = Pack(layers=tuple(PackLayer(film="EBT3") for _ in range(3)))
-    response = Response.of(pack)
+    response = ResponseMatrix.of(pack)
     for band, deposit in zip(response.bands, response.deposits, strict=True):
         assert band.low < band.peak < band.high
         at = np.interp([band.low, band.peak, band.high], response.energies, deposit)
@@ -79,7 +81,7 @@ def test_faster_protons_come_earlier() -> None:
 
 
 def test_films_in_the_wrong_order_are_refused() -> None:
-    bands = Response.of(Pack(layers=(PackLayer(film="HDV2"), PackLayer(film="EBT3")))).bands
+    bands = ResponseMatrix.of(Pack(layers=(PackLayer(film="HDV2"), PackLayer(film="EBT3")))).bands
     with pytest.raises(InputError, match="expected films in the order in which protons reach them"):
         check_increasing(bands[::-1])
 
@@ -88,7 +90,7 @@ def test_a_pack_that_stops_all_is_refused() -> None:
     wall = Slab(material="Ta", thickness=0.1)
     pack = Pack(layers=(PackLayer(film="HDV2", filters=(wall,)),))
     with pytest.raises(InputError, match="reaches film 1: check the thicknesses"):
-        _ = Response.of(pack).bands
+        _ = ResponseMatrix.of(pack).bands
 
 
 @pytest.mark.parametrize(
@@ -109,26 +111,26 @@ SHAPE = (6, 7)
 
 
 @pytest.fixture(scope="module")
-def response() -> Response:
+def response() -> ResponseMatrix:
     filters = ["40 um Al", *["150 um Mylar"] * 3, "300 um Mylar", *["250 um Fe"] * 3]
     layers = [{"film": "HDV2", "filters": stack} for stack in filters]
-    return Response.of(Pack.model_validate({"layers": layers}))
+    return ResponseMatrix.of(Pack.model_validate({"layers": layers}))
 
 
-def doses_of(response: Response, spectrum: np.ndarray) -> np.ndarray:
+def doses_of(response: ResponseMatrix, spectrum: np.ndarray) -> np.ndarray:
     """Of a spectrum (protons per m² and MeV) in every pixel."""
     dose = np.trapezoid(spectrum * response.doses, response.energies, axis=1)
     return dose[:, None, None] * np.ones(SHAPE)
 
 
-def falling(response: Response, temperature: float) -> np.ndarray:
+def falling(response: ResponseMatrix, temperature: float) -> np.ndarray:
     """Protons per m² and MeV, exponential to the last."""
     return 1e14 * np.exp(-response.energies / temperature)
 
 
 @pytest.mark.parametrize(("temperature", "within"), [(8.0, 0.01), (12.0, 0.01), (40.0, 0.03)])
 def test_a_falling_spectrum_comes_back(
-    response: Response, temperature: float, within: float
+    response: ResponseMatrix, temperature: float, within: float
 ) -> None:
     spectrum = falling(response, temperature)
     doses = doses_of(response, spectrum)
@@ -138,7 +140,7 @@ def test_a_falling_spectrum_comes_back(
     np.testing.assert_allclose(spectra.fluence, spectra.fluence[:, :1, :1] * np.ones(SHAPE))
 
 
-def test_each_layer_shows_protons_of_its_reported_energy(response: Response) -> None:
+def test_each_layer_shows_protons_of_its_reported_energy(response: ResponseMatrix) -> None:
     spectrum = falling(response, 10.0)
     # What a magnetic and an electric field add in a pixel, to the first order.
     for power in (0.5, 1.0):
@@ -150,7 +152,7 @@ def test_each_layer_shows_protons_of_its_reported_energy(response: Response) -> 
         np.testing.assert_allclose(excess, 0.3 * (spectra.energies / 3) ** -power, rtol=0.06)
 
 
-def test_the_last_film_shows_faster_protons_than_stop_in_it(response: Response) -> None:
+def test_the_last_film_shows_faster_protons_than_stop_in_it(response: ResponseMatrix) -> None:
     doses = doses_of(response, falling(response, 10.0))
     spectra = unfold(doses, np.full(doses.shape, 0.01), response)
     peaks = np.array([band.peak for band in response.bands])
@@ -158,7 +160,7 @@ def test_the_last_film_shows_faster_protons_than_stop_in_it(response: Response) 
     assert spectra.energies[-1] > 1.03 * peaks[-1]
 
 
-def test_errors_are_those_of_noisy_doses(response: Response) -> None:
+def test_errors_are_those_of_noisy_doses(response: ResponseMatrix) -> None:
     doses = doses_of(response, falling(response, 15.0))[:, :1, :1] * np.ones((1, 50, 60))
     noise = 1 + 0.03 * np.random.default_rng(0).normal(size=doses.shape)
     errors = np.full(doses.shape, 0.03)
@@ -169,14 +171,14 @@ def test_errors_are_those_of_noisy_doses(response: Response) -> None:
     assert abs(away.mean(axis=(1, 2))).max() < 0.15
 
 
-def test_nothing_is_negative(response: Response) -> None:
+def test_nothing_is_negative(response: ResponseMatrix) -> None:
     doses = np.random.default_rng(1).uniform(0, 10, (8, *SHAPE))
     spectra = unfold(doses, np.full(doses.shape, 0.05), response)
     assert (spectra.fluence >= 0).all()
     assert (spectra.error > 0).all()
 
 
-def test_an_unknown_dose_is_bridged(response: Response) -> None:
+def test_an_unknown_dose_is_bridged(response: ResponseMatrix) -> None:
     doses = doses_of(response, falling(response, 15.0))
     errors = np.full(doses.shape, 0.01)
     errors[3, 2, 2] = np.inf
@@ -185,7 +187,7 @@ def test_an_unknown_dose_is_bridged(response: Response) -> None:
     assert spectra.error[3, 2, 2] > 3 * spectra.error[3, 0, 0]
 
 
-def test_a_bridged_film_keeps_its_bend(response: Response) -> None:
+def test_a_bridged_film_keeps_its_bend(response: ResponseMatrix) -> None:
     spectrum = falling(response, 8.0)
     bent = spectrum * (1 + 0.3 * (response.energies / 3) ** -0.75)
     # A pixel whose protons are displaced, among 99 plain ones that set the usual spectrum.
@@ -201,7 +203,9 @@ def test_a_bridged_film_keeps_its_bend(response: Response) -> None:
         assert excess == pytest.approx(0.3 * (spectra.energies[film] / 3) ** -0.75, rel=0.06)
 
 
-def test_fluence_of_a_pixel_grows_with_its_dose_where_a_film_is_bridged(response: Response) -> None:
+def test_fluence_of_a_pixel_grows_with_its_dose_where_a_film_is_bridged(
+    response: ResponseMatrix,
+) -> None:
     factors = np.array([1.0, 0.05, 20.0])
     bent = falling(response, 8.0) * (1 + 0.3 * (response.energies / 3) ** -0.75)
     # Three pixels of the same spectrum, among 97 plain ones that set the usual one.
@@ -214,7 +218,7 @@ def test_fluence_of_a_pixel_grows_with_its_dose_where_a_film_is_bridged(response
     np.testing.assert_allclose(fluence / factors, fluence[:, :1] * np.ones(3), rtol=1e-6)
 
 
-def test_twice_the_dose_is_twice_the_fluence(response: Response) -> None:
+def test_twice_the_dose_is_twice_the_fluence(response: ResponseMatrix) -> None:
     doses = (
         np.random.default_rng(2).uniform(5, 10, (8, *SHAPE)) * np.arange(9, 1, -1)[:, None, None]
     )
@@ -233,6 +237,6 @@ def test_twice_the_dose_is_twice_the_fluence(response: Response) -> None:
         (-np.ones((8, 3, 3)), "doses are negative"),
     ],
 )
-def test_other_doses_are_refused(response: Response, doses: np.ndarray, message: str) -> None:
+def test_other_doses_are_refused(response: ResponseMatrix, doses: np.ndarray, message: str) -> None:
     with pytest.raises(InputError, match=message):
         unfold(doses, np.full(doses.shape, 0.1), response)

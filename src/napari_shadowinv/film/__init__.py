@@ -3,7 +3,7 @@
 - films on a scan: `find_films`, `straighten_film`, `read_corners`, `write_corners`
 - pixels without marks and burns: `usable_pixels`, `burnt_edges`
 - doses: `Calibration`, `dose`, `combined_dose`, `net_optical_density`
-- packs, and the response of each film to protons of each energy: `Pack`, `Response`
+- packs, and the response of each film to protons of each energy: `Pack`, `ResponseMatrix`
 - alignment of the films of a pack: `register`, `poses_by_fiducials`, `move_corners`,
   `check_orientation`
 - fluences at each energy from the doses of all films: `unfold`

@@ -25,7 +25,7 @@ from .scans import (
     usable_pixels,
     write_corners,
 )
-from .unfolding import Band, Response, Spectra, unfold
+from .unfolding import Band, ResponseMatrix, Spectra, unfold
 
 __all__ = [
     "Band",
@@ -38,7 +38,7 @@ __all__ = [
     "Pack",
     "PackLayer",
     "Poses",
-    "Response",
+    "ResponseMatrix",
     "Slab",
     "Spectra",
     "Stopping",

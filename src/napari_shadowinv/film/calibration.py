@@ -32,8 +32,6 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
 _CHANNELS = ("red", "green", "blue")
-_TYPICAL_SPREAD = 0.02  # of a pixel, where the table has none
-_LEAST_SPREAD = 1e-4  # of the optical density
 
 
 class DoseMap(NamedTuple):
@@ -100,7 +98,7 @@ class Calibration:
             )
         spreads = np.asarray(self.spreads, float)
         if spreads.size == 0:
-            spreads = _TYPICAL_SPREAD * pixels
+            spreads = 0.02 * pixels
         if spreads.shape != pixels.shape:
             raise InputError(
                 f"the calibration's spreads have shape {spreads.shape}: expected that of its "
@@ -190,7 +188,7 @@ class Calibration:
         spread = np.interp(np.log(table_doses), np.log(self.doses[order]), spread)
         # Growth of the dose with the density, over two films that are not neighbours.
         slope = np.gradient(np.log(table_doses), density)
-        error = np.maximum(spread, _LEAST_SPREAD) * slope
+        error = np.maximum(spread, 1e-4) * slope  # of the density, where the table has none
         return np.asarray(np.interp(np.log(np.asarray(doses, float)), np.log(table_doses), error))
 
     def optical_density(self, doses: ArrayLike, channel: str = "red") -> FloatArray:

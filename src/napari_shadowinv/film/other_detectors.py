@@ -44,11 +44,7 @@ from numpy.typing import ArrayLike, NDArray
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
-_TRACKS_PER_BIN = 50
-_BINS_PER_SIDE = 300
-_MAX_BINS = 100_000_000
-_EDGE_TOLERANCE_BINS = 1e-9  # of a bin: rounding does not push a track out of the image
-_MICRONS_PER_M = 1e6  # in a metre
+_EDGE_TOLERANCE_BINS = 1e-9  # rounding does not push a track out of the image
 
 
 class TrackImage(NamedTuple):
@@ -129,14 +125,19 @@ class Tracks:
         columns = {name: getattr(self, name)[is_inside] for name in ("y", "x", *ranges)}
         return replace(self, **columns)
 
-    def image(self, bin: float | None = None) -> TrackImage:
+    def image(
+        self, bin: float | None = None, *, tracks_per_bin: float = 50, bins_per_side: int = 300
+    ) -> TrackImage:
         """Count the tracks in square bins from the top left corner.
 
         Parameters
         ----------
         bin : float, optional
             Side of a bin in µm. Default: the smallest with a whole number of bins along the
-            shorter side, at most 300 along the longer one, and 50 tracks in each on average.
+            shorter side, at most `bins_per_side` along the longer one, and `tracks_per_bin` in
+            each on average.
+        tracks_per_bin, bins_per_side : number, default 50 and 300
+            Of the usual bin.
 
         Returns
         -------
@@ -153,15 +154,21 @@ class Tracks:
                 "no track lies within the ranges: expected at least one; widen diameter, contrast "
                 "or eccentricity"
             )
-        side = self._usual_bin() if bin is None else bin / _MICRONS_PER_M
+        if bin is not None:
+            side = bin / 1e6
+        else:
+            filled = np.sqrt(tracks_per_bin * self.size[0] * self.size[1] / len(self))
+            target = max(filled, max(self.size) / bins_per_side)
+            # A whole number of bins along the shorter side, so that little is cut off.
+            side = min(self.size) / max(2, int(min(self.size) / target + _EDGE_TOLERANCE_BINS))
         if not (np.isfinite(side) and 0 < side <= min(self.size) / 2 * (1 + _EDGE_TOLERANCE_BINS)):
             raise InputError(
-                f"bin is {side * _MICRONS_PER_M:g} µm: expected at most half of the scanned area's "
-                f"shorter side, {min(self.size) / 2 * _MICRONS_PER_M:g} µm, and more than 0"
+                f"bin is {side * 1e6:g} µm: expected at most half of the scanned area's "
+                f"shorter side, {min(self.size) / 2 * 1e6:g} µm, and more than 0"
             )
-        if self.size[0] * self.size[1] > _MAX_BINS * side**2:
+        if self.size[0] * self.size[1] > 1e8 * side**2:
             raise InputError(
-                f"bin is {side * _MICRONS_PER_M:g} µm: expected at most {_MAX_BINS} bins, on an "
+                f"bin is {side * 1e6:g} µm: expected at most 100000000 bins, on an "
                 f"area of {self.size[0]:g} × {self.size[1]:g} m; choose larger bins"
             )
         height, width = (int(length / side + _EDGE_TOLERANCE_BINS) for length in self.size)
@@ -172,14 +179,7 @@ class Tracks:
         columns = np.clip(column[inside].astype(np.int64), 0, width - 1)
         hits = np.bincount(rows * width + columns, minlength=height * width)
         counts = hits.reshape(height, width).astype(np.uint32)
-        return TrackImage(counts, np.sqrt(np.maximum(counts, 1.0)), float(side * _MICRONS_PER_M))
-
-    def _usual_bin(self) -> float:
-        height, width = self.size
-        filled = np.sqrt(_TRACKS_PER_BIN * height * width / len(self))
-        target = max(filled, max(self.size) / _BINS_PER_SIDE)
-        # A whole number of bins along the shorter side, so that little is cut off.
-        return min(self.size) / max(2, int(min(self.size) / target + _EDGE_TOLERANCE_BINS))
+        return TrackImage(counts, np.sqrt(np.maximum(counts, 1.0)), float(side * 1e6))
 
 
 def _within(values: AnyArray, name: str, limits: tuple[float | None, float | None]) -> BoolArray:
@@ -196,14 +196,14 @@ def _within(values: AnyArray, name: str, limits: tuple[float | None, float | Non
     return np.asarray((values >= ends[0]) & (values <= ends[1]))
 
 
-# Share and decay time in minutes of the two parts of the signal: Boutoux et al.
+# Share and decay time in minutes of the two parts of the signal, fitted to measurements of up to
+# 4000 minutes: Boutoux et al.
 _FADING = {
     "MS": ((0.334, 107.32), (0.666, 33974.0)),
     "SR": ((0.579, 15.052), (0.421, 3829.5)),
     "TR": ((0.535, 23.812), (0.465, 3837.2)),
     "MP": ((0.565, 18.461), (0.435, 6117.5)),
 }
-_MAX_FADING_MIN = 4000.0  # min, to which the fit was made
 
 
 class Luminescence(NamedTuple):
@@ -336,9 +336,9 @@ def fading(minutes: float, plate: str) -> float:
     """
     if plate not in _FADING:
         raise InputError(f"plate is {plate!r}: expected one of {', '.join(_FADING)}")
-    if not 0 <= minutes <= _MAX_FADING_MIN:
+    if not 0 <= minutes <= 4000:
         raise InputError(
-            f"the plate was scanned after {minutes:g} min: expected 0 to {_MAX_FADING_MIN:g}, for "
-            "which its fading is known"
+            f"the plate was scanned after {minutes:g} min: expected 0 to 4000, for which its "
+            "fading is known"
         )
     return float(sum(share * np.exp(-minutes / time) for share, time in _FADING[plate]))

@@ -36,13 +36,6 @@ from napari_shadowinv.physics.setup import ProtonSetup, setup_from_dict
 PROTON_MASS = 938.27209  # MeV
 _ELECTRON_MASS = 0.51099895  # MeV
 _BETHE_FACTOR = 0.307075  # MeV cm²/mol
-_MIN_ENERGY_MEV = 0.01
-_MAX_ENERGY_MEV = 300.0
-_N_ENERGIES = 4000
-# Below, Bethe's formula is wrong: it goes on with its slope, then in proportion to the velocity.
-_MIN_BETHE_MEV = 0.5
-_MIN_SLOPE_MEV = 0.1
-_PER_M = 100.0  # from 1/cm
 
 _UNITS = {"eV": 1e-6, "keV": 1e-3, "MeV": 1.0, "GeV": 1e3}
 _ROW = re.compile(r"\s*([\d.]+)\s+(eV|keV|MeV|GeV)\s+([\d.]+E[+-]\d+)\s+([\d.]+E[+-]\d+)\s")
@@ -91,14 +84,22 @@ class Stopping:
         losses = np.array([float(electrons) + float(nuclei) for *_, electrons, nuclei in rows])
         if not (np.diff(energies) > 0).all():
             raise FileFormatError(f"{path} has energies that do not increase: make the table again")
-        return Stopping(energies, losses * 1000 * grams * _PER_M, 1000 * grams)
+        return Stopping(energies, losses * 1000 * grams * 100, 1000 * grams)
 
     @classmethod
-    def by_bethe(cls, density: float, charge_per_mass: float, excitation: float) -> Stopping:
+    def by_bethe(
+        cls,
+        density: float,
+        charge_per_mass: float,
+        excitation: float,
+        *,
+        slow: tuple[float, float] = (0.1, 0.5),
+    ) -> Stopping:
         """Compute losses by Bethe's formula, to about 5 % from 1 MeV and 2 % from 10 MeV on.
 
         The density is in kg/m³, the charge per mass, mean Z/A, in mol/g, and the mean excitation
-        energy in eV.
+        energy in eV. Below the higher of the energies `slow`, in MeV, the formula is wrong: the
+        loss goes on with its slope, then, below the lower one, in proportion to the velocity.
 
         Examples
         --------
@@ -106,19 +107,20 @@ class Stopping:
         >>> float(aluminium.loss(10.0) / 2699 * 10)  # 33.8 MeV cm²/g by ICRU 49
         34.2...
         """
-        energies = np.geomspace(_MIN_ENERGY_MEV, _MAX_ENERGY_MEV, _N_ENERGIES)
-        fast = _mass_loss(np.maximum(energies, _MIN_BETHE_MEV), charge_per_mass, excitation)
-        near = _mass_loss(_MIN_BETHE_MEV * np.array([1.0, 1.01]), charge_per_mass, excitation)
+        energies = np.geomspace(0.01, 300.0, 4000)
+        slowest, slower = slow
+        fast = _mass_loss(np.maximum(energies, slower), charge_per_mass, excitation)
+        near = _mass_loss(slower * np.array([1.0, 1.01]), charge_per_mass, excitation)
         slope = np.log(near[1] / near[0]) / np.log(1.01)
-        going_on = np.minimum(np.maximum(energies, _MIN_SLOPE_MEV) / _MIN_BETHE_MEV, 1.0) ** slope
-        slow = np.sqrt(np.minimum(energies / _MIN_SLOPE_MEV, 1.0))
-        losses = fast * going_on * slow * (density / 1000) * _PER_M
+        going_on = np.minimum(np.maximum(energies, slowest) / slower, 1.0) ** slope
+        velocity = np.sqrt(np.minimum(energies / slowest, 1.0))
+        losses = fast * going_on * velocity * (density / 1000) * 100
         return cls(energies, losses, density)
 
     @cached_property
     def _depths(self) -> tuple[FloatArray, FloatArray]:
         """Closely spaced energies, and the range of protons at each."""
-        energies = np.geomspace(self.energies[0], self.energies[-1], _N_ENERGIES)
+        energies = np.geomspace(self.energies[0], self.energies[-1], 4000)
         per_loss = 1 / self.loss(energies)
         steps = 0.5 * (per_loss[1:] + per_loss[:-1]) * np.diff(energies)
         # Below the first energy the loss goes as the velocity.

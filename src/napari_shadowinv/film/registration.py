@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
@@ -30,46 +31,50 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import upright
 
 EDGE_ERROR_PX = 3.0  # standard deviation of a film's place by its edges
-# Structure between these sizes is compared.
-_FINE_BLUR_PX = 2.0
-_COARSE_BLUR_PX = 12.0
-_SAMPLING_PX = 2  # so fine that no structure is lost
-_MARGIN_PX = 30  # edges are burnt, and belong to the film, not to the beam
-_MAX_SHIFT_SAMPLES = 12  # of films from where their edges are
-# Fields displace what films show by different amounts, too: of films with exact edges, by which
-# fields came out 4 to 6 % wrong, images shifted by less than this made it 10 to 17 %.
-_EDGE_AGREEMENT_PX = 1.5
-# How far a comparison may move the corners of two films against each other, over the error of their
-# edges: less if no third film of their kind confirms it, because what moves may be the beam.
-_MAX_MOVE_ERRORS = 4.0
-_MAX_LONE_MOVE_ERRORS = 2.5
-_TURN_ERROR_RAD = 0.005  # of a film's direction by its edges
-_MAX_TURN_ERRORS = 3.0  # times that of two films: sides of half a thousand pixels exclude more
-# A triangle of comparisons may stay open by the larger of these.
-_MAX_GAP_ERRORS = 3.0
-_MIN_GAP_PX = 1.0
-# A kink of the calibration table shows as a line of equal dose, which moves with the dose.
-_DOSE_STEPS = 24  # of the map from the dose of one film to that of another
-_MAX_STEPS = 25
-_STEP_TOLERANCE = 1e-3  # samples
-_N_PARTS = (3, 5)  # along y and x; they must agree
-_MIN_SHARE = 0.99  # of usable pixels around a place that counts
-_MIN_USABLE_SHARE = 0.5  # of a part that counts
-_MIN_CORRELATION = 0.3
-_MIN_AGREEING_SHARE = 0.6  # of the parts
-_MAX_DISTANCE_PX = 5.0  # at which parts that are further away count
-_MIN_ERROR_PX = 0.1
-_N_NEIGHBOURS = 2  # films before and behind that one is compared with
 # Ways in which a film may lie, as flips of its rows and columns.
 _WAYS_AROUND = {
     (True, True): "upside down: give its layer turned = 180",
     (False, True): "mirrored left to right: give its layer mirrored = true",
     (True, False): "mirrored top to bottom: give its layer mirrored = true, turned = 180",
 }
-# Of large structure, for the way a film lies.
-_BLOCK_PX = 8
-_MIN_TURNED_CORRELATION = 0.7
-_MAX_DEFICIT_RATIO = 0.35  # of the deficits from a correlation of 1, turned over and as is
+
+
+@dataclass(frozen=True)
+class TextureMatch:
+    """How films are compared by their fine structure; chosen by ``benchmarks/film_pack.py``."""
+
+    fine_blur: float = 2.0  # px; structure between these two sizes is compared
+    coarse_blur: float = 12.0
+    sampling: int = 2  # px to a sample, so few that no structure is lost
+    margin: int = 30  # px; edges are burnt, and belong to the film, not to the beam
+    reach: int = 12  # samples, of films from where their edges are
+    neighbours: int = 2  # films before and behind that one is compared with
+    parts: tuple[int, int] = (3, 5)  # along y and x, which must agree
+    usable_share: float = 0.5  # of a part that counts
+    correlation: float = 0.3  # of films, and of a part, that show the same
+    agreeing_share: float = 0.6  # of the parts
+    max_distance: float = 5.0  # px, at which parts that are further away count
+    least_error: float = 0.1  # px, of a shift
+
+
+@dataclass(frozen=True)
+class MoveLimits:
+    """How far a comparison may move films; chosen by ``benchmarks/film_pack.py``.
+
+    Of corners, over the error of both films' edges: less if no third film of their kind confirms
+    it, because what moves may be the beam. A triangle of comparisons may stay open by the larger
+    gap. Fields displace what films show by different amounts, too: of films with exact edges, by
+    which fields came out 4 to 6 % wrong, images shifted by less than `from_edges` made it 10 to
+    17 %.
+    """
+
+    confirmed: float = 4.0
+    alone: float = 2.5
+    gap_errors: float = 3.0
+    gap: float = 1.0  # px
+    turn_error: float = 0.005  # rad, of a film's direction by its edges
+    turns: float = 3.0  # times that of two films: sides of half a thousand pixels exclude more
+    from_edges: float = 1.5  # px
 
 
 class Poses(NamedTuple):
@@ -117,7 +122,7 @@ class _Film(NamedTuple):
     counts: BoolArray  # where the texture is known
 
     @classmethod
-    def of(cls, image: FloatArray, usable: BoolArray) -> _Film:
+    def of(cls, image: FloatArray, usable: BoolArray, match: TextureMatch) -> _Film:
         """Return a film with its smooth and its fine structure, on fewer pixels."""
         weight = usable.astype(np.float64)
         filled = np.where(usable, image, 0.0)
@@ -126,23 +131,26 @@ class _Film(NamedTuple):
             share = ndimage.gaussian_filter(weight, size)
             return ndimage.gaussian_filter(filled, size) / np.maximum(share, 1e-6), share
 
-        (fine, share), (coarse, _) = smooth(_FINE_BLUR_PX), smooth(_COARSE_BLUR_PX)
+        (fine, share), (coarse, _) = smooth(match.fine_blur), smooth(match.coarse_blur)
         inner = np.zeros_like(usable)
-        margin = min(_MARGIN_PX, min(image.shape) // 8)
+        margin = min(match.margin, min(image.shape) // 8)
         inner[margin:-margin, margin:-margin] = True
         counts = inner & usable & (share > 0.9)
-        few = np.s_[_SAMPLING_PX // 2 :: _SAMPLING_PX, _SAMPLING_PX // 2 :: _SAMPLING_PX]
+        few = 2 * (slice(match.sampling // 2, None, match.sampling),)
         texture = np.where(counts, fine - coarse, 0.0)
         return cls(image, usable, fine[few], texture[few], counts[few])
 
-    def with_dose_of(self, other: _Film) -> _Film:
-        """Return the film with its dose mapped to that of another by a monotone function."""
+    def with_dose_of(self, other: _Film, match: TextureMatch, *, steps: int = 24) -> _Film:
+        """Return the film with its dose mapped to that of another by a monotone function.
+
+        A kink of the calibration table shows as a line of equal dose, which moves with the dose.
+        """
         both = self.counts & other.counts
-        if both.sum() < _DOSE_STEPS**2:
+        if both.sum() < steps**2:
             return self
         order = np.argsort(self.level[both])
         levels, values = (
-            np.array([part.mean() for part in np.array_split(plane[both][order], _DOSE_STEPS)])
+            np.array([part.mean() for part in np.array_split(plane[both][order], steps)])
             for plane in (self.level, other.level)
         )
         values = isotonic_regression(values).x
@@ -155,7 +163,7 @@ class _Film(NamedTuple):
         slopes = np.diff(values) / np.diff(levels)
         mapped += slopes[0] * np.minimum(self.image - levels[0], 0.0)
         mapped += slopes[-1] * np.maximum(self.image - levels[-1], 0.0)
-        return _Film.of(mapped, self.usable)
+        return _Film.of(mapped, self.usable, match)
 
 
 class _Pair(NamedTuple):
@@ -173,6 +181,8 @@ def register(
     *,
     spread: float | ArrayLike = EDGE_ERROR_PX,
     kinds: Sequence[Hashable] | None = None,
+    match: TextureMatch = TextureMatch(),
+    limits: MoveLimits = MoveLimits(),
     report: Reporter | None = None,
 ) -> Poses:
     """Align films by the structure that they share.
@@ -198,6 +208,10 @@ def register(
     kinds : sequence of hashable, length n, optional
         Films of one kind were cut alike, so that the edges of one are as far off as the edges of
         another. Default: all are.
+    match : TextureMatch, optional
+        How they are compared.
+    limits : MoveLimits, optional
+        How far a comparison may move films.
 
     Raises
     ------
@@ -213,29 +227,29 @@ def register(
     report = report or Reporter(None, None)
     edges = np.broadcast_to(np.asarray(spread, np.float64), len(values))
     alike: list[Hashable] = [None] * len(values) if kinds is None else list(kinds)
-    films = [_Film.of(*planes) for planes in zip(values, is_usable, strict=True)]
+    films = [_Film.of(*planes, match) for planes in zip(values, is_usable, strict=True)]
     compared = []
     for first in range(len(films)):
         report("register", first, len(films))
-        for second in range(first + 1, min(first + 1 + _N_NEIGHBOURS, len(films))):
-            if (pair := _compare(first, second, films)) is not None:
+        for second in range(first + 1, min(first + 1 + match.neighbours, len(films))):
+            if (pair := _compare(first, second, films, match)) is not None:
                 compared.append(pair)
-    pairs = _credible(compared, edges, alike, values.shape[1:])
-    poses = _fit_poses(pairs, edges)
+    pairs = _credible(compared, edges, alike, values.shape[1:], limits)
+    poses = _fit_poses(pairs, edges, limits.turn_error)
     for k in np.flatnonzero(~poses.by_images):
         # Edges are as far off as those of films of the same kind that can be compared.
         peers = [j for j in np.flatnonzero(poses.by_images) if alike[j] == alike[k]]
         if peers:
             by_peers = np.sqrt(np.mean(poses.shifts[peers] ** 2))
             poses.errors[k] = max(poses.errors[k], by_peers)
-    if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > _EDGE_AGREEMENT_PX:
+    if not pairs or max(np.abs(pair.shift).max() for pair in pairs) > limits.from_edges:
         # What films show agrees to tenths of a pixel also where fields or the beam move it.
         moves = np.sqrt(np.mean(poses.shifts**2, axis=1))
         return poses._replace(errors=np.hypot(poses.errors, np.where(poses.by_images, moves, 0.0)))
     return poses._replace(
         shifts=np.zeros_like(poses.shifts),
         turns=np.zeros_like(poses.turns),
-        errors=np.where(poses.by_images, _EDGE_AGREEMENT_PX / 2, poses.errors),
+        errors=np.where(poses.by_images, limits.from_edges / 2, poses.errors),
     )
 
 
@@ -247,11 +261,21 @@ def move_corners(corners: ArrayLike, shift: ArrayLike, turn: float, scale: float
     return np.asarray(middle + (around + scale * np.asarray(shift)) @ axes)
 
 
-def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]) -> None:
+def check_orientation(
+    images: ArrayLike,
+    usable: ArrayLike,
+    names: Sequence[str],
+    *,
+    block: int = 8,
+    correlation: float = 0.7,
+    deficit_ratio: float = 0.35,
+) -> None:
     """Reject films that lie another way round than most films do, and name all of them.
 
     Neighbours must show the same large structure, turned or mirrored: where the films show too
-    little, or their structure is symmetric, they are not rejected.
+    little, or their structure is symmetric, they are not rejected. The structure is that of means
+    over `block` px. Turned over, it must correlate better than `correlation`, and lack at most
+    `deficit_ratio` of what it lacks to a correlation of 1 as it lies.
 
     Raises
     ------
@@ -261,9 +285,9 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
     # Large structure in few pixels, and how much of each of them is known.
     planes = []
     for image, mask in zip(np.asarray(images), np.asarray(usable), strict=True):
-        counts = block_sums(mask, _BLOCK_PX)
-        sums = block_sums(np.where(mask, image, 0.0), _BLOCK_PX)
-        planes.append(np.stack([sums / np.maximum(counts, 1.0), counts / _BLOCK_PX**2]))
+        counts = block_sums(mask, block)
+        sums = block_sums(np.where(mask, image, 0.0), block)
+        planes.append(np.stack([sums / np.maximum(counts, 1.0), counts / block**2]))
     flips = [(False, False)]  # of the rows and columns, so that films lie as the first
     clues = {}
     for number in range(1, len(planes)):
@@ -271,8 +295,8 @@ def check_orientation(images: ArrayLike, usable: ArrayLike, names: Sequence[str]
         as_is = _greatest_correlation(before, film)
         turned = {flip: _greatest_correlation(before, _flip(film, flip)) for flip in _WAYS_AROUND}
         best = max(turned, key=lambda flip: turned[flip])
-        is_better = 1 - turned[best] < _MAX_DEFICIT_RATIO * (1 - as_is)
-        if is_better and turned[best] > _MIN_TURNED_CORRELATION:
+        is_better = 1 - turned[best] < deficit_ratio * (1 - as_is)
+        if is_better and turned[best] > correlation:
             clues[number] = f"correlation {as_is:.3f}, turned over {turned[best]:.3f}"
             rows, columns = flips[-1]
             flips.append((rows != best[0], columns != best[1]))
@@ -305,21 +329,27 @@ def _flip(planes: FloatArray, flip: tuple[bool, bool]) -> FloatArray:
 
 
 def _credible(
-    pairs: list[_Pair], edges: FloatArray, kinds: list[Hashable], shape: tuple[int, ...]
+    pairs: list[_Pair],
+    edges: FloatArray,
+    kinds: list[Hashable],
+    shape: tuple[int, ...],
+    limits: MoveLimits,
 ) -> list[_Pair]:
     """Comparisons that the edges of both films do not exclude."""
     credible = []
     to_corner = float(np.hypot(shape[0], shape[1])) / 2
     for pair in pairs:
         move = np.hypot(*pair.shift) + abs(pair.turn) * to_corner
-        factor = _MAX_MOVE_ERRORS if _is_confirmed(pair, pairs, kinds) else _MAX_LONE_MOVE_ERRORS
+        factor = limits.confirmed if _is_confirmed(pair, pairs, kinds, limits) else limits.alone
         is_within = move < factor * np.hypot(edges[pair.first], edges[pair.second])
-        if is_within and abs(pair.turn) < _MAX_TURN_ERRORS * np.sqrt(2) * _TURN_ERROR_RAD:
+        if is_within and abs(pair.turn) < limits.turns * np.sqrt(2) * limits.turn_error:
             credible.append(pair)
     return credible
 
 
-def _is_confirmed(pair: _Pair, pairs: list[_Pair], kinds: list[Hashable]) -> bool:
+def _is_confirmed(
+    pair: _Pair, pairs: list[_Pair], kinds: list[Hashable], limits: MoveLimits
+) -> bool:
     """Whether comparisons of both films with a third one of their kind agree with a pair."""
     by_films: dict[tuple[int, int], tuple[FloatArray, float]] = {}
     for item in pairs:
@@ -332,24 +362,24 @@ def _is_confirmed(pair: _Pair, pairs: list[_Pair], kinds: list[Hashable]) -> boo
             continue
         gap = np.abs(onwards[0] + back[0] - pair.shift).max()
         error = np.sqrt(onwards[1] ** 2 + back[1] ** 2 + pair.error**2)
-        if gap < max(_MIN_GAP_PX, _MAX_GAP_ERRORS * error):
+        if gap < max(limits.gap, limits.gap_errors * error):
             return True
     return False
 
 
-def _compare(first: int, second: int, films: list[_Film]) -> _Pair | None:
+def _compare(first: int, second: int, films: list[_Film], match: TextureMatch) -> _Pair | None:
     """Pose of the second film against the first, or None if they do not show the same."""
     reference, reference_mask = films[first].texture, films[first].counts
-    film = films[second].with_dose_of(films[first])
-    shift, correlation = _coarse_shift(films[first], film)
-    if correlation < _MIN_CORRELATION:
+    film = films[second].with_dose_of(films[first], match)
+    shift, correlation = _coarse_shift(films[first], film, match.reach)
+    if correlation < match.correlation:
         return None
     pose = np.array([*shift, 0.0])
     planes = [film.texture, film.counts.astype(np.float64), *np.gradient(film.texture)]
     y, x = _from_middle(reference.shape)
-    for _ in range(_MAX_STEPS):
+    for _ in range(25):
         moved, share, *slopes = _move(pose, planes)
-        both = reference_mask & (share > _MIN_SHARE)
+        both = reference_mask & (share > 0.99)
         c, s = np.cos(pose[2]), np.sin(pose[2])
         turning = slopes[0] * (-s * y - c * x) + slopes[1] * (c * y - s * x)
         design = np.stack([slope[both] for slope in (*slopes, turning)], axis=1)
@@ -362,20 +392,20 @@ def _compare(first: int, second: int, films: list[_Film]) -> _Pair | None:
         normal = gain * design.T @ (weight[:, None] * design)
         step = np.linalg.lstsq(normal, design.T @ (weight * residual), rcond=None)[0]
         pose += step
-        if np.abs(pose[:2]).max() > 2 * _MAX_SHIFT_SAMPLES or abs(pose[2]) > 10 * _TURN_ERROR_RAD:
+        if np.abs(pose[:2]).max() > 2 * match.reach or abs(pose[2]) > 0.05:
             return None
-        if np.abs(step[:2]).max() < _STEP_TOLERANCE:
+        if np.abs(step[:2]).max() < 1e-3:
             break
     moved, share, *slopes = _move(pose, planes)
-    error = _disagreement(reference, moved, reference_mask & (share > _MIN_SHARE), slopes)
+    error = _disagreement(reference, moved, reference_mask & (share > 0.99), slopes, match)
     if error is None:
         return None
-    shift_error = max(_MIN_ERROR_PX, error)
+    shift_error = max(match.least_error, error)
     # How much worse a turn is told follows from where the structure is.
     spread = np.diag(np.linalg.inv(normal)).copy()
-    turn_error = shift_error / _SAMPLING_PX * np.sqrt(spread[2] / spread[:2].mean())
+    turn_error = shift_error / match.sampling * np.sqrt(spread[2] / spread[:2].mean())
     return _Pair(
-        first, second, _SAMPLING_PX * pose[:2], float(pose[2]), shift_error, float(turn_error)
+        first, second, match.sampling * pose[:2], float(pose[2]), shift_error, float(turn_error)
     )
 
 
@@ -392,10 +422,10 @@ def _move(pose: FloatArray, planes: list[FloatArray]) -> list[FloatArray]:
     return [ndimage.map_coordinates(plane, at, order=1) for plane in planes]
 
 
-def _coarse_shift(first: _Film, second: _Film) -> tuple[FloatArray, float]:
+def _coarse_shift(first: _Film, second: _Film, reach: int) -> tuple[FloatArray, float]:
     """Whole pixels by which the second film correlates best, each counting where it is known."""
     sides = first.texture.shape
-    shape = tuple(fft.next_fast_len(side + _MAX_SHIFT_SAMPLES, real=True) for side in sides)
+    shape = tuple(fft.next_fast_len(side + reach, real=True) for side in sides)
 
     def products(left: AnyArray, right: AnyArray) -> FloatArray:
         spectra = [fft.rfft2(plane.astype(np.float64), shape) for plane in (left, right)]
@@ -406,44 +436,48 @@ def _coarse_shift(first: _Film, second: _Film) -> tuple[FloatArray, float]:
     powers = products(squares, second.counts) * products(first.counts, moved_squares)
     least = 0.05 * float(squares.sum() * moved_squares.sum())
     alike = common / np.sqrt(np.maximum(powers, max(least, 1e-300)))
-    near = np.arange(-_MAX_SHIFT_SAMPLES, _MAX_SHIFT_SAMPLES + 1)
+    near = np.arange(-reach, reach + 1)
     window = alike[np.ix_(near, near)]
     place = np.unravel_index(int(np.argmax(window)), window.shape)
     return near[list(place)].astype(np.float64), float(window[place])
 
 
 def _disagreement(
-    reference: FloatArray, moved: FloatArray, both: BoolArray, slopes: list[FloatArray]
+    reference: FloatArray,
+    moved: FloatArray,
+    both: BoolArray,
+    slopes: list[FloatArray],
+    match: TextureMatch,
 ) -> float | None:
     """Error of a shift by how far parts of the films are from it, or None if too few agree."""
     n_parts, away, weights = 0, [], []
-    sides = zip(reference.shape, _N_PARTS, strict=True)
+    sides = zip(reference.shape, match.parts, strict=True)
     for places in product(*(np.array_split(np.arange(side), count) for side, count in sides)):
         part = np.ix_(*places)
         counts = both[part]
-        if counts.mean() < _MIN_USABLE_SHARE:
+        if counts.mean() < match.usable_share:
             continue
         n_parts += 1
         fixed_part, moved_part = reference[part][counts], moved[part][counts]
         size = np.sqrt((fixed_part @ fixed_part) * (moved_part @ moved_part))
-        if size == 0 or fixed_part @ moved_part < _MIN_CORRELATION * size:
+        if size == 0 or fixed_part @ moved_part < match.correlation * size:
             continue
         gain = (fixed_part @ moved_part) / (moved_part @ moved_part)
         design = gain * np.stack([slope[part][counts] for slope in slopes], axis=1)
         step = np.linalg.lstsq(design, fixed_part - gain * moved_part, rcond=None)[0]
-        distance = np.clip(_SAMPLING_PX * step, -_MAX_DISTANCE_PX, _MAX_DISTANCE_PX)
+        distance = np.clip(match.sampling * step, -match.max_distance, match.max_distance)
         away.append((distance**2).mean())
         weights.append((design**2).sum())
-    if len(away) < max(2, _MIN_AGREEING_SHARE * n_parts):
+    if len(away) < max(2, match.agreeing_share * n_parts):
         return None
     return float(np.sqrt(np.average(away, weights=weights) / len(away)))
 
 
-def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
+def _fit_poses(pairs: list[_Pair], edges: FloatArray, turn_error: float) -> Poses:
     """The poses that comparisons and edges together make likeliest."""
     count = len(edges)
     normal, sides = np.diag(1 / np.square(edges)), np.zeros((count, 2))
-    turns, turned = np.eye(count) / _TURN_ERROR_RAD**2, np.zeros(count)
+    turns, turned = np.eye(count) / turn_error**2, np.zeros(count)
     is_compared = np.zeros(count, dtype=bool)
     for pair in pairs:
         difference = np.zeros(count)
@@ -470,9 +504,8 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray) -> Poses:
     )
 
 
-def _greatest_correlation(first: FloatArray, second: FloatArray) -> float:
-    """Of two images with their known shares, over shifts by the reach."""
-    steps = _MAX_SHIFT_SAMPLES // _BLOCK_PX
+def _greatest_correlation(first: FloatArray, second: FloatArray, *, steps: int = 1) -> float:
+    """Of two images with their known shares, over shifts by so many pixels."""
     greatest = -1.0
     for shift in product(range(-steps, steps + 1), repeat=2):
         on_first = tuple(slice(max(0, step) or None, min(0, step) or None) for step in shift)
@@ -487,15 +520,17 @@ def _greatest_correlation(first: FloatArray, second: FloatArray) -> float:
     return greatest
 
 
-_MIN_MARK_ERROR_PX = 0.3  # px: as marks are read off a scan
-_MAX_MISFIT_PX = 10.0  # further from its place by the other marks, a mark has a wrong name
-_MARK_ROUNDS = 50
-
 Points = Mapping[str, ArrayLike]
 
 
 def poses_by_fiducials(
-    points: Sequence[Points], corners: ArrayLike, scales: ArrayLike, names: Sequence[str]
+    points: Sequence[Points],
+    corners: ArrayLike,
+    scales: ArrayLike,
+    names: Sequence[str],
+    *,
+    mark_error: float = 0.3,
+    max_misfit: float = 10.0,
 ) -> Poses:
     """Find the poses of films by marks that are at the same place on each.
 
@@ -512,6 +547,9 @@ def poses_by_fiducials(
         Px of each film in a px of the images, which magnify with the depth in the pack.
     names : sequence of str
         Names of the films for messages.
+    mark_error, max_misfit : float, default 0.3 and 10
+        Least error of a mark in px, as marks are read off a scan; and distance from its place by
+        the other marks beyond which a mark has a wrong name.
 
     Raises
     ------
@@ -536,7 +574,7 @@ def poses_by_fiducials(
     count = len(film_marks)
     shifts, turns = np.zeros((count, 2)), np.zeros(count)
     marked = [k for k in range(count) if film_marks[k]]
-    for _ in range(_MARK_ROUNDS):
+    for _ in range(50):
         common = _mean_places(film_marks, shifts, turns)
         for k in marked:
             shifts[k], turns[k] = _fit_rigid(film_marks[k], common)
@@ -549,7 +587,7 @@ def poses_by_fiducials(
         away = (place - shift - common[name] @ _rotation(turn) for name, place in marks.items())
         misfits.append(np.array([np.hypot(*distance) for distance in away]))
     for name, misfit in zip(names, misfits, strict=True):
-        if misfit.size and misfit.max() > _MAX_MISFIT_PX:
+        if misfit.size and misfit.max() > max_misfit:
             raise InputError(
                 f"fiducials: a mark on {name} is {misfit.max():.0f} px from its place by the marks "
                 "of all films: correct its name or its place"
@@ -559,7 +597,7 @@ def poses_by_fiducials(
     spare = 2 * sum(map(len, film_marks)) - 2 * len(shared) - sum(poses) + max(poses)
     every = np.concatenate(misfits)
     closure = float(np.sqrt((every**2).sum() / spare)) if spare > 0 else float("nan")
-    error = float(np.fmax(_MIN_MARK_ERROR_PX, closure))
+    error = float(np.fmax(mark_error, closure))
     errors = [error / np.sqrt(len(marks)) if marks else EDGE_ERROR_PX for marks in film_marks]
     shifts /= np.asarray(scales, np.float64)[:, None]
     return Poses(shifts, turns, np.array(errors), np.zeros(count, dtype=bool), closure)

@@ -13,6 +13,7 @@ Corners are in px of the scan, (y, x), from the film's top left in the direction
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,18 +27,6 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.calibration import Calibration, checked_scan, net_optical_density
 
-_MAX_FILM_BRIGHTNESS = 0.75  # of the bed's brightness, in the film's darkest colour
-_BED_PERCENTILE = 99.0  # percentile of the brightness
-_MIN_FILM_SHARE = 0.02  # of the scan's area, or `least_side` squared
-_DUST_PX = 2  # px
-_END_SHARE = 0.08  # of a side, at its ends, do not count for its place: corners are cut and bent
-_MAX_OFFSET_SHARE = 0.04  # of the film's size, from a side to its border
-_MAX_ROUNDS = 8
-_MAX_DEVIATIONS = 2.5  # of a point that is no outlier
-_REACH_PX = 6.0  # of the search from a side
-_BLUR_PX = 2.0  # of a side
-_STEP_PX = 0.5
-_MIN_OUTLIER_PX = 0.1  # a point of a side that is closer to its line is no outlier
 _Line = tuple[float, float]  # offset and slope
 
 
@@ -55,7 +44,53 @@ class _CornerRow(CheckedModel):
     x4: float
 
 
-def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[FloatArray]:
+@dataclass(frozen=True)
+class SideFit:
+    """How films are told from the bed, and lines laid along their sides; lengths in px."""
+
+    brightness: float = 0.75  # of a film, over the bed's, in the film's darkest colour
+    dust: int = 2
+    ends: float = 0.08  # of a side, where it does not count: corners are cut and bent
+    offset: float = 0.04  # of the film's size, from a side to its border
+    reach: float = 6.0  # of the search from a side
+    blur: float = 2.0  # of a side
+    step: float = 0.5  # of the search
+    outlier: float = 0.1  # from its line, at least
+
+
+@dataclass(frozen=True)
+class MarkCheck:
+    """What is a mark on a film; chosen by the tests of films with writing and without."""
+
+    sampling: int = 8  # px between the samples of the smooth background
+    background: int = 13  # samples, side of the median that gives the background
+    scatter: int = 25  # samples, side of the median that gives its scatter
+    scatters: float = 6.0  # by which a mark differs from the background
+    density: float = 0.04  # by which it differs, too, in optical density
+    blur: float = 1.0  # px
+    area: int = 4  # px
+    gap: int = 3  # px, that is closed
+    margin: int = 2  # px, by which marks are widened
+
+
+@dataclass(frozen=True)
+class BurnCheck:
+    """What is a burnt edge, measured on real EBT3: 1.6 to 40 times the dose, over in 8 to 38 px."""
+
+    depth: int = 40  # px, at most
+    cut: int = 3  # px, the outermost, which are partly bed
+    length: int = 6  # px
+    fall: float = 0.35  # of the logarithm of the dose over that length: a factor of 1.4
+    to_inside: float = 3.0  # times the slope further in, so that a beam is not taken for a burn
+    rise: float = 0.2  # of the logarithm, everywhere between the edge and the fall
+    along: int = 21  # px along the edge, of the median that removes grain and writing
+    share: float = 0.3  # of a side: fire follows edges, fronts of the beam cross them
+    margin: int = MarkCheck.margin
+
+
+def find_films(
+    scan: ArrayLike, *, least_side: float | None = None, sides: SideFit = SideFit()
+) -> list[FloatArray]:
     """Return the corners of the films on a scan, row by row as one reads.
 
     Parameters
@@ -64,6 +99,8 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
         Films on a bright bed, none of which touches another.
     least_side : float, optional
         Smaller side of the smallest film in px. Default: a seventh of the scan's.
+    sides : SideFit, optional
+        How films are told from the bed, and their sides found.
 
     Returns
     -------
@@ -77,10 +114,10 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
     """
     values = checked_scan(scan)
     darkest = values.min(axis=-1)
-    dark = darkest < _MAX_FILM_BRIGHTNESS * np.percentile(darkest, _BED_PERCENTILE)
-    inside = ndimage.binary_opening(dark, np.ones((3, 3)), iterations=_DUST_PX)
+    dark = darkest < sides.brightness * np.percentile(darkest, 99.0)
+    inside = ndimage.binary_opening(dark, np.ones((3, 3)), iterations=sides.dust)
     height, width = dark.shape
-    area = _MIN_FILM_SHARE * height * width if least_side is None else least_side**2
+    area = 0.02 * height * width if least_side is None else least_side**2
     labels, _ = ndimage.label(inside)
     sizes = np.bincount(labels.ravel())
     boxes = enumerate(ndimage.find_objects(labels), 1)
@@ -94,7 +131,7 @@ def find_films(scan: ArrayLike, *, least_side: float | None = None) -> list[Floa
     for number, box in films:
         film = ndimage.binary_fill_holes(labels[box] == number)
         top_left = np.array([part.start for part in box])
-        corners.append(_sharpen_corners(values, _fit_rectangle(film) + top_left))
+        corners.append(_sharpen_corners(values, _fit_rectangle(film, sides) + top_left, sides))
     return _in_reading_order(corners)
 
 
@@ -158,7 +195,7 @@ def checked_corners(corners: ArrayLike) -> FloatArray:
     return places
 
 
-def _fit_rectangle(film: BoolArray) -> FloatArray:
+def _fit_rectangle(film: BoolArray, sides: SideFit) -> FloatArray:
     """Return the corners of lines along the four sides of a region."""
     from scipy.spatial import ConvexHull
 
@@ -167,7 +204,7 @@ def _fit_rectangle(film: BoolArray) -> FloatArray:
     axes = _axes_of_smallest_box(hull)
     for _ in range(2):  # the second time in the direction of the film, not of its hull
         turned = border @ axes.T
-        lines = [_fit_side(turned, axis, end) for axis in (0, 1) for end in (0, 1)]
+        lines = [_fit_side(turned, axis, end, sides) for axis in (0, 1) for end in (0, 1)]
         # From the middle of the border's pixels to their outer edge.
         outward = 0.5 * np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
         places = (_intersections(lines) + outward) @ axes
@@ -189,13 +226,13 @@ def _axes_of_smallest_box(hull: FloatArray) -> FloatArray:
     return np.stack([down, [-down[1], down[0]]])
 
 
-def _fit_side(border: FloatArray, axis: int, end: int) -> _Line:
+def _fit_side(border: FloatArray, axis: int, end: int, sides: SideFit) -> _Line:
     """Fit offset and slope of the line along most of the pixels at one end of an axis."""
     low, high = ends = border.min(axis=0), border.max(axis=0)
     along, across = border[:, 1 - axis], border[:, axis]
     size = (high - low)[1 - axis]
-    inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - _END_SHARE) * size
-    near = np.abs(across - ends[end][axis]) < _MAX_OFFSET_SHARE * max(high - low)
+    inner = np.abs(along - (low + high)[1 - axis] / 2) < (0.5 - sides.ends) * size
+    near = np.abs(across - ends[end][axis]) < sides.offset * max(high - low)
     return _fit_line(along[inner & near], across[inner & near], 0.5)
 
 
@@ -203,10 +240,10 @@ def _fit_line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
     """Fit a line to most points; points closer than `usual` are no outliers."""
     used = np.ones(along.size, bool)
     slope = offset = 0.0
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(8):
         slope, offset = np.polyfit(along[used], across[used], 1)
         away = np.abs(across - offset - slope * along)
-        used = away <= max(_MAX_DEVIATIONS * 1.5 * np.median(away), usual)
+        used = away <= max(2.5 * 1.5 * np.median(away), usual)
     return float(offset), float(slope)
 
 
@@ -220,7 +257,7 @@ def _intersections(lines: Sequence[_Line]) -> FloatArray:
     return np.array(corners)
 
 
-def _sharpen_corners(scan: AnyArray, corners: FloatArray) -> FloatArray:
+def _sharpen_corners(scan: AnyArray, corners: FloatArray, sides: SideFit) -> FloatArray:
     """Refine corners to a part of a pixel, by the share of film in each pixel at the sides."""
     # The border of a mask has steps of a pixel, which average out only along a tilted side.
     axes, middle, size = upright(corners)
@@ -228,7 +265,7 @@ def _sharpen_corners(scan: AnyArray, corners: FloatArray) -> FloatArray:
     lines = []
     for axis in (0, 1):
         half = size[axis] / 2
-        count = round((1 - 2 * _END_SHARE) * size[1 - axis])
+        count = round((1 - 2 * sides.ends) * size[1 - axis])
         along = np.arange(count) - (count - 1) / 2
         for sign in (-1, 1):
 
@@ -240,30 +277,32 @@ def _sharpen_corners(scan: AnyArray, corners: FloatArray) -> FloatArray:
                 at = np.moveaxis(places @ axes + middle, -1, 0)
                 return np.asarray(ndimage.map_coordinates(darkest, at, order=1, mode="nearest"))
 
-            edge, clear = _find_edge(sample)
+            edge, clear = _find_edge(sample, sides)
             if clear.mean() < 0.5:
                 return corners
-            offset, slope = _fit_line(along[clear], edge[clear], _MIN_OUTLIER_PX)
+            offset, slope = _fit_line(along[clear], edge[clear], sides.outlier)
             lines.append((sign * (half + offset), sign * slope))
     return np.asarray(middle + _intersections(lines) @ axes)
 
 
-def _find_edge(sample: Callable[[FloatArray], FloatArray]) -> tuple[FloatArray, BoolArray]:
+def _find_edge(
+    sample: Callable[[FloatArray], FloatArray], sides: SideFit
+) -> tuple[FloatArray, BoolArray]:
     """Return where lines cross the edge from film to bed, and which of them do so clearly."""
-    across = np.arange(-_REACH_PX, _REACH_PX + _STEP_PX, _STEP_PX)
+    across = np.arange(-sides.reach, sides.reach + sides.step, sides.step)
     values = sample(across)
     bed, film = values[:, -1], values[:, 0]
     inside = values < ((bed + film) / 2)[:, None]
     last = inside.shape[1] - 1 - np.argmax(inside[:, ::-1], axis=1)
-    clear = (film < _MAX_FILM_BRIGHTNESS * bed) & inside.any(axis=1) & (last < inside.shape[1] - 1)
-    about = across[last] + _STEP_PX / 2
+    clear = (film < sides.brightness * bed) & inside.any(axis=1) & (last < inside.shape[1] - 1)
+    about = across[last] + sides.step / 2
     # Pixels are means over their squares: their deficit against the bed gives the edge exactly.
-    near = np.arange(-_BLUR_PX, _BLUR_PX + _STEP_PX, _STEP_PX)
+    near = np.arange(-sides.blur, sides.blur + sides.step, sides.step)
     values = sample(about[:, None] + near)
     bed, film = values[:, -1:], values[:, :1]
-    clear &= film[:, 0] < _MAX_FILM_BRIGHTNESS * bed[:, 0]
+    clear &= film[:, 0] < sides.brightness * bed[:, 0]
     shares = np.divide(bed - values, bed - film, out=np.zeros_like(values), where=clear[:, None])
-    return about - _BLUR_PX + np.trapezoid(shares, dx=_STEP_PX, axis=1), clear
+    return about - sides.blur + np.trapezoid(shares, dx=sides.step, axis=1), clear
 
 
 def upright(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -322,33 +361,13 @@ def write_corners(path: str | Path, films: dict[str, FloatArray]) -> None:
     write_cells(path, columns, rows)
 
 
-_SAMPLE_STEP_PX = 8  # between the samples of the smooth background
-_BACKGROUND_SAMPLES = 13  # side of the median that gives the background
-_SCATTER_SAMPLES = 25  # side of the median that gives its scatter
-_MIN_SCATTERS = 6.0  # by which a mark differs from the background
-_MIN_DENSITY = 0.04  # by which it differs, too, in optical density
-_MARK_BLUR_PX = 1.0
-_MIN_MARK_PX = 4  # area
-_GAP_PX = 3  # that is closed
-_MARGIN_PX = 2  # by which marks are widened
-
-# Burnt edges, measured on real EBT3: 1.6 to 40 times the dose, over in 8 to 38 px.
-_MAX_BURNT_DEPTH_PX = 40
-_CUT_PX = 3  # the outermost pixels are partly bed
-_FALL_PX = 6
-_MIN_FALL = 0.35  # of the logarithm of the dose over that length: a factor of 1.4
-_MIN_FALL_TO_INSIDE = 3.0  # times the slope further in, so that a beam is not taken for a burn
-_MIN_RISE = 0.2  # of the logarithm, everywhere between the edge and the fall
-_ALONG_PX = 21  # along the edge, of the median that removes grain and writing
-_MIN_BURNT_SHARE = 0.3  # of a side: fire follows edges, fronts of the beam cross them
-
-
 def usable_pixels(
     film: ArrayLike,
     calibration: Calibration,
     *,
     background: Sequence[float] | ArrayLike | None = None,
     rim: int = 6,
+    marks: MarkCheck = MarkCheck(),
 ) -> BoolArray:
     """Return the pixels whose dose can be trusted.
 
@@ -367,6 +386,8 @@ def usable_pixels(
         Pixel of unexposed film. Default: the calibration's.
     rim : int, default 6
         Pixels along the edges that do not count.
+    marks : MarkCheck, optional
+        What is a mark.
 
     Returns
     -------
@@ -391,25 +412,26 @@ def usable_pixels(
     )
     table = np.log10(unexposed / calibration.pixels[np.argsort(calibration.doses)])
     expected = np.interp(red, np.maximum.accumulate(table[:, 0]), table[:, 2])
-    excess = ndimage.gaussian_filter(blue - expected, _MARK_BLUR_PX)
-    first = _SAMPLE_STEP_PX // 2
-    samples = excess[first::_SAMPLE_STEP_PX, first::_SAMPLE_STEP_PX]
-    usual = ndimage.median_filter(samples, _BACKGROUND_SAMPLES, mode="nearest")
-    scatter = ndimage.median_filter(np.abs(samples - usual), _SCATTER_SAMPLES, mode="nearest")
-    least = np.maximum(_resample(_MIN_SCATTERS * NORMAL_MAD * scatter, excess), _MIN_DENSITY)
-    marked = np.abs(excess - _resample(usual, excess)) > least
+    excess = ndimage.gaussian_filter(blue - expected, marks.blur)
+    first, step = marks.sampling // 2, marks.sampling
+    samples = excess[first::step, first::step]
+    usual = ndimage.median_filter(samples, marks.background, mode="nearest")
+    scatter = ndimage.median_filter(np.abs(samples - usual), marks.scatter, mode="nearest")
+    least = _resample(marks.scatters * NORMAL_MAD * scatter, excess, step)
+    away = np.abs(excess - _resample(usual, excess, step))
+    marked = away > np.maximum(least, marks.density)
     labels, _ = ndimage.label(marked)
-    marked &= np.bincount(labels.ravel())[labels] >= _MIN_MARK_PX
-    disc = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), _GAP_PX)
-    border = 2 * _GAP_PX
+    marked &= np.bincount(labels.ravel())[labels] >= marks.area
+    disc = ndimage.iterate_structure(ndimage.generate_binary_structure(2, 1), marks.gap)
+    border = 2 * marks.gap
     closed = ndimage.binary_closing(np.pad(marked, border), disc)[border:-border, border:-border]
-    usable = ~ndimage.binary_dilation(closed, iterations=_MARGIN_PX)
+    usable = ~ndimage.binary_dilation(closed, iterations=marks.margin)
     for view in (usable, usable[::-1], usable.T, usable.T[::-1]):
         view[:rim] = False
     return np.asarray(usable)
 
 
-def burnt_edges(dose: ArrayLike) -> BoolArray:
+def burnt_edges(dose: ArrayLike, *, burn: BurnCheck = BurnCheck()) -> BoolArray:
     """Return the pixels along burnt edges of a film, which look like dose.
 
     Heat and light darken a film as protons do, so colours do not show it. But the dose then falls
@@ -419,6 +441,8 @@ def burnt_edges(dose: ArrayLike) -> BoolArray:
     ----------
     dose : array_like, shape (H, W)
         Dose of an upright film, positive.
+    burn : BurnCheck, optional
+        What is a burnt edge.
 
     Returns
     -------
@@ -429,33 +453,33 @@ def burnt_edges(dose: ArrayLike) -> BoolArray:
     for turns in range(4):
         # A view: marks on it are marks on the film.
         side = np.rot90(burnt, turns)
-        side |= _burnt_top(np.rot90(logarithm, turns))
+        side |= _burnt_top(np.rot90(logarithm, turns), burn)
     return burnt
 
 
-def _burnt_top(logarithm: FloatArray) -> BoolArray:
+def _burnt_top(logarithm: FloatArray, burn: BurnCheck) -> BoolArray:
     """Mark the burnt pixels along the upper side."""
     height = len(logarithm)
-    reach = min(_MAX_BURNT_DEPTH_PX, height // 6)
+    reach = min(burn.depth, height // 6)
     burnt = np.zeros(logarithm.shape, dtype=bool)
-    if reach <= _CUT_PX or height < reach + 4 * _FALL_PX:
+    if reach <= burn.cut or height < reach + 4 * burn.length:
         return burnt
-    top = logarithm[_CUT_PX : reach + 4 * _FALL_PX]
-    smooth = ndimage.median_filter(top, (3, _ALONG_PX), mode="nearest")
-    depths = np.arange(reach - _CUT_PX)
-    outside, inside, beyond = (smooth[depths + n * _FALL_PX] for n in (0, 1, 3))
+    top = logarithm[burn.cut : reach + 4 * burn.length]
+    smooth = ndimage.median_filter(top, (3, burn.along), mode="nearest")
+    depths = np.arange(reach - burn.cut)
+    outside, inside, beyond = (smooth[depths + n * burn.length] for n in (0, 1, 3))
     fall = outside - inside
-    is_steep = fall > np.maximum(_MIN_FALL, _MIN_FALL_TO_INSIDE * (inside - beyond) / 2)
-    is_higher = np.minimum.accumulate(outside, axis=0) > inside + _MIN_RISE
+    is_steep = fall > np.maximum(burn.fall, burn.to_inside * (inside - beyond) / 2)
+    is_higher = np.minimum.accumulate(outside, axis=0) > inside + burn.rise
     ends = np.where(is_steep & is_higher, depths[:, None] + 1, 0).max(axis=0)
-    if (ends > 0).mean() < _MIN_BURNT_SHARE:
+    if (ends > 0).mean() < burn.share:
         return burnt
     # Under a bright beam the fall is hidden: there the burn is as deep as elsewhere on this side.
     ends = np.where(ends > 0, ends, np.median(ends[ends > 0]))
-    ends = ndimage.maximum_filter1d(ends + _CUT_PX + _FALL_PX + _MARGIN_PX, _ALONG_PX)
+    ends = ndimage.maximum_filter1d(ends + burn.cut + burn.length + burn.margin, burn.along)
     return np.asarray(np.arange(height)[:, None] < ends)
 
 
-def _resample(samples: FloatArray, image: FloatArray) -> FloatArray:
-    places = np.mgrid[: image.shape[0], : image.shape[1]] / _SAMPLE_STEP_PX - 0.5
+def _resample(samples: FloatArray, image: FloatArray, step: int) -> FloatArray:
+    places = np.mgrid[: image.shape[0], : image.shape[1]] / step - 0.5
     return np.asarray(ndimage.map_coordinates(samples, places, order=1, mode="nearest"))

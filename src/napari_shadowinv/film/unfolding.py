@@ -1,6 +1,6 @@
 """From the doses of a pack's films to the fluence of protons at each energy.
 
-- the response of the films to protons of each energy: `Response`
+- the response of the films to protons of each energy: `ResponseMatrix`
 - the spectrum in each pixel: `unfold`
 
 Protons that stop in a film have left dose in all films before it. The doses of a pixel in all
@@ -16,18 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import constants
 from scipy.optimize import nnls
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.pack import PROTON_MASS, Pack, Slab, Stopping
-
-_JOULES_PER_MEV = 1.602176634e-13  # J
-_MIN_ENERGY_MEV = 0.5
-_MAX_ENERGY_MEV = 200.0
-_N_ENERGIES = 6000
-_BAND_SHARE = 0.5  # of the peak
 
 
 @dataclass(frozen=True)
@@ -48,7 +43,7 @@ class Band:
 
 
 @dataclass(frozen=True, eq=False)
-class Response:
+class ResponseMatrix:
     """Energy that one proton loses in the active layer of each film.
 
     Attributes
@@ -66,14 +61,17 @@ class Response:
     doses: FloatArray
 
     @classmethod
-    def of(cls, pack: Pack, energies: ArrayLike | None = None) -> Response:
+    def of(
+        cls, pack: Pack, energies: ArrayLike | None = None, *, ends: Sequence[float] = (0.5, 200.0)
+    ) -> ResponseMatrix:
         """Compute the response of a pack.
 
         Parameters
         ----------
         pack : Pack
         energies : array_like, shape (n,), optional
-            In MeV. Default: so close together that each film's peak is well resolved.
+            In MeV. Default: so close together that each film's peak is well resolved, between
+            the `ends`, or up to the end of a stopping table.
 
         Raises
         ------
@@ -81,11 +79,11 @@ class Response:
             If an energy is above the range of a stopping table.
         """
         stoppings = pack.stoppings()
-        last = min(_MAX_ENERGY_MEV, *(stopping.energies[-1] for stopping in stoppings.values()))
+        last = min(ends[1], *(stopping.energies[-1] for stopping in stoppings.values()))
         if energies is None:
-            energies = np.geomspace(_MIN_ENERGY_MEV, last, _N_ENERGIES)
+            energies = np.geomspace(ends[0], last, 6000)
         first = np.array(energies, dtype=np.float64)
-        deposits, doses = [], []
+        deposits, doses, joules_per_mev = [], [], constants.e / constants.micro
         now = first
         for layer in pack.layers:
             film = pack.film(layer)
@@ -93,7 +91,7 @@ class Response:
             after = _behind(stoppings, (film.active,), before)
             mass = stoppings[film.active.material].density * film.active.thickness  # kg/m²
             deposits.append(before - after)
-            doses.append((before - after) * _JOULES_PER_MEV / mass)
+            doses.append((before - after) * joules_per_mev / mass)
             now = _behind(stoppings, film.behind, after)
         return cls(first, np.stack(deposits), np.stack(doses))
 
@@ -114,7 +112,7 @@ class Response:
                     f"no proton of up to {self.energies[-1]:.4g} MeV reaches film {number}: check "
                     "the thicknesses of the pack, which are in m"
                 )
-            above = np.flatnonzero(deposit >= _BAND_SHARE * deposit[top])
+            above = np.flatnonzero(deposit >= 0.5 * deposit[top])
             # The first gap ends it; protons that are much faster cross all films.
             gaps = np.flatnonzero(np.diff(above[above >= top]) > 1)
             last = above[above >= top][gaps[0]] if gaps.size else above[-1]
@@ -148,12 +146,6 @@ def relative_strengths(energies: ArrayLike) -> FloatArray:
     return np.asarray(momenta[0] / momenta)
 
 
-_BLOCK_PX = 4096
-# Shares of the last energy within which the spectrum falls to 1/e beyond it.
-_START_SLOPE = 0.15
-_MIN_SLOPE = 0.02
-_MAX_SLOPE = 2.0
-_MAX_ROUNDS = 100
 _DISPLACEMENT_POWER = 0.75  # displacement falls with this power of the energy: 0.5 by B, 1 by E
 
 
@@ -190,7 +182,7 @@ class _Basis(NamedTuple):
     bends: FloatArray  # (n - 2, n), deviation of shares from linear
 
     @classmethod
-    def of(cls, response: Response, usual: FloatArray, slope: float) -> _Basis:
+    def of(cls, response: ResponseMatrix, usual: FloatArray, slope: float) -> _Basis:
         """Return the basis of a usual spectrum at the films' energies; its tail is `slope` MeV."""
         peaks = np.array([band.peak for band in response.bands])
         energies = response.energies
@@ -228,7 +220,7 @@ def _displacement(energies: FloatArray) -> FloatArray:
 def unfold(
     doses: ArrayLike,
     errors: ArrayLike,
-    response: Response,
+    response: ResponseMatrix,
     *,
     curvature: float = 1.0,
     on_progress: OnProgress | None = None,
@@ -247,7 +239,7 @@ def unfold(
     errors : array_like, shape (n, H, W)
         Standard deviations as shares of the doses; infinite where a dose is unknown. A dose
         of exactly zero has no error to weight it by, and counts as unknown.
-    response : Response
+    response : ResponseMatrix
         Of the pack.
     curvature : float, default 1
         Usual bend of the spectrum from film to film, as a share of the mean spectrum.
@@ -281,9 +273,9 @@ def unfold(
     basis = _usual_basis(mean, response)
     bends = basis.bends / curvature
     fluence, variance = np.zeros_like(flat), np.zeros_like(flat)
-    for first in range(0, len(flat), _BLOCK_PX):
+    for first in range(0, len(flat), 4096):
         report("unfold", first, len(flat))
-        part = slice(first, first + _BLOCK_PX)
+        part = slice(first, first + 4096)
         spectra = _unfold_pixels(flat[part], per_error[part], basis.matrix, bends)
         fluence[part], variance[part] = spectra
     planes = (count, *film_doses.shape[1:])
@@ -292,18 +284,23 @@ def unfold(
     return Spectra(basis.seen_energies(typical, curvature), *scaled)
 
 
-def _usual_basis(mean: FloatArray, response: Response) -> _Basis:
-    """Return the basis of the spectrum of the mean doses, extrapolated by its fall at the end."""
+def _usual_basis(
+    mean: FloatArray, response: ResponseMatrix, *, falls: tuple[float, float] = (0.02, 2.0)
+) -> _Basis:
+    """Return the basis of the spectrum of the mean doses, extrapolated by its fall at the end.
+
+    There it falls to 1/e within a share of the last energy that is between `falls`.
+    """
     check_increasing(response.bands)
     peaks = np.array([band.peak for band in response.bands])
-    slope = _START_SLOPE * peaks[-1]
+    slope = 0.15 * peaks[-1]  # to start from
     basis = _Basis.of(response, np.exp(-peaks / slope), slope)
-    for _ in range(_MAX_ROUNDS):
+    for _ in range(100):
         usual = _peel_spectrum(mean, basis.matrix / basis.usual)
         if len(usual) > 1:
-            falls = max(np.log(usual[-2] / usual[-1]), 1e-9)
-            shortest, longest = _MIN_SLOPE * peaks[-1], _MAX_SLOPE * peaks[-1]
-            measured_slope = np.clip((peaks[-1] - peaks[-2]) / falls, shortest, longest)
+            fall = max(np.log(usual[-2] / usual[-1]), 1e-9)
+            shortest, longest = (share * peaks[-1] for share in falls)
+            measured_slope = np.clip((peaks[-1] - peaks[-2]) / fall, shortest, longest)
             # Half way, because a slower fall beyond the last film makes the next one faster.
             slope = float(np.sqrt(slope * measured_slope))
         before, basis = basis.usual, _Basis.of(response, usual, slope)

@@ -26,7 +26,7 @@ from napari_shadowinv.film import (
     Pack,
     PackLayer,
     Poses,
-    Response,
+    ResponseMatrix,
     burnt_edges,
     check_orientation,
     combined_dose,
@@ -326,7 +326,7 @@ def run_film(
         If `should_stop` returned true.
     """
     report = Reporter(on_progress, should_stop)
-    response = Response.of(pack)
+    response = ResponseMatrix.of(pack)
     peaks = np.array([band.peak for band in response.bands])
     scanned = read_films(pack, report)
     pixel = _pixel_size(pack, [film.scan for film in scanned])
