@@ -10,18 +10,12 @@ import numpy as np
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Level
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel, Scale
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Panel, PanelGrid, Scale
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from napari_shadowinv.film_doses import FilmDoses
-
-_COLUMNS = 4
-_PANEL_SHARE = 0.75  # of the usual size of a panel
-_LETTERS_PER_INCH = 13  # of the header
-_FINE_BLUR_PX = 1.0  # the overlay shows the structure between the two blurs
-_COARSE_BLUR_PX = 20.0
 
 
 def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
@@ -45,14 +39,13 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
     planes, usable = doses.dose, doses.usable
     count, *shape = planes.shape
     panels_shown = count + (count >= 3)
-    columns = min(_COLUMNS, panels_shown)
-    width, height = (_PANEL_SHARE * side for side in _panels.panel_size(shape))
-    grid = Grid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.52)
+    columns = min(4, panels_shown)
+    width, height = (0.75 * side for side in _panels.panel_size(shape))
+    grid = PanelGrid(-(-panels_shown // columns), columns, width, height, foot=0.1, head=0.52)
     facts = [fact for fact in doses.facts if not fact.is_detail]
     line = _panels.fact_line(fact for fact in facts if fact.level is Level.SOUND)
     cautions = [(fact.text, ALARM_COLOUR) for fact in facts if fact.level is not Level.SOUND]
-    letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
-    header = _panels.wrapped([(line, QUIET_COLOUR), *cautions], letters)
+    header = _panels.wrapped([(line, QUIET_COLOUR), *cautions], grid.letters)
     with _panels.new_page(grid, Scale(1.0, "px"), title, header) as (figure, panels):
         for k in range(count):
             label = doses.film_label(k)
@@ -90,10 +83,7 @@ def _draw_overlay(panel: Panel, doses: FloatArray, usable: BoolArray) -> None:
         else np.zeros(dose.shape)
         for dose, used in zip(doses, usable, strict=True)
     ]
-    structures = [
-        gaussian_filter(plane, _FINE_BLUR_PX) - gaussian_filter(plane, _COARSE_BLUR_PX)
-        for plane in logarithms
-    ]
+    structures = [gaussian_filter(p, 1.0) - gaussian_filter(p, 20.0) for p in logarithms]
     inner = np.s_[structures[0].shape[0] // 8 : -(structures[0].shape[0] // 8)]
     correlations = [
         _correlation(plane[inner], neighbour[inner]) for plane, neighbour in pairwise(structures)

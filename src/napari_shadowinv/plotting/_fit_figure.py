@@ -20,16 +20,10 @@ from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.significance import deviation_along
 from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Grid, Panel
+from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Panel, PanelGrid
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-_MAX_ROWS = 3  # up to this number of images, each has a row; more have a column each
-_UNIFORM_TOLERANCE = 1e-6
-_MAX_RESIDUAL_SIGMA = 20.0
-_LETTERS_PER_INCH = 13  # of the header
 
 
 def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
@@ -56,17 +50,16 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     count, *shape = fit.images.shape
     levels = fit.source.mean(axis=(1, 2), keepdims=True)
     kinds = ["Image", "Re-projection", "Residual"]
-    if not (np.abs(fit.source / levels - 1) < _UNIFORM_TOLERANCE).all():
+    if not (np.abs(fit.source / levels - 1) < 1e-6).all():
         kinds.insert(0, "Beam")
-    upright = count > _MAX_ROWS
+    upright = count > 3  # a column for each image, else a row
     columns = count if upright else len(kinds)
     rows = len(kinds) if upright else count
     sentences = [_panels.headline_sentence(fit.headline)]
     grid, header, heading = _page(shape, rows + len(fit.fields), columns, sentences, title)
     facts = fit.facts_with_names(())
     of_images = [fact for fact in facts if fact.key.startswith("image_")]
-    letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
-    footer = _panels.footer_lines(facts, fit.headline.text, letters)
+    footer = _panels.footer_lines(facts, fit.headline.text, grid.letters)
     scale = _panels.image_scale(shape, fit.setup)
     with _panels.new_page(grid, scale, heading, header, footer) as (figure, panels):
         for k in range(count):
@@ -82,7 +75,7 @@ def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:
     mean = float(fit.source[k].mean())
     if kind == "Residual":
         title, residual = f"Residual: {fact.short}", fit.normalised_residual[k]
-        panel.draw_differences(residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
+        panel.draw_differences(residual, title, "Residual (σ)", 20.0)
         return
     plane = {"Beam": fit.source, "Image": fit.images, "Re-projection": fit.reprojection}[kind][k]
     probe = f": {fit.setups[k].probe}" if fit.setups else ""
@@ -137,10 +130,6 @@ def _magnitude_error(field: FittedField, in_units: ShownField) -> FloatArray | N
     return np.asarray(pixels * in_units.magnitude[strongest] / max(length[strongest], 1e-12))
 
 
-_PANELS_PER_IMAGE = 3  # image, prediction, residual
-_MAX_LEFT_OUT_ROWS = 6  # of images; more start a second column
-
-
 def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figure:
     """Show how well the others predict each image that was left out.
 
@@ -160,8 +149,8 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
         A figure with an Agg canvas; write it with `save_figure`.
     """
     count, *shape = left_out.images.shape
-    side_by_side = -(-count // _MAX_LEFT_OUT_ROWS)
-    columns, rows = _PANELS_PER_IMAGE * side_by_side, -(-count // side_by_side)
+    side_by_side = -(-count // 6)  # rows of three panels
+    columns, rows = 3 * side_by_side, -(-count // side_by_side)
     first_fact, *of_images = left_out.facts
     setups = left_out.setups
     sentences = [(first_fact.text, _panels.LEVEL_COLOURS[first_fact.level])]
@@ -171,13 +160,13 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     with _panels.new_page(grid, scale, heading, header, [(text, QUIET_COLOUR)]) as (figure, panels):
         for k in range(count):
             row, column = k % rows, k // rows
-            first = row * columns + column * _PANELS_PER_IMAGE
+            first = row * columns + column * 3
             probe = f": {setups[k].probe}" if setups else ""
-            row_panels = panels[first : first + _PANELS_PER_IMAGE]
+            row_panels = panels[first : first + 3]
             _draw_left_out(row_panels, left_out, k, f"Image {k + 1}{probe}", of_images[k])
         for place, panel in enumerate(panels):
             row, column = divmod(place, columns)
-            if column // _PANELS_PER_IMAGE * rows + row >= count:
+            if column // 3 * rows + row >= count:
                 panel.axes.remove()
     return figure
 
@@ -188,13 +177,12 @@ def _page(
     columns: int,
     sentences: list[tuple[str, str]],
     title: str | None,
-) -> tuple[Grid, list[tuple[str, str]], str | None]:
+) -> tuple[PanelGrid, list[tuple[str, str]], str | None]:
     """Panels of one shape below a heading and sentences, wrapped to the page's width."""
     width, height = _panels.panel_size(shape)
-    grid = Grid(rows, columns, width, height, foot=0.12, head=0.52)
-    letters = int(grid.figure_size[0] * _LETTERS_PER_INCH)
-    header = _panels.wrapped(sentences, letters)
-    heading = title and textwrap.shorten(title, int(letters * 0.7), placeholder=" …")
+    grid = PanelGrid(rows, columns, width, height, foot=0.12, head=0.52)
+    header = _panels.wrapped(sentences, grid.letters)
+    heading = title and textwrap.shorten(title, int(grid.letters * 0.7), placeholder=" …")
     return grid, header, heading
 
 
@@ -207,6 +195,6 @@ def _draw_left_out(
     panels[0].draw_intensity(left_out.images[k] / mean, name, limits, label="Intensity / mean")
     panels[1].draw_intensity(left_out.predicted[k] / mean, "Prediction", limits, "Intensity / mean")
     title = f"Residual: {fact.short}"
-    panels[2].draw_differences(residual, title, "Residual (σ)", _MAX_RESIDUAL_SIGMA)
+    panels[2].draw_differences(residual, title, "Residual (σ)", 20.0)
     if fact.level is not Level.SOUND:
         panels[2].axes.set_title(title, color=ALARM_COLOUR)

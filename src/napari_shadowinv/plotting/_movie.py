@@ -22,14 +22,9 @@ from napari_shadowinv.plotting._panels import choose_grid, image_scale, new_page
 if TYPE_CHECKING:
     import xarray
 
-_DOTS_PER_INCH = 120
-_OUTLIER_SHARE = 0.02  # share of the shots whose extremes may lie beyond the colour scale
 _COLOUR_MAP = "viridis"
 _H264 = {"quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "quiet"}  # 10 is lossless
 _RECORDED = ("image", "source", "mask")  # shown under masks, too
-_GREYS = 56  # colours of a GIF that are reserved for text
-_LETTER_WIDTH_IN = 0.075
-_LINE_HEIGHT_IN = 0.15
 
 
 def stack_frames(
@@ -102,11 +97,14 @@ def _plane(field: xarray.DataArray, index: int, used: xarray.DataArray | None) -
     return np.where(mask.reshape(-1, *plane.shape).any(axis=0), plane, np.nan)
 
 
-def _limits(field: xarray.DataArray, used: xarray.DataArray | None) -> tuple[float, float]:
+def _limits(
+    field: xarray.DataArray, used: xarray.DataArray | None, *, outliers: float = 0.02
+) -> tuple[float, float]:
+    """Return the ends of the colour scale; a share of the shots may lie beyond each."""
     planes = (_plane(field, index, used) for index in range(field.sizes["shot"]))
     extremes = np.array([(np.nanmin(plane), np.nanmax(plane)) for plane in planes])
-    low = float(np.quantile(extremes[:, 0], _OUTLIER_SHARE, method="lower"))
-    high = float(np.quantile(extremes[:, 1], 1 - _OUTLIER_SHARE, method="higher"))
+    low = float(np.quantile(extremes[:, 0], outliers, method="lower"))
+    high = float(np.quantile(extremes[:, 1], 1 - outliers, method="higher"))
     if "component" in field.dims:
         low = 0.0
     return low, high if high > low else low + 1.0
@@ -121,8 +119,8 @@ def _draw_frames(
 ) -> Iterator[NDArray[np.uint8]]:
     """Redraw a figure with the values and the name of each shot."""
     grid = choose_grid(shape, 1, title=False)
-    lines = textwrap.wrap(label, max(12, int(grid.height / _LETTER_WIDTH_IN)))
-    grid = replace(grid, right_margin=grid.right_margin + _LINE_HEIGHT_IN * (len(lines) - 1))
+    lines = textwrap.wrap(label, max(12, int(grid.height / 0.075)))
+    grid = replace(grid, right_margin=grid.right_margin + 0.15 * (len(lines) - 1))
     with new_page(grid, image_scale(shape, setup), None) as (figure, (panel,)):
         # Without values: the colour bar must not depend on the first shot.
         panel.show(np.full(shape, limits[0]), "", "\n".join(lines), _COLOUR_MAP, limits)
@@ -132,26 +130,26 @@ def _draw_frames(
         panel.axes.images[0].set_data(plane)
         with own_style():
             panel.axes.set_title(name)
-            figure.set_dpi(_DOTS_PER_INCH)
+            figure.set_dpi(120)
             canvas.draw()
         pixels = np.asarray(canvas.buffer_rgba())[..., :3]
         rows, columns = (length - length % 2 for length in pixels.shape[:2])
         yield np.ascontiguousarray(pixels[:rows, :columns])
 
 
-def in_few_colours(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def in_few_colours(frame: NDArray[np.uint8], *, n_greys: int = 56) -> NDArray[np.uint8]:
     """Reduce the colours to a fixed palette that suits a GIF.
 
     A palette of the 256 most frequent colours would leave few for the bright parts.
 
     Takes and returns an ndarray of uint8, shape (rows, columns, 3); the colours are the nearest of
-    the colour scale, and greys.
+    the colour scale, and the greys that are reserved for text.
     """
     from matplotlib import colormaps
     from scipy.spatial import cKDTree
 
-    scale = colormaps[_COLOUR_MAP](np.linspace(0, 1, 256 - _GREYS))[:, :3]
-    greys = np.repeat(np.linspace(0, 1, _GREYS), 3).reshape(-1, 3)
+    scale = colormaps[_COLOUR_MAP](np.linspace(0, 1, 256 - n_greys))[:, :3]
+    greys = np.repeat(np.linspace(0, 1, n_greys), 3).reshape(-1, 3)
     palette = (255 * np.concatenate([scale, greys])).round().astype(np.uint8)
     rows = frame.reshape(-1, 3)
     # A frame has few thousand different colours, and most pixels share some.

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}
-_CAUSTIC_DENSITY = 0.15  # level of the outline of a caustic
-LINE_IN = 0.18  # of a header or footer
 
 
 ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR = "#b00020", "#1b6e3c", "0.3"
@@ -78,7 +76,7 @@ def image_scale(shape: Sequence[int], setup: Setup | None) -> Scale:
 
 
 @dataclass(frozen=True)
-class Grid:
+class PanelGrid:
     """Sizes in inches that put panels of one shape on a page without overlaps.
 
     Lines of a header or footer add to `head` and `foot`.
@@ -94,11 +92,17 @@ class Grid:
     right_margin: float = 0.95
     below: float = 0.52
     above: float = 0.36
+    line: float = 0.18  # of a header or footer
 
     @property
     def extra(self) -> float:
         """Extra width of the last panel, with the profiles, compared with a narrow image."""
         return max(0.0, 2.5 - self.width)
+
+    @property
+    def letters(self) -> int:
+        """Letters that fit on a line of a header or footer."""
+        return int(self.figure_size[0] * 13)
 
     @property
     def figure_size(self) -> tuple[float, float]:
@@ -122,11 +126,13 @@ class Grid:
         )
 
 
-def choose_grid(shape: Sequence[int], panels: int, *, foot: float = 0, title: bool = True) -> Grid:
+def choose_grid(
+    shape: Sequence[int], panels: int, *, foot: float = 0, title: bool = True
+) -> PanelGrid:
     """Choose the columns for which the page is closest to a slide's 16:10."""
     width, height = panel_size(shape)
     grids = [
-        Grid(panels // columns, columns, width, height, foot, head=0.4 if title else 0.05)
+        PanelGrid(panels // columns, columns, width, height, foot, head=0.4 if title else 0.05)
         for columns in range(1, panels + 1)
         if panels % columns == 0
     ]
@@ -165,7 +171,7 @@ def styled_figure(size: tuple[float, float], **layout: Any) -> Iterator[Figure]:
 
 @contextmanager
 def new_page(
-    grid: Grid,
+    grid: PanelGrid,
     scale: Scale,
     title: str | None,
     header: Sequence[tuple[str, str]] = (),
@@ -173,19 +179,19 @@ def new_page(
 ) -> Iterator[tuple[Figure, list[Panel]]]:
     """Yield a figure with its empty panels, between lines of text, each with its colour."""
     top = grid.head - 0.08
-    head, foot = grid.head + LINE_IN * len(header), grid.foot + LINE_IN * len(footer)
+    head, foot = grid.head + grid.line * len(header), grid.foot + grid.line * len(footer)
     grid = replace(grid, head=head, foot=foot)
     width, height = grid.figure_size
     with styled_figure(grid.figure_size) as figure:
         if title:
             figure.text(0.2 / width, 1 - 0.26 / height, title, size=13, weight="bold", va="center")
         for number, (text, colour) in enumerate(header):
-            y = 1 - (top + LINE_IN * number) / height
+            y = 1 - (top + grid.line * number) / height
             figure.text(0.2 / width, y, text, size=10, color=colour, va="top")
         boxes = [grid.box(index) for index in range(grid.rows * grid.columns)]
         yield figure, [Panel(figure.add_axes(box), scale, grid) for box in boxes]
         for number, (text, colour) in enumerate(reversed(footer)):
-            y = (0.1 + LINE_IN * number) / height
+            y = (0.1 + grid.line * number) / height
             figure.text(0.2 / width, y, text, size=8.5, color=colour, va="bottom")
 
 
@@ -243,7 +249,7 @@ class Panel:
 
     axes: Axes
     scale: Scale
-    grid: Grid
+    grid: PanelGrid
 
     def show(
         self, plane: FloatArray, title: str, label: str, cmap: str, limits: tuple[float, float]
@@ -368,8 +374,8 @@ class Panel:
 
         # Noise breaks a caustic into specks; one line around them is readable.
         density = gaussian_filter(caustic.astype(np.float64), 1 + min(caustic.shape) / 200)
-        if density.min() < _CAUSTIC_DENSITY < density.max():
-            self.contour(density, [_CAUSTIC_DENSITY], "white", linewidths=1.1)
+        if density.min() < 0.15 < density.max():
+            self.contour(density, [0.15], "white", linewidths=1.1)
 
     def draw_cuts(self, field: ShownField, error: FloatArray | None = None) -> None:
         """Plot a field's magnitude along x and along y through its peak, with its error's band."""

@@ -16,10 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_MAX_PARTS = 8
-_LEAST_PART = 0.01  # of the largest one
-_LOG_RANGE = 8.0  # of the values of a sweep, for a logarithmic axis
-
 
 def plan_figure(plan: ExperimentPlan) -> Figure:
     """Show a plan on a page.
@@ -87,7 +83,7 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
         below.set_ylim(-5, 105)
         below.set_ylabel("determined\n(% of draws)")
         below.set_xlabel(f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title)
-        if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
+        if values[0] > 0 and values[-1] / values[0] > 8:
             below.set_xscale("log")
             below.minorticks_off()
         below.set_xticks(values, [f"{value:.3g}" for value in values])
@@ -108,8 +104,8 @@ def _draw_errors(axes: Axes, plan: ExperimentPlan) -> None:
 
 
 def _draw_parts(axes: Axes, plan: ExperimentPlan) -> None:
-    least = _LEAST_PART * max(plan.parts.values(), default=0.0)
-    parts = [part for part in plan.parts.items() if part[1] >= least][:_MAX_PARTS]
+    least = 0.01 * max(plan.parts.values(), default=0.0)
+    parts = [part for part in plan.parts.items() if part[1] >= least][:8]
     if not parts:
         axes.axis("off")
         return

@@ -20,12 +20,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.analysis import ProductResult
 
-_WIDTH_IN = 8.0
-_HEIGHT_IN = 3.2  # of a panel
-_LINE_IN = 0.19  # of the text
-_LETTERS = 125
 _COLOURS = ("#1f77b4", "#d95f02", "#1b9e77", "#7a5195", "0.4")
-_OPACITIES = (0.35, 0.18)
 
 
 def products_figure(results: Sequence[ProductResult], *, title: str | None = None) -> Figure:
@@ -44,18 +39,19 @@ def products_figure(results: Sequence[ProductResult], *, title: str | None = Non
     """
     panels = [(each, names) for each in results for names in _panels_of(each)]
     lines = _footer(results)
-    foot = 0.25 + _LINE_IN * len(lines)
+    line, panel = 0.19, 3.2  # inches
+    foot = 0.25 + line * len(lines)
     head = 0.35 if title else 0.1
-    height = head + _HEIGHT_IN * len(panels) + foot
-    with _panels.styled_figure((_WIDTH_IN, height)) as figure:
+    height = head + panel * len(panels) + foot
+    with _panels.styled_figure((8.0, height)) as figure:
         for number, (each, names) in enumerate(panels):
-            bottom = height - head - _HEIGHT_IN * (number + 1)
-            box = (0.1, (bottom + 0.6) / height, 0.78, (_HEIGHT_IN - 1.0) / height)
+            bottom = height - head - panel * (number + 1)
+            box = (0.1, (bottom + 0.6) / height, 0.78, (panel - 1.0) / height)
             _draw(figure.add_axes(box), each, names)
         if title:
             figure.text(0.02, 1 - 0.1 / height, title, va="top", weight="bold")
         for number, (text, colour) in enumerate(lines):
-            place = (foot - 0.15 - _LINE_IN * number) / height
+            place = (foot - 0.15 - line * number) / height
             figure.text(0.02, place, text, va="top", fontsize=8, color=colour)
     return figure
 
@@ -73,7 +69,7 @@ def _footer(results: Sequence[ProductResult]) -> list[tuple[str, str]]:
         sentences.append((f"{fact.title}: {fact.text}", colour))
     limits = dict.fromkeys(sentence for each in results for sentence in each.limits)
     sentences += [(text, QUIET_COLOUR) for text in limits]
-    return _panels.wrapped(dict.fromkeys(sentences), _LETTERS)
+    return _panels.wrapped(dict.fromkeys(sentences), 125)
 
 
 def _panels_of(result: ProductResult) -> tuple[tuple[str, ...], ...]:
@@ -123,7 +119,7 @@ def _draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> Non
         marker = "." if result.is_series else ""
         values = scale * result[name].value
         axes.plot(places, values, color=colour, linewidth=1.3, marker=marker, label=name)
-        for share, opacity in zip(BANDS, _OPACITIES, strict=True):
+        for share, opacity in zip(BANDS, (0.35, 0.18), strict=True):
             if (band := result.band(name, share)) is not None:
                 style: Any = {"color": colour, "alpha": opacity, "linewidth": 0}
                 axes.fill_between(places, scale * band[0], scale * band[1], **style)

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.results import AnyResult
 
 DOTS_PER_INCH = 160  # of a figure's file
-_MAX_RESIDUAL_PERCENT = 50.0  # % of the mean
 
 
 def report_figure(
@@ -75,7 +74,7 @@ def report_figure(
         fact = next(fact for fact in facts if fact.key == "image_residual")
         residual = 100 * blank_masked(inversion.residual) / inversion.image[inversion.mask].mean()
         label = "Difference (% of mean)"
-        panels[4].draw_differences(residual, fact.short.capitalize(), label, _MAX_RESIDUAL_PERCENT)
+        panels[4].draw_differences(residual, fact.short.capitalize(), label, 50.0)
         panels[5].draw_cuts(field)
     return figure
 
@@ -117,7 +116,7 @@ def comparison_figure(
     in_units = dict(zip(fields, shown_fields(arrays, setup), strict=True))
     shape = shapes[0][1:]
     grid = _panels.choose_grid(shape, panels=len(in_units) + 1, foot=0.35, title=bool(title))
-    grid = replace(grid, foot=grid.foot - _panels.LINE_IN)
+    grid = replace(grid, foot=grid.foot - grid.line)
     scale, footer = _panels.image_scale(shape, setup), [(caption, QUIET_COLOUR)]
     with _panels.new_page(grid, scale, title, footer=footer) as (figure, panels):
         draw_side_by_side(panels, in_units)
