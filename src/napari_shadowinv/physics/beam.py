@@ -36,7 +36,6 @@ _UNIT_IN_TITLE = re.compile(r"\(([^()]+)\)$")
 _POWERS = {"f": -15, "p": -12, "n": -9, "µ": -6, "μ": -6, "u": -6, "m": -3, "c": -2, "": 0}
 _POWERS |= {"k": 3, "M": 6, "G": 9, "T": 12}
 _BASES = ("eV", "m")
-_BEAM_STEP = 1e-3  # relative, for a derivative
 _EXAMPLES = {"m": "1.3 mm", "MeV": "14.7 MeV"}
 
 
@@ -158,7 +157,6 @@ def number_field(title: str, description: str, default: Any = ..., **limits: Any
 
 # Beyond any experiment, and far from the numbers that products in double precision cannot hold.
 _MAX_DISTANCE_M, _MAX_PIXEL_M = 1e9, 1e6
-_MIN_LENGTH_M = 1e-15
 
 
 class BeamSetup(CheckedModel):
@@ -241,8 +239,8 @@ class BeamSetup(CheckedModel):
         name = str(field.field_name)
         if value is None or unit_in_title(cls.model_fields[name].title) != "m":
             return value
-        if value < _MIN_LENGTH_M:
-            raise ValueError(f"expected at least {_MIN_LENGTH_M:g} m: check its unit")
+        if value < 1e-15:
+            raise ValueError("expected at least 1e-15 m: check its unit")
         if name == "source_object_distance" and _MAX_DISTANCE_M < value < math.inf:
             raise ValueError(
                 f"expected at most {_MAX_DISTANCE_M:g} m, or inf for a collimated beam"
@@ -334,9 +332,9 @@ class BeamSetup(CheckedModel):
         """Value of the quantity that differs between images of one object."""
         return float(getattr(self, self.beam_field))
 
-    def sensitivity_to_beam(self, name: str) -> float:
+    def sensitivity_to_beam(self, name: str, *, step: float = 1e-3) -> float:
         """Return the relative change of one of `si_fields` by a relative change of `beam_field`."""
-        factors = 1 - _BEAM_STEP, 1 + _BEAM_STEP
+        factors = 1 - step, 1 + step
         setups = (self.model_copy(update={self.beam_field: f * self.beam_value}) for f in factors)
         low, high = (
             math.log(np.abs(setup.field_in_si(name, np.ones((2, 1, 1)))).max()) for setup in setups
@@ -409,16 +407,19 @@ def length_unit(length: float) -> tuple[float, str]:
     return next(fitting, _LENGTH_UNITS[-1])
 
 
-_MIN_SIZE_M, _MAX_SIZE_M = 10e-9, 1e-3  # of a pixel at the object
-_MIN_PARTICLE_DETECTOR_PIXEL_M = 3e-6  # no film scanner or plate reader resolves less
-_MAX_PIXEL_DEVIATION = 0.03  # of a file's pixel size from the setup's
-_MAX_DETECTOR_PIXEL_M = 10e-3
-_MAX_DETECTOR_DISTANCE_M = 10.0
-_MIN_PARTICLE_DISTANCE_M = 1e-4
-_MIN_PARTICLE_MAGNIFICATION = 2.0
-_MAX_MAGNIFICATION = 1000.0
-_MAX_DEFLECTION_RAD = 0.3
-_MAX_FIELD_T_M = 10.0
+@dataclass(frozen=True)
+class UsualGeometry:
+    """What common experiments have; those of ``benchmarks/wrong_inputs.py`` are beyond it."""
+
+    pixels: tuple[float, float] = (10e-9, 1e-3)  # m, at the object
+    # m; no film scanner or plate reader resolves less
+    detector_pixels: tuple[float, float] = (3e-6, 10e-3)
+    # m, from the object to the detector, and to a source of particles
+    distances: tuple[float, float] = (1e-4, 10.0)
+    magnifications: tuple[float, float] = (2.0, 1000.0)  # the first with particles
+    file_deviation: float = 0.03  # of a file's pixel size from the setup's
+    deflection: float = 0.3  # rad, at most
+    field: float = 10.0  # T m, at most
 
 
 def geometry_text(setup: BeamSetup, shape: tuple[int, int] | None = None) -> str:
@@ -459,6 +460,8 @@ def setup_warnings(
     setup: BeamSetup,
     shape: tuple[int, int] | None = None,
     metadata: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    usual: UsualGeometry = UsualGeometry(),
 ) -> tuple[Caution, ...]:
     """Return a sentence for everything about a setup that no common experiment has.
 
@@ -469,6 +472,8 @@ def setup_warnings(
         Height and width of the image in px; without it the field of view is not checked.
     metadata : mapping, optional
         Of the image, with the ``geometry`` in its file and the factor of its ``bin``.
+    usual : UsualGeometry, optional
+        What is not doubtful.
 
     Returns
     -------
@@ -483,12 +488,14 @@ def setup_warnings(
     >>> caution.text[:34]
     'setup: the magnification is 1.04: '
     """
-    doubts = [*_pixel_doubts(setup), *_distance_doubts(setup, shape), *setup.probe_doubts()]
-    doubts += _file_doubts(setup, metadata)
+    doubts = [*_pixel_doubts(setup, usual), *_distance_doubts(setup, shape, usual)]
+    doubts += [*setup.probe_doubts(), *_file_doubts(setup, metadata, usual.file_deviation)]
     return tuple(Caution("setup", f"setup: {doubt}") for doubt in doubts)
 
 
-def deflection_warnings(setup: BeamSetup, displacement: FloatArray) -> tuple[Caution, ...]:
+def deflection_warnings(
+    setup: BeamSetup, displacement: FloatArray, *, usual: UsualGeometry = UsualGeometry()
+) -> tuple[Caution, ...]:
     """Return a sentence if a displacement is larger than such an experiment can make.
 
     Parameters
@@ -496,19 +503,21 @@ def deflection_warnings(setup: BeamSetup, displacement: FloatArray) -> tuple[Cau
     setup : BeamSetup
     displacement : ndarray, shape (2, H, W)
         In px of the object plane.
+    usual : UsualGeometry, optional
+        What is not doubtful.
     """
     largest = float(np.nanmax(np.hypot(*displacement), initial=0.0))
     angle, main = float(setup.deflection_angle(largest)), setup.main_field.name
     text = ""
-    if angle > _MAX_DEFLECTION_RAD:
+    if angle > usual.deflection:
         text = (
             f"setup: the largest deflection is {angle:.3g} rad, and small angles (below "
-            f"{_MAX_DEFLECTION_RAD:g}) are assumed: the field in SI units is not reliable; check "
+            f"{usual.deflection:g}) are assumed: the field in SI units is not reliable; check "
             "the distances, the pixel size and their units"
         )
     elif main == "path_integrated_b":
         field = float(np.abs(setup.field_in_si(main, np.array([largest, 0.0]))).max())
-        if field > _MAX_FIELD_T_M:
+        if field > usual.field:
             text = (
                 f"setup: the path-integrated field reaches {field:.3g} T m, far more than any "
                 "laboratory plasma has: check the energy (MeV), the distances and the pixel size"
@@ -516,13 +525,13 @@ def deflection_warnings(setup: BeamSetup, displacement: FloatArray) -> tuple[Cau
     return (Caution("setup", text),) if text else ()
 
 
-def _file_doubts(setup: BeamSetup, metadata: Mapping[str, Any]) -> Iterator[str]:
+def _file_doubts(setup: BeamSetup, metadata: Mapping[str, Any], deviation: float) -> Iterator[str]:
     """Compare the pixels with those of the image's file, which may be of either plane."""
     geometry = metadata.get("geometry", {})
     names = ("pixel_size", "detector_pixel_size")
     stated = [geometry[name] * metadata.get("bin", 1) for name in names if geometry.get(name)]
     pairs = itertools.product(setup.pixel_sizes, stated)
-    if stated and not any(abs(size / file - 1) < _MAX_PIXEL_DEVIATION for size, file in pairs):
+    if stated and not any(abs(size / file - 1) < deviation for size, file in pairs):
         here, there = map(length_text, setup.pixel_sizes)
         yield (
             f"a pixel is {length_text(stated[0])} by the image's file, but {here} at the object "
@@ -531,36 +540,35 @@ def _file_doubts(setup: BeamSetup, metadata: Mapping[str, Any]) -> Iterator[str]
         )
 
 
-def _pixel_doubts(setup: BeamSetup) -> Iterator[str]:
-    pixel = setup.object_pixel_size
-    if not _MIN_SIZE_M <= pixel <= _MAX_SIZE_M:
+def _pixel_doubts(setup: BeamSetup, usual: UsualGeometry) -> Iterator[str]:
+    pixel, (least, most) = setup.object_pixel_size, usual.pixels
+    if not least <= pixel <= most:
         yield (
-            f"a pixel is {length_text(pixel)} at the object, expected {length_text(_MIN_SIZE_M)} "
-            f"to {length_text(_MAX_SIZE_M)}: all lengths and fields scale with it; it is given "
+            f"a pixel is {length_text(pixel)} at the object, expected {length_text(least)} "
+            f"to {length_text(most)}: all lengths and fields scale with it; it is given "
             "in m"
         )
     at_detector = setup.detector_pixel_size
     if at_detector is None:
         return
-    if at_detector > _MAX_DETECTOR_PIXEL_M and pixel <= _MAX_SIZE_M:
+    if at_detector > usual.detector_pixels[1] and pixel <= most:
         yield (
             f"a pixel is {length_text(at_detector)} at the detector, larger than any detector's: "
             "it is given in m"
         )
-    elif setup.projects and at_detector < _MIN_PARTICLE_DETECTOR_PIXEL_M:
+    elif setup.projects and at_detector < usual.detector_pixels[0]:
         yield (
             f"a pixel is {length_text(at_detector)} at the detector, finer than films and plates "
             "are scanned: if this is its size at the object, give it as such"
         )
 
 
-def _distance_doubts(setup: BeamSetup, shape: tuple[int, int] | None) -> Iterator[str]:
+def _distance_doubts(
+    setup: BeamSetup, shape: tuple[int, int] | None, usual: UsualGeometry
+) -> Iterator[str]:
     to_object, to_detector = setup.source_object_distance, setup.object_image_distance
-    if (
-        setup.projects
-        and setup.magnification < _MIN_PARTICLE_MAGNIFICATION
-        and not setup.is_collimated
-    ):
+    least, most = usual.magnifications
+    if setup.projects and setup.magnification < least and not setup.is_collimated:
         yield (
             f"the magnification is {setup.magnification:.3g}: the source is "
             f"{length_text(to_object)} from the object and the detector only "
@@ -573,19 +581,19 @@ def _distance_doubts(setup: BeamSetup, shape: tuple[int, int] | None) -> Iterato
             f"within {length_text(setup.max_source_distance)}: deflections scale with the "
             "distances; they are given in m"
         )
-    if setup.magnification > _MAX_MAGNIFICATION:
+    if setup.magnification > most:
         yield (
             f"the magnification is {setup.magnification:.3g}: the source is "
             f"{length_text(to_object)} from the object and the detector "
             f"{length_text(to_detector)} behind it; both distances are given in m"
         )
-    elif to_detector > _MAX_DETECTOR_DISTANCE_M:
+    elif to_detector > usual.distances[1]:
         yield (
             f"the detector is {length_text(to_detector)} behind the object: fields are too small "
             "by the factor by which that is too long; it is given in m"
         )
     nearest = min(to_object, to_detector)
-    if setup.projects and nearest < _MIN_PARTICLE_DISTANCE_M:
+    if setup.projects and nearest < usual.distances[0]:
         yield (
             f"source or detector is {length_text(nearest)} from the object: distances are given "
             "in m"

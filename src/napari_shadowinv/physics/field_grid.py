@@ -35,9 +35,6 @@ _FIELDS = {"B": "magnetic field", "E": "electric field"}
 _COMPONENT = re.compile(r"([BE])_?([xyz])", re.IGNORECASE)
 _PLASMAPY_AXES = ("ax0", "ax1", "ax2")
 _DIRECTION = re.compile(r"([+-]?)([xyz])")
-_UNEVEN = 1e-4  # of the mean spacing
-_MIN_NODES = 2
-_BYTES_PER_NODE = 48  # six components twice in single precision
 _LARGEST = float(np.finfo(np.float32).max)
 
 
@@ -206,7 +203,8 @@ def field_grid(field: Any) -> FieldGrid:
     if set(_PLASMAPY_AXES) <= set(dims):
         field = _name_axes(field)
     places = [_checked_places(field, axis) for axis in AXES]
-    check_memory([len(at) for _, _, at in places], _BYTES_PER_NODE, "a field")
+    # Six components, twice in single precision.
+    check_memory([len(at) for _, _, at in places], 48, "a field")
     names: dict[tuple[str, str], str] = {}
     for variable in map(str, field.data_vars):
         if match := _COMPONENT.fullmatch(variable):
@@ -264,10 +262,10 @@ def _checked_field(array: ArrayLike, name: str) -> AnyArray:
     values = np.asarray(array)
     if values.dtype.kind not in "buif":
         raise InputError(f"the {name} has values of type {values.dtype}, expected real numbers")
-    if values.ndim != 4 or values.shape[0] != 3 or min(values.shape[1:]) < _MIN_NODES:
+    if values.ndim != 4 or values.shape[0] != 3 or min(values.shape[1:]) < 2:
         raise InputError(
             f"the {name} has shape {values.shape}: expected (3, depth, height, width), its "
-            f"components in the order (z, y, x), with at least {_MIN_NODES} nodes each way"
+            f"components in the order (z, y, x), with at least 2 nodes each way"
         )
     if values.dtype.kind != "f":
         values = values.astype(np.float64)
@@ -330,14 +328,13 @@ def _checked_places(dataset: Any, axis: str) -> tuple[float, float, FloatArray]:
             "attribute 'units'"
         )
     places = np.asarray(coordinate.values, dtype=np.float64) * METRES[text]
-    if len(places) < _MIN_NODES or not np.isfinite(places).all():
+    if len(places) < 2 or not np.isfinite(places).all():
         raise InputError(
-            f"the coordinate {axis!r} has {len(places)} values: expected at least {_MIN_NODES} "
-            "finite ones"
+            f"the coordinate {axis!r} has {len(places)} values: expected at least 2 finite ones"
         )
     steps = np.diff(places)
     mean = float(steps.mean())
-    if mean == 0 or np.abs(steps - mean).max() > _UNEVEN * abs(mean):
+    if mean == 0 or np.abs(steps - mean).max() > 1e-4 * abs(mean):  # beyond rounding
         raise InputError(
             f"the coordinate {axis!r} is not evenly spaced: expected nodes at one distance; "
             "resample the field"

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import PIXELS, VECTOR, check_finite, check_shape, plain_array
-from napari_shadowinv._system.machine import available_threads, in_ranges
+from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray, IntArray
@@ -36,12 +36,6 @@ from napari_shadowinv.geometry.compiler import njit
 Corners = tuple[float, float, float, float, float, float, float, float]
 
 _ONE = np.uint32(1)
-# Area relative to squared diameter below which a tile is a line and shares of its area are noise.
-_MIN_TILE_SHAPE = 1e-9
-# Area relative to that in the source below which a tile is deposited pixel by pixel.
-_MIN_AREA_RATIO = 1e-3
-# Flux relative to the brightest pixel's below which it is a rounding error.
-_MIN_FLUX_SHARE = 1e-12
 
 
 @njit(nogil=True, cache=True, error_model="numpy")
@@ -131,7 +125,7 @@ def _spread_flux(
     out: FloatArray,
 ) -> None:
     """Flux per area of a line of tiles as they land; 0 for those that are deposited right away."""
-    thin = 2 * _MIN_AREA_RATIO / (tiles * tiles)
+    thin = 2 * 1e-3 / (tiles * tiles)  # a thousandth of the area in the source
     for b in range(upper.shape[1] - 1):
         share = flux[b // tiles] / (tiles * tiles)
         y0, x0 = upper[0, b], upper[1, b]
@@ -255,7 +249,7 @@ def _add_sums(rises: FloatArray, window: FloatArray) -> None:
             brightest = max(brightest, total)
     for i in range(window.shape[0]):
         for j in range(window.shape[1]):
-            if rises[i, j] > _MIN_FLUX_SHARE * brightest:
+            if rises[i, j] > 1e-12 * brightest:
                 window[i, j] += rises[i, j]
 
 
@@ -276,7 +270,8 @@ def _deposit(window: FloatArray, share: float, double_area: float, corners: Corn
     if inside and i0 == i1 and j0 == j1:
         window[i0, j0] += share
         return
-    if abs(double_area) < _MIN_TILE_SHAPE * ((y_max - y_min) ** 2 + (x_max - x_min) ** 2):
+    # A tile so narrow is a line, and shares of its area are noise.
+    if abs(double_area) < 1e-9 * ((y_max - y_min) ** 2 + (x_max - x_min) ** 2):
         _deposit_line(window, share, corners)
         return
 
@@ -345,10 +340,6 @@ def _edge_integral(row: int, cut: float, ya: float, xa: float, yb: float, xb: fl
 
 # A cubic spline without knots next to the border needs four samples.
 MIN_SIDE_PX = 4
-# Fixed, so that sums are formed in the same order whatever the number of threads.
-_MOST_BANDS, _MIN_BAND_ROWS = 32, 16
-_MIN_PIXELS_PER_THREAD, _MIN_COLUMNS = 1 << 15, 64
-_BYTES_PER_PIXEL = 72  # displacement, its spline, source and image
 
 
 def synthetic_image(
@@ -422,7 +413,8 @@ def synthetic_image(
         return top, window
 
     report = Reporter(on_progress, should_stop)
-    count = min(_MOST_BANDS, max(1, shape[0] // _MIN_BAND_ROWS))
+    # So that sums are formed in the same order whatever the number of threads.
+    count = min(32, max(1, shape[0] // 16))
     bands = list(itertools.pairwise(shape[0] * k // count for k in range(count + 1)))
     image = np.zeros(shape)
     report("image", 0, len(bands))
@@ -465,7 +457,7 @@ def jacobian_determinant(displacement: ArrayLike, *, threads: int | None = None)
     """
     field = _finite_displacement(displacement)
     determinant = np.empty((field.shape[1], field.shape[2]))
-    rows = max(1, _MIN_PIXELS_PER_THREAD // determinant.shape[1])
+    rows = max(1, LIGHT_ITEMS // determinant.shape[1])
     threads = available_threads(threads)
     in_ranges(_fill_determinant, len(determinant), threads, field, determinant, smallest=rows)
     return determinant
@@ -516,7 +508,8 @@ def checked_shape(shape: tuple[int, int], name: str = "the image") -> tuple[int,
 def checked_displacement(displacement: ArrayLike) -> FloatArray:
     """Return a displacement as floats, or raise an `InputError` if a spline cannot be fitted."""
     plain = plain_array(displacement, "displacement", VECTOR, unit=PIXELS)
-    check_memory(plain.shape[-2:], _BYTES_PER_PIXEL, "an image")
+    # Displacement, its spline, source and image.
+    check_memory(plain.shape[-2:], 72, "an image")
     field = np.asarray(plain, dtype=np.float64)
     if field.ndim != 3 or field.shape[0] != 2 or min(field.shape[1:]) < MIN_SIDE_PX:
         raise InputError(
@@ -565,8 +558,7 @@ def _spline_coefficients(field: FloatArray, threads: int = 1) -> FloatArray:
     count, height, width = field.shape
     along_y = np.empty((height + 4, width))
     coefficients = np.empty((count, height + 4, width + 4))
-    columns = max(_MIN_COLUMNS, _MIN_PIXELS_PER_THREAD // height)
-    rows = max(1, _MIN_PIXELS_PER_THREAD // width)
+    columns, rows = max(64, LIGHT_ITEMS // height), max(1, LIGHT_ITEMS // width)
     pivots = _pivots(height), _pivots(width)
     for values, out in zip(field, coefficients, strict=True):
         in_ranges(_filter_columns, width, threads, values, pivots[0], along_y, smallest=columns)

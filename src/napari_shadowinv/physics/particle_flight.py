@@ -42,8 +42,6 @@ _LIGHT_SPEED = constants.c
 PARTICLES_PER_BLOCK = 1 << 17
 """Particles that are traced, and drawn, together: the random numbers depend on it."""
 _SMALLEST_RANGE = 256  # particles for a thread
-_MAX_PATH = 20.0  # diagonals of the grid, beyond which a particle is trapped
-_MAX_STEPS = 10_000_000  # of a particle across the grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,6 +187,8 @@ class Flight:
         options: TraceOptions,
         threads: int,
         report: Reporter,
+        *,
+        max_path: float = 20.0,  # diagonals of the grid, beyond which a particle is trapped
     ) -> None:
         _check_place(grid, setup)
         self.grid, self.setup, self.shape, self.options = grid, setup, shape, options
@@ -199,16 +199,16 @@ class Flight:
         self.charge = particle.charge / (particle.mass * _LIGHT_SPEED)
         self.peaks = np.array([grid.peak("magnetic"), grid.peak("electric") / _LIGHT_SPEED])
         diagonal = math.hypot(*((n - 1) * d for n, d in zip(grid.shape, grid.spacing, strict=True)))
-        self.max_path = _MAX_PATH * diagonal
+        self.max_path = max_path * diagonal
         self._check_strength(setup.energy)
 
-    def _check_strength(self, energy: float) -> None:
+    def _check_strength(self, energy: float, *, max_steps: int = 10_000_000) -> None:
         """Refuse a field in which a particle would take too many steps, or get no finite speed."""
         u = float(self.momenta(np.array([energy]))[0])
         gamma = math.hypot(1.0, u)
         strength = abs(self.charge) * (self.peaks[0] + self.peaks[1] * gamma / u)
         if not math.isfinite(strength * self.max_path) or (
-            strength * self.grid.length / self.options.max_turn > _MAX_STEPS
+            strength * self.grid.length / self.options.max_turn > max_steps
         ):
             name, unit = ("electric", "V/m") if self.peaks[1] > self.peaks[0] else ("magnetic", "T")
             raise InputError(

@@ -22,12 +22,9 @@ import math
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
-UNTOUCHED, DEFLECTED, TRAPPED = 0, 1, 2
+UNTOUCHED, DEFLECTED, TRAPPED = range(3)
 """Status of a particle: met no field, left the grid, or did not leave it."""
 
-_MIN_STEP_SHARE = 1e-9  # of a step; a particle so close to the rim has left the grid
-_FACE_TOLERANCE = 1e-9  # in cells
-_SPEED_TOLERANCE = 1e-3  # relative change of the squared momentum that changes the step
 _SLOW_SHARE = 1e-3  # of a cell, over which a particle at rest is accelerated in one step
 _GAUSS = 0.5 / math.sqrt(3.0)  # places of a rule that is exact for cubic polynomials
 
@@ -103,7 +100,7 @@ def push_particles(
         hx, hy, hz = 0.5 * flight * inv_x, 0.5 * flight * inv_y, 0.5 * flight * inv_z
         path, count, is_bent = 0.0, 0, False
         while path <= max_path:
-            if abs(squared_u - step_u) > _SPEED_TOLERANCE * step_u:
+            if abs(squared_u - step_u) > 1e-3 * step_u:
                 step_u = squared_u
                 # Close to a turning point, at the speed that the field gives within the step.
                 u = math.sqrt(max(squared_u, 2.0 * _SLOW_SHARE * max_e * length))
@@ -122,7 +119,7 @@ def push_particles(
                     _share_inside(y, 2 * dy, rim_y),
                     _share_inside(z, 2 * dz, rim_z),
                 )
-                if not share > _MIN_STEP_SHARE:
+                if not share > 1e-9:  # so close to the rim it has left the grid
                     break
             x += share * dx
             y += share * dy
@@ -265,9 +262,9 @@ def _next_face(at: float, slope: float, t: float) -> float:
     """Distance along a line, beyond `t`, at which it meets the next plane of nodes."""
     place = at + t * slope
     if slope > 0.0:
-        return (math.floor(place + _FACE_TOLERANCE) + 1.0 - at) / slope
+        return (math.floor(place + 1e-9) + 1.0 - at) / slope
     if slope < 0.0:
-        return (math.ceil(place - _FACE_TOLERANCE) - 1.0 - at) / slope
+        return (math.ceil(place - 1e-9) - 1.0 - at) / slope
     return math.inf
 
 

@@ -375,10 +375,6 @@ def _scene(
     return sum(phantoms[1:], start=phantoms[0])
 
 
-PAPER_DENSITY = 1.65e25
-"""Density of the paper's plasma in electrons per m³."""
-
-
 def wakefield_setup() -> OpticalSetup:
     """Optical probe of the paper's plasma wave: collimated light of 810 nm (Section V).
 
@@ -406,7 +402,7 @@ def wakefield(
     setup: OpticalSetup,
     amplitude: float = 0.8,
     *,
-    density: float = PAPER_DENSITY,
+    density: float = 1.65e25,
     width: float = 6e-6,
     length: float = 14e-6,
     curvature_radius: float = 20e-6,

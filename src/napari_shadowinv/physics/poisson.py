@@ -22,8 +22,6 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 
-_BYTES_PER_PIXEL = 64  # image, source, ratio, transform and copies of them
-
 
 def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> FloatArray:
     """Potential of a weak object: solve ∇²φ = I/I₀ - 1.
@@ -143,7 +141,8 @@ def _potential_by_cosines(plane: FloatArray, operator: FloatArray) -> FloatArray
 
 def _checked(name: str, values: ArrayLike) -> FloatArray:
     plain = plain_array(values, name)
-    check_memory(plain.shape, _BYTES_PER_PIXEL, "a linear inversion")
+    # Image, source, ratio, transform and copies of them.
+    check_memory(plain.shape, 64, "a linear inversion")
     array = np.ascontiguousarray(check_plane(plain, name), dtype=np.float64)
     check_finite(name, array)
     return array

@@ -42,11 +42,6 @@ from napari_shadowinv.physics.forward import (
 )
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 
-# Share of a pixel by which rounding may put an image's edge beyond the other's.
-_EDGE_TOLERANCE_PX = 1e-6
-# Pixels that differ by less are the same ones, divided and multiplied by a magnification.
-_SIZE_TOLERANCE = 1e-9
-
 
 def predict_image(
     displacement: ArrayLike,
@@ -188,7 +183,8 @@ def transferred_displacement(
                 f"{setup.object_pixel_size * 1e6:.4g} µm at the object, but the field is known "
                 f"only on {most} of them: crop the source or reduce the shape to that"
             )
-    if size == old and math.isclose(ratio, 1, rel_tol=_SIZE_TOLERANCE):
+    # The same pixels may have been divided and multiplied by a magnification.
+    if size == old and math.isclose(ratio, 1, rel_tol=1e-9):
         return factor * field
     return factor * _resample(field, size, ratio)
 
@@ -245,7 +241,8 @@ def _require_same_kind(recorded_with: Setup, setup: Setup) -> None:
 
 def _covered_shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
     """Height and width in pixels of the new size that fit into the old image."""
-    height, width = (math.floor(n / ratio + _EDGE_TOLERANCE_PX) for n in old)
+    # Rounding may put an image's edge beyond the other's.
+    height, width = (math.floor(n / ratio + 1e-6) for n in old)
     if min(height, width) < MIN_SIDE_PX:
         raise InputError(
             f"the known field covers {height} × {width} pixels of the other setup: expected at "

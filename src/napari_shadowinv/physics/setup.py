@@ -86,10 +86,6 @@ SPECIES: dict[Species, Particle] = {
 }
 
 
-_MIN_ENERGY_MEV, _MAX_ENERGY_MEV = 1e-6, 1e5
-_MAX_ION_SOURCE_DISTANCE_M = 0.1  # sources of ions are small and shine from centimetres
-
-
 class ProtonSetup(BeamSetup):
     """A beam of charged particles through an object, onto a film or a plate.
 
@@ -146,7 +142,7 @@ class ProtonSetup(BeamSetup):
         "Kinetic energy (MeV)",
         "Kinetic energy per particle (not per nucleon), in MeV.",
         gt=0,
-        le=_MAX_ENERGY_MEV,
+        le=1e5,
     )
     species: Species = Field(
         default="proton", description="Particle species; electrons are deflected the opposite way."
@@ -154,10 +150,9 @@ class ProtonSetup(BeamSetup):
 
     @model_validator(mode="after")
     def _energy_in_range(self) -> ProtonSetup:
-        if self.energy < _MIN_ENERGY_MEV:
+        if self.energy < 1e-6:
             raise CombinationError(
-                f"{{energy}} is {self.energy:g} MeV, expected at least {_MIN_ENERGY_MEV:g} MeV: "
-                "check its unit"
+                f"{{energy}} is {self.energy:g} MeV, expected at least 1e-06 MeV: check its unit"
             )
         return self
 
@@ -167,7 +162,8 @@ class ProtonSetup(BeamSetup):
 
     @property
     def max_source_distance(self) -> float:
-        return math.inf if self.species == "electron" else _MAX_ION_SOURCE_DISTANCE_M
+        # Sources of ions are small and shine from centimetres.
+        return math.inf if self.species == "electron" else 0.1
 
     def probe_doubts(self) -> Iterator[str]:
         least, most = self.particle.usual_energies

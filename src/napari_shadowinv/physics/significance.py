@@ -20,9 +20,6 @@ from napari_shadowinv.facts import Fact, Level, percent, to_figures
 LEVEL = 2.0
 """Standard deviations at which the border of a structure lies."""
 
-_FALSE_ALARM = 0.05  # probability that errors alone look like a structure anywhere in the image
-_MIN_ELEMENTS = 9  # resolution elements of the smallest structure
-
 
 @dataclass(frozen=True, eq=False)
 class PixelErrors:
@@ -122,7 +119,12 @@ def significance(displacement: FloatArray, std: FloatArray) -> FloatArray:
 
 
 def find_structures(
-    significant: FloatArray, mask: BoolArray | None = None, *, element: float = 1.0
+    significant: FloatArray,
+    mask: BoolArray | None = None,
+    *,
+    element: float = 1.0,
+    false_alarm: float = 0.05,
+    least_elements: float = 9,
 ) -> Structures:
     """Find the connected regions that stand above 2 σ and are not due to errors alone.
 
@@ -140,6 +142,8 @@ def find_structures(
         Pixels that count. Default: all.
     element : float, optional
         Area of a resolution element in pixels, such as pixels for each site.
+    false_alarm, least_elements : float, default 0.05 and 9
+        The probability, and the number of resolution elements.
 
     Returns
     -------
@@ -149,13 +153,13 @@ def find_structures(
 
     used = ~np.isnan(significant) & (True if mask is None else mask)
     n_pixels = int(used.sum())
-    limit = math.sqrt(2 * math.log(max(n_pixels, 1) / _FALSE_ALARM))
+    limit = math.sqrt(2 * math.log(max(n_pixels, 1) / false_alarm))
     regions, count = label(used & (significant > LEVEL), structure=np.ones((3, 3)))
     peaks = np.zeros(count + 1)
     np.maximum.at(peaks, regions, np.where(regions > 0, significant, 0.0))
     sizes = np.bincount(regions.ravel(), minlength=count + 1)
     # Small images of few sites are one structure at most.
-    smallest = min(_MIN_ELEMENTS * element, n_pixels / 2)
+    smallest = min(least_elements * element, n_pixels / 2)
     is_structure = (peaks > limit) & (sizes >= smallest)
     is_structure[0] = False
     ranked = np.flatnonzero(is_structure)

@@ -56,9 +56,6 @@ if TYPE_CHECKING:
 
 Profile = ArrayLike | Callable[[FloatArray, FloatArray], ArrayLike]
 
-_REACH_SAMPLES = 64  # rays each way through the whole grid, which show how far it moves them
-_SPARE_PX = 2
-_BYTES_PER_RAY = 160
 _MAX_THIN_ERROR = 0.05  # beyond it, the line integral is no good description
 _MAX_EDGE_SHARE = 0.1
 _VECTORS = ("component", *PLANE)
@@ -366,7 +363,7 @@ def _fluence(
     fine = math.isqrt(flight.options.rays_per_pixel - 1) + 1
     first, last = reach
     size = tuple((last - first) * fine)
-    check_memory(size, _BYTES_PER_RAY, "an image")
+    check_memory(size, 160, "an image")
     rays = flight.push(pixel_centres(first, last, fine), "rays")
     displacement = (fine * rays.displacement).reshape(2, *size)
     flux = _beam(flight, profile, first, last, fine) / fine**2
@@ -515,11 +512,14 @@ def _beam(
     return np.array(beam)
 
 
-def _reach(flight: Flight, displacement: FloatArray) -> tuple[IntArray, IntArray]:
+def _reach(
+    flight: Flight, displacement: FloatArray, *, count: int = 64, spare: int = 2
+) -> tuple[IntArray, IntArray]:
     """Return the first pixel and the one behind the last that rays are aimed at, along y and x.
 
     Rays from outside the image may be deflected into it. They pass through the grid, and start no
-    farther outside than the field moves them.
+    farther outside than the field moves them, and `spare` px. How far that is, `count` rays each
+    way through the whole grid show.
     """
     first, last = image_range(flight.shape)
     shadow = _shadow(flight)
@@ -532,11 +532,11 @@ def _reach(flight: Flight, displacement: FloatArray) -> tuple[IntArray, IntArray
             "unit of length"
         )
     low, high = np.floor(shadow[0]).astype(np.int64), np.ceil(shadow[1]).astype(np.int64) + 1
-    samples = [np.linspace(start, end, _REACH_SAMPLES) for start, end in shadow.T]
+    samples = [np.linspace(start, end, count) for start, end in shadow.T]
     elsewhere = flight.push(np.stack(np.meshgrid(*samples)).reshape(2, -1), "rays").displacement
     moves = np.concatenate([displacement, elsewhere], axis=1)
     if not np.isnan(moves).any():
-        pad = math.ceil(np.abs(moves).max()) + _SPARE_PX
+        pad = math.ceil(np.abs(moves).max()) + spare
         low, high = np.maximum(low, first - pad), np.minimum(high, last + pad)
     return np.minimum(low, first), np.maximum(high, last)
 

@@ -16,7 +16,7 @@ coordinates on to it. For pint ``px`` is a length, 1/96 inch, and ``flux`` a fem
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -31,10 +31,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.physics.setup import Setup
 
-_SHOWN_PERCENTILES = 0.1, 99.7
-_MAX_SHOWN_PER_MEAN = 3.5
-_MIN_SHADE = 0.3  # of the brightest intensity; the limits of darker images begin at 0
-_SAMPLED_PIXELS = 100_000
 
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
 
@@ -245,30 +241,39 @@ def shown_potential(potential: FloatArray, setup: Setup | None) -> tuple[FloatAr
     return metres * factor, f"{prefix}m"
 
 
-def intensity_limits(image: AnyArray) -> tuple[float, float]:
+def intensity_limits(
+    image: AnyArray,
+    *,
+    ends: Sequence[float] = (0.1, 99.7),
+    peak: float = 3.5,
+    shade: float = 0.3,
+) -> tuple[float, float]:
     """Return grey limits of an image that a caustic's few bright pixels cannot spoil.
 
-    The lower limit is 0, unless the image has negative pixels or all of it is bright.
+    The lower limit is 0, unless the image has negative pixels or all of it is brighter than a
+    `shade` of the upper limit, which is at most `peak` times the mean.
 
     Parameters
     ----------
     image : ndarray
         Intensities in any unit. A large image is sampled.
+    ends, peak, shade
+        Percentiles of the darkest and brightest pixel; factor on the mean; and share.
 
     Returns
     -------
     tuple of float
         Darkest and brightest intensity to show, the second larger.
     """
-    step = max(1, int(np.sqrt(image.size / _SAMPLED_PIXELS)))
+    step = max(1, int(np.sqrt(image.size / 100_000)))
     sample = np.asarray(image[::step, ::step])
     finite = sample[np.isfinite(sample)]
     if not finite.size:
         return 0.0, 1.0
-    dark, bright = (float(value) for value in np.percentile(finite, _SHOWN_PERCENTILES))
+    dark, bright = (float(value) for value in np.percentile(finite, ends))
     mean = float(finite.mean())
-    high = min(bright, _MAX_SHOWN_PER_MEAN * mean) if mean > 0 else bright
-    low = 0.0 if 0 <= dark < _MIN_SHADE * high else dark
+    high = min(bright, peak * mean) if mean > 0 else bright
+    low = 0.0 if 0 <= dark < shade * high else dark
     return (low, high) if high > low else (low, low + 1.0)
 
 
