@@ -412,10 +412,8 @@ class UsualGeometry:
     """What common experiments have; those of ``benchmarks/wrong_inputs.py`` are beyond it."""
 
     pixels: tuple[float, float] = (10e-9, 1e-3)  # m, at the object
-    # m; no film scanner or plate reader resolves less
-    detector_pixels: tuple[float, float] = (3e-6, 10e-3)
-    # m, from the object to the detector, and to a source of particles
-    distances: tuple[float, float] = (1e-4, 10.0)
+    detector_pixel: float = 3e-6  # m, at least: no film scanner or plate reader resolves less
+    distance: float = 10.0  # m, of the detector from the object, at most
     magnifications: tuple[float, float] = (2.0, 1000.0)  # the first with particles
     file_deviation: float = 0.03  # of a file's pixel size from the setup's
     deflection: float = 0.3  # rad, at most
@@ -545,18 +543,10 @@ def _pixel_doubts(setup: BeamSetup, usual: UsualGeometry) -> Iterator[str]:
     if not least <= pixel <= most:
         yield (
             f"a pixel is {length_text(pixel)} at the object, expected {length_text(least)} "
-            f"to {length_text(most)}: all lengths and fields scale with it; it is given "
-            "in m"
+            f"to {length_text(most)}: all lengths and fields scale with it; it is given in m"
         )
     at_detector = setup.detector_pixel_size
-    if at_detector is None:
-        return
-    if at_detector > usual.detector_pixels[1] and pixel <= most:
-        yield (
-            f"a pixel is {length_text(at_detector)} at the detector, larger than any detector's: "
-            "it is given in m"
-        )
-    elif setup.projects and at_detector < usual.detector_pixels[0]:
+    if at_detector is not None and setup.projects and at_detector < usual.detector_pixel:
         yield (
             f"a pixel is {length_text(at_detector)} at the detector, finer than films and plates "
             "are scanned: if this is its size at the object, give it as such"
@@ -587,17 +577,12 @@ def _distance_doubts(
             f"{length_text(to_object)} from the object and the detector "
             f"{length_text(to_detector)} behind it; both distances are given in m"
         )
-    elif to_detector > usual.distances[1]:
+    elif to_detector > usual.distance:
         yield (
             f"the detector is {length_text(to_detector)} behind the object: fields are too small "
             "by the factor by which that is too long; it is given in m"
         )
     nearest = min(to_object, to_detector)
-    if setup.projects and nearest < usual.distances[0]:
-        yield (
-            f"source or detector is {length_text(nearest)} from the object: distances are given "
-            "in m"
-        )
     if shape is None or not (setup.projects or math.isfinite(to_object)):
         return  # light is often imaged from a plane close behind the object
     extent = max(shape) * setup.object_pixel_size
