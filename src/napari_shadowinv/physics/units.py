@@ -242,11 +242,7 @@ def shown_potential(potential: FloatArray, setup: Setup | None) -> tuple[FloatAr
 
 
 def intensity_limits(
-    image: AnyArray,
-    *,
-    ends: Sequence[float] = (0.1, 99.7),
-    peak: float = 3.5,
-    shade: float = 0.3,
+    image: AnyArray, *, ends: Sequence[float] = (0.1, 99.7), peak: float = 3.5, shade: float = 0.3
 ) -> tuple[float, float]:
     """Return grey limits of an image that a caustic's few bright pixels cannot spoil.
 
