@@ -56,25 +56,31 @@ class TextureMatch:
     max_distance: float = 5.0  # px, at which parts that are further away count
     least_error: float = 0.1  # px, of a shift
 
-
-@dataclass(frozen=True)
-class MoveLimits:
-    """How far a comparison may move films; chosen by ``benchmarks/film_pack.py``.
-
-    Of corners, over the error of both films' edges: less if no third film of their kind confirms
-    it, because what moves may be the beam. A triangle of comparisons may stay open by the larger
-    gap. Fields displace what films show by different amounts, too: of films with exact edges, by
-    which fields came out 4 to 6 % wrong, images shifted by less than `from_edges` made it 10 to
-    17 %.
-    """
-
-    confirmed: float = 4.0
-    alone: float = 2.5
-    gap_errors: float = 3.0
-    gap: float = 1.0  # px
-    turn_error: float = 0.005  # rad, of a film's direction by its edges
-    turns: float = 3.0  # times that of two films: sides of half a thousand pixels exclude more
-    from_edges: float = 1.5  # px
+    def disagreement(
+        self, reference: FloatArray, moved: FloatArray, both: BoolArray, slopes: list[FloatArray]
+    ) -> float | None:
+        """Error of a shift by how far parts of the films are from it, or None if too few agree."""
+        n_parts, away, weights = 0, [], []
+        sides = zip(reference.shape, self.parts, strict=True)
+        for places in product(*(np.array_split(np.arange(side), count) for side, count in sides)):
+            part = np.ix_(*places)
+            counts = both[part]
+            if counts.mean() < self.usable_share:
+                continue
+            n_parts += 1
+            fixed_part, moved_part = reference[part][counts], moved[part][counts]
+            size = np.sqrt((fixed_part @ fixed_part) * (moved_part @ moved_part))
+            if size == 0 or fixed_part @ moved_part < self.correlation * size:
+                continue
+            gain = (fixed_part @ moved_part) / (moved_part @ moved_part)
+            design = gain * np.stack([slope[part][counts] for slope in slopes], axis=1)
+            step = np.linalg.lstsq(design, fixed_part - gain * moved_part, rcond=None)[0]
+            distance = np.clip(self.sampling * step, -self.max_distance, self.max_distance)
+            away.append((distance**2).mean())
+            weights.append((design**2).sum())
+        if len(away) < max(2, self.agreeing_share * n_parts):
+            return None
+        return float(np.sqrt(np.average(away, weights=weights) / len(away)))
 
 
 class Poses(NamedTuple):
@@ -175,6 +181,57 @@ class _Pair(NamedTuple):
     turn_error: float
 
 
+@dataclass(frozen=True)
+class MoveLimits:
+    """How far a comparison may move films; chosen by ``benchmarks/film_pack.py``.
+
+    Of corners, over the error of both films' edges: less if no third film of their kind confirms
+    it, because what moves may be the beam. A triangle of comparisons may stay open by the larger
+    gap. Fields displace what films show by different amounts, too: of films with exact edges, by
+    which fields came out 4 to 6 % wrong, images shifted by less than `from_edges` made it 10 to
+    17 %.
+    """
+
+    confirmed: float = 4.0
+    alone: float = 2.5
+    gap_errors: float = 3.0
+    gap: float = 1.0  # px
+    turn_error: float = 0.005  # rad, of a film's direction by its edges
+    turns: float = 3.0  # times that of two films: sides of half a thousand pixels exclude more
+    from_edges: float = 1.5  # px
+
+    def credible(
+        self, pairs: list[_Pair], edges: FloatArray, kinds: list[Hashable], shape: tuple[int, ...]
+    ) -> list[_Pair]:
+        """Comparisons that the edges of both films do not exclude."""
+        credible = []
+        to_corner = float(np.hypot(shape[0], shape[1])) / 2
+        for pair in pairs:
+            move = np.hypot(*pair.shift) + abs(pair.turn) * to_corner
+            factor = self.confirmed if self._is_confirmed(pair, pairs, kinds) else self.alone
+            is_within = move < factor * np.hypot(edges[pair.first], edges[pair.second])
+            if is_within and abs(pair.turn) < self.turns * np.sqrt(2) * self.turn_error:
+                credible.append(pair)
+        return credible
+
+    def _is_confirmed(self, pair: _Pair, pairs: list[_Pair], kinds: list[Hashable]) -> bool:
+        """Whether comparisons of both films with a third one of their kind agree with a pair."""
+        by_films: dict[tuple[int, int], tuple[FloatArray, float]] = {}
+        for item in pairs:
+            by_films[item.first, item.second] = item.shift, item.error
+            by_films[item.second, item.first] = -item.shift, item.error
+        for third, kind in enumerate(kinds):
+            onwards, back = by_films.get((pair.first, third)), by_films.get((third, pair.second))
+            is_alike = kind == kinds[pair.first] == kinds[pair.second]
+            if not is_alike or onwards is None or back is None:
+                continue
+            gap = np.abs(onwards[0] + back[0] - pair.shift).max()
+            error = np.sqrt(onwards[1] ** 2 + back[1] ** 2 + pair.error**2)
+            if gap < max(self.gap, self.gap_errors * error):
+                return True
+        return False
+
+
 def register(
     images: ArrayLike,
     usable: ArrayLike,
@@ -234,7 +291,7 @@ def register(
         for second in range(first + 1, min(first + 1 + match.neighbours, len(films))):
             if (pair := _compare(first, second, films, match)) is not None:
                 compared.append(pair)
-    pairs = _credible(compared, edges, alike, values.shape[1:], limits)
+    pairs = limits.credible(compared, edges, alike, values.shape[1:])
     poses = _fit_poses(pairs, edges, limits.turn_error)
     for k in np.flatnonzero(~poses.by_images):
         # Edges are as far off as those of films of the same kind that can be compared.
@@ -328,45 +385,6 @@ def _flip(planes: FloatArray, flip: tuple[bool, bool]) -> FloatArray:
     return planes[:, :: -1 if flip[0] else 1, :: -1 if flip[1] else 1]
 
 
-def _credible(
-    pairs: list[_Pair],
-    edges: FloatArray,
-    kinds: list[Hashable],
-    shape: tuple[int, ...],
-    limits: MoveLimits,
-) -> list[_Pair]:
-    """Comparisons that the edges of both films do not exclude."""
-    credible = []
-    to_corner = float(np.hypot(shape[0], shape[1])) / 2
-    for pair in pairs:
-        move = np.hypot(*pair.shift) + abs(pair.turn) * to_corner
-        factor = limits.confirmed if _is_confirmed(pair, pairs, kinds, limits) else limits.alone
-        is_within = move < factor * np.hypot(edges[pair.first], edges[pair.second])
-        if is_within and abs(pair.turn) < limits.turns * np.sqrt(2) * limits.turn_error:
-            credible.append(pair)
-    return credible
-
-
-def _is_confirmed(
-    pair: _Pair, pairs: list[_Pair], kinds: list[Hashable], limits: MoveLimits
-) -> bool:
-    """Whether comparisons of both films with a third one of their kind agree with a pair."""
-    by_films: dict[tuple[int, int], tuple[FloatArray, float]] = {}
-    for item in pairs:
-        by_films[item.first, item.second] = item.shift, item.error
-        by_films[item.second, item.first] = -item.shift, item.error
-    for third, kind in enumerate(kinds):
-        onwards, back = by_films.get((pair.first, third)), by_films.get((third, pair.second))
-        is_alike = kind == kinds[pair.first] == kinds[pair.second]
-        if not is_alike or onwards is None or back is None:
-            continue
-        gap = np.abs(onwards[0] + back[0] - pair.shift).max()
-        error = np.sqrt(onwards[1] ** 2 + back[1] ** 2 + pair.error**2)
-        if gap < max(limits.gap, limits.gap_errors * error):
-            return True
-    return False
-
-
 def _compare(first: int, second: int, films: list[_Film], match: TextureMatch) -> _Pair | None:
     """Pose of the second film against the first, or None if they do not show the same."""
     reference, reference_mask = films[first].texture, films[first].counts
@@ -397,7 +415,7 @@ def _compare(first: int, second: int, films: list[_Film], match: TextureMatch) -
         if np.abs(step[:2]).max() < 1e-3:
             break
     moved, share, *slopes = _move(pose, planes)
-    error = _disagreement(reference, moved, reference_mask & (share > 0.99), slopes, match)
+    error = match.disagreement(reference, moved, reference_mask & (share > 0.99), slopes)
     if error is None:
         return None
     shift_error = max(match.least_error, error)
@@ -440,37 +458,6 @@ def _coarse_shift(first: _Film, second: _Film, reach: int) -> tuple[FloatArray, 
     window = alike[np.ix_(near, near)]
     place = np.unravel_index(int(np.argmax(window)), window.shape)
     return near[list(place)].astype(np.float64), float(window[place])
-
-
-def _disagreement(
-    reference: FloatArray,
-    moved: FloatArray,
-    both: BoolArray,
-    slopes: list[FloatArray],
-    match: TextureMatch,
-) -> float | None:
-    """Error of a shift by how far parts of the films are from it, or None if too few agree."""
-    n_parts, away, weights = 0, [], []
-    sides = zip(reference.shape, match.parts, strict=True)
-    for places in product(*(np.array_split(np.arange(side), count) for side, count in sides)):
-        part = np.ix_(*places)
-        counts = both[part]
-        if counts.mean() < match.usable_share:
-            continue
-        n_parts += 1
-        fixed_part, moved_part = reference[part][counts], moved[part][counts]
-        size = np.sqrt((fixed_part @ fixed_part) * (moved_part @ moved_part))
-        if size == 0 or fixed_part @ moved_part < match.correlation * size:
-            continue
-        gain = (fixed_part @ moved_part) / (moved_part @ moved_part)
-        design = gain * np.stack([slope[part][counts] for slope in slopes], axis=1)
-        step = np.linalg.lstsq(design, fixed_part - gain * moved_part, rcond=None)[0]
-        distance = np.clip(match.sampling * step, -match.max_distance, match.max_distance)
-        away.append((distance**2).mean())
-        weights.append((design**2).sum())
-    if len(away) < max(2, match.agreeing_share * n_parts):
-        return None
-    return float(np.sqrt(np.average(away, weights=weights) / len(away)))
 
 
 def _fit_poses(pairs: list[_Pair], edges: FloatArray, turn_error: float) -> Poses:
