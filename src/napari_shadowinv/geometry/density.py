@@ -24,15 +24,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.machine import available_threads, in_ranges
+from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
 Triple = tuple[float, float, float]
 Segment = tuple[float, float, float, float]  # from (ya, xa) to (yb, xb)
 Integrals = tuple[float, float, float, float, float]  # as `walk_edge` returns them
-
-_MIN_PIXELS_PER_THREAD = 100_000  # pixels
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,7 @@ class Density:
             values = values.copy()
         height, width = values.shape
         sums = np.empty((2, height, width + 1))
-        rows = max(1, _MIN_PIXELS_PER_THREAD // max(1, width))
+        rows = max(1, LIGHT_ITEMS // max(1, width))
         in_ranges(_sum_rows, height, available_threads(threads), values, sums, smallest=rows)
         return cls(values, sums, side)
 

@@ -26,19 +26,13 @@ from napari_shadowinv.geometry.triangle_mesh import (
 )
 
 # What to do with a vertex that is proven hidden.
-REMOVE, STOP, RAISE, KEEP = 0, 1, 2, 3
+REMOVE, STOP, RAISE, KEEP = range(4)
 
 # How a repair ended.
-DONE, HIDDEN, EXHAUSTED = 0, 1, 2  # exhausted: the limit of flips was reached
+DONE, HIDDEN, EXHAUSTED = range(3)  # exhausted: the limit of flips was reached
 
 # Where a site was found.
-INSIDE, ON_EDGE, ON_CORNER, NOWHERE = 0, 1, 2, 3
-
-# Longest step above the plane when a weight is raised, in roundings of the weight.
-LONGEST_STEP = 1 << 15
-
-# Share of sites out of place from which on a new triangulation is faster.
-MOST_STRAYS = 0.1
+INSIDE, ON_EDGE, ON_CORNER, NOWHERE = range(4)
 
 
 @kernel
@@ -64,10 +58,8 @@ def _raise_vertex(mesh: Mesh, h: int, a: int, b: int, c: int) -> None:
     # Close sites that are coplanar but for rounding would chase each other up by single roundings.
     # A wider step now and then (1, 8, 1, 64, 1, 8, 1, 512 ... roundings) ends that soon.
     mesh.counters[triangle_mesh.RAISES] += 1
-    step = min(
-        (mesh.counters[triangle_mesh.RAISES] & -mesh.counters[triangle_mesh.RAISES]) ** 3,
-        LONGEST_STEP,
-    )
+    raises = mesh.counters[triangle_mesh.RAISES]
+    step = min((raises & -raises) ** 3, 1 << 15)
     rounding = np.nextafter(abs(weight), np.inf) - abs(weight)
     height = precise_excess(mesh.points, mesh.weights, a, b, c, v)
     mesh.weights[v] = weight + max(height, 0.0) + step * rounding

@@ -40,13 +40,10 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 BLOCK = 2048  # queries that share one walk; fixed, so that threads change nothing
 WIDTH = 8  # numbers in a cache line
-_LARGEST_CAVITY = 256
 _PATCH = 31  # numbers that describe the surface over a triangle
 _CACHED_PATCHES = 512  # triangles whose patches are remembered
-_EDGE_PX, _EDGE_SHARE = 1e-6, 1e-9  # beyond a triangle's edges that still belongs to it
+_EDGE_PX = 1e-6  # beyond a triangle's edges, and still within it
 STRIP_PX = 32  # rows whose triangles are looked through together
-_STRIPS_AT_ONCE = 4  # between two reports of progress
-_MIN_PIXELS_PER_THREAD = 1 << 13
 
 
 class _Mesh(NamedTuple):
@@ -175,7 +172,7 @@ def _interpolate_blocks(
     """Interpolate blocks `start` to `stop` of the queries."""
     vertices, neighbors, points = mesh
     n = values.shape[0]
-    cavity = np.empty(_LARGEST_CAVITY, np.int32)
+    cavity = np.empty(256, np.int32)
     for block in range(start, stop):
         t = 0
         for q in range(block * BLOCK, min((block + 1) * BLOCK, queries.shape[0])):
@@ -647,7 +644,7 @@ def _evaluate_strips(
             for row in range(top, bottom + 1):
                 for column in range(leftmost, rightmost + 1):
                     b0, b1, b2 = _patch_coordinates(patch, row, column)
-                    if min(b0, b1, b2) >= -_EDGE_SHARE:
+                    if min(b0, b1, b2) >= -1e-9:
                         out[row, column], _ = _value_on_patch(patch, row, column)
         t = 0
         for row in range(begin, end):
@@ -715,19 +712,15 @@ class CloughTocher:
         It is faster than a call with all pixels. `on_share` receives the progress, 0 to 1, and may
         raise to end the work.
         """
-        height, width = shape
         out = np.empty(shape)
         (vertices, _, points), values, _ = surface = self._surface
         starts, members = _triangles_by_strip(vertices, points, len(values), shape)
-        smallest = max(1, _MIN_PIXELS_PER_THREAD // (STRIP_PX * width))
-        for first in range(0, len(starts) - 1, _STRIPS_AT_ONCE):
-            strips = min(_STRIPS_AT_ONCE, len(starts) - 1 - first)
+        for first in range(0, len(starts) - 1, 4):
+            strips = min(4, len(starts) - 1 - first)
             operands = first, starts, members, surface, out
-            in_ranges(
-                _evaluate_strips, strips, self.threads, *operands, smallest=smallest, uneven=True
-            )
+            in_ranges(_evaluate_strips, strips, self.threads, *operands, smallest=1, uneven=True)
             if on_share is not None:
-                on_share(min((first + strips) * STRIP_PX / height, 1.0))
+                on_share(min((first + strips) * STRIP_PX / shape[0], 1.0))
         return out
 
     @property

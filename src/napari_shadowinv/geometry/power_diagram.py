@@ -39,8 +39,6 @@ from napari_shadowinv.geometry.density import (
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
-_MIN_SQUARES_PER_THREAD = 1 << 14  # that borders are walked through
-
 
 @kernel
 def _power_centres(
@@ -265,7 +263,7 @@ class PowerDiagram:
         ends = self.vertices if side == 1 else (self.vertices + 0.5) / side - 0.5
         borders = _Borders(sides, ends, density.image, sums)
         squares_per_side = math.sqrt(density.image.size / self.n_sites)
-        smallest = math.ceil(_MIN_SQUARES_PER_THREAD / max(squares_per_side, 1.0))
+        smallest = math.ceil(LIGHT_ITEMS / max(squares_per_side, 1.0))
         operands = borders, integrals
         in_ranges(walk, len(sides), self._threads, *operands, smallest=smallest, uneven=True)
         if side > 1:

@@ -109,10 +109,9 @@ def insertion_order(n: int) -> IntArray:
 Twofold = tuple[float, float]
 
 # What to do with the edge a-b between the triangles (p, a, b) and (q, b, a).
-LEGAL = 0  # it is locally regular, or so close to it that rounding decides
-FLIP = 1  # p-q must replace it
-REFLEX_A = 2  # a is hidden: it lies in the triangle (p, q, b), above its lifted plane
-REFLEX_B = 3  # b is hidden likewise
+# LEGAL: it is locally regular, or so close to it that rounding decides. FLIP: p-q must replace it.
+# REFLEX_A: a is hidden, in the triangle (p, q, b), above its lifted plane. REFLEX_B: b likewise.
+LEGAL, FLIP, REFLEX_A, REFLEX_B = range(4)
 
 # Error bounds in units of the permanent: (3 + 16 ε) ε for the cross product of two
 # differences, 12 ε (+ O(ε²)) for the lifted determinant, ε = 2⁻⁵³; both rounded up.
@@ -314,17 +313,19 @@ def precise_excess(
 Indices = NDArray[np.int32]
 
 # Places in Mesh.counters.
-SIZE = 0  # triangles in use, holes included
-FREE = 1  # first of the holes, or -1; a hole's first twin is the next one
-TOP = 2  # edges on the stack
-OVERFLOW = 3  # 1 when an edge found no room on the stack
-FLIPS = 4  # flips made
-LIMIT = 5  # flips allowed
-LAST = 6  # triangle where the next location starts
-RAISES = 7  # weights raised
-POLICY = 8  # for vertices that are proven hidden
-EVERYWHERE = 9  # 1 to look at all edges around a flip
-N_COUNTERS = 10
+COUNTERS = range(10)
+(
+    SIZE,  # triangles in use, holes included
+    FREE,  # first of the holes, or -1; a hole's first twin is the next one
+    TOP,  # edges on the stack
+    OVERFLOW,  # 1 when an edge found no room on the stack
+    FLIPS,  # flips made
+    LIMIT,  # flips allowed
+    LAST,  # triangle where the next location starts
+    RAISES,  # weights raised
+    POLICY,  # for vertices that are proven hidden
+    EVERYWHERE,  # 1 to look at all edges around a flip
+) = COUNTERS
 
 
 class Mesh(NamedTuple):

@@ -32,8 +32,8 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry import flips
 from napari_shadowinv.geometry.triangle_mesh import (
+    COUNTERS,
     LIMIT,
-    N_COUNTERS,
     SIZE,
     Indices,
     Mesh,
@@ -42,17 +42,7 @@ from napari_shadowinv.geometry.triangle_mesh import (
     list_edges,
 )
 
-# Distance of the ghosts from the centre of the sites, in extents of the sites. From 3.5 on a ghost
-# that weighs no more than any site has its cell outside three times the bounding box.
-GHOST_DISTANCE = 10.0
-
-# The weight of the ghosts, in units of their squared distance, moves in steps of this factor:
-# it must not follow each change of the smallest weight, which would flip edges at the border.
-GHOST_STEP = 1024.0
-
 STACK_SIZE = 1 << 14
-
-_SITES_PER_PART = 1 << 17  # sites inserted between two calls of `alive`
 
 T = TypeVar("T", bound=np.generic)
 
@@ -96,7 +86,9 @@ def _with_ghosts(sites: FloatArray, region: ArrayLike | None) -> tuple[FloatArra
     extent = float((high - low).max())
     if extent == 0.0:
         extent = max(1.0, float(np.abs(sites).max()))
-    distance = GHOST_DISTANCE * extent
+    # From 3.5 on a ghost that weighs no more than any site has its cell outside three times the
+    # bounding box.
+    distance = 10.0 * extent
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     return np.concatenate([sites, low + (high - low) / 2 + distance * corners]), distance
 
@@ -162,7 +154,7 @@ class RegularTriangulation:
             twins=np.empty(6 * n + 6, np.int32),
             hidden=np.zeros(n, np.bool_),
             stack=np.empty(STACK_SIZE, np.int64),
-            counters=np.zeros(N_COUNTERS, np.int64),
+            counters=np.zeros(len(COUNTERS), np.int64),
             scratch=np.empty(16),
         )
         self._is_regular = False  # for the weights of the mesh
@@ -282,7 +274,7 @@ class RegularTriangulation:
         while overturned:
             _mark(flips.look_for_overturned, mesh, suspects, threads)
             overturned = flips.return_overturned(mesh, suspects, origins, strays)
-        if np.count_nonzero(strays) > flips.MOST_STRAYS * n:
+        if np.count_nonzero(strays) > 0.1 * n:
             return False
         _mark(flips.look_for_irregular, mesh, suspects, threads)
         if flips.repair(mesh, flips.REMOVE, suspects) != flips.DONE:
@@ -362,12 +354,12 @@ class RegularTriangulation:
             raise RuntimeError(twin._exhaustion_text())
         return twin
 
-    def _build(self, alive: Callable[[], None] | None = None) -> None:
+    def _build(self, alive: Callable[[], None] | None = None, *, part: int = 1 << 17) -> None:
         order = insertion_order(self._mesh.hidden.size)
-        for first in range(0, order.size, _SITES_PER_PART):
+        for first in range(0, order.size, part):
             if alive is not None:
                 alive()
-            last = min(first + _SITES_PER_PART, order.size)
+            last = min(first + part, order.size)
             if flips.build(self._mesh, order, first, last) == flips.EXHAUSTED:
                 raise RuntimeError(self._exhaustion_text())
 
@@ -384,8 +376,9 @@ class RegularTriangulation:
     def _weigh_ghosts(self) -> None:
         ghosts = -(self._ghost_distance**2)
         lightest = float(self._mesh.weights[:-4].min())
+        # In steps: to follow each change of the smallest weight would flip edges at the border.
         while ghosts > lightest:
-            ghosts *= GHOST_STEP
+            ghosts *= 1024.0
         self._mesh.weights[-4:] = ghosts
 
     def _in_given_order(self, values: NDArray[T]) -> NDArray[T]:

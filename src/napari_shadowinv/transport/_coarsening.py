@@ -25,12 +25,6 @@ from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.triangle_mesh import Indices
 
-_MAX_COARSEST_NODES = 60
-_MIN_TIE = 0.2
-_MAX_PAIRED_SHARE = 0.75
-_LAST_SECOND_STEP = 3  # level; more of them hardly save an iteration
-NODES_PER_BLOCK = 25_000
-_MOST_BLOCKS = 8
 _NOT_CONNECTED = (
     "the cells form several groups with no flux between them, so the relative weights of the "
     "groups are undetermined"
@@ -395,14 +389,20 @@ def _join_blocks(bounds: IntArray, nodes_per_block: int) -> IntArray:
 
 
 def _build_levels(
-    laplacian: csr_array, ground: FloatArray | None, nodes_per_block: int, threads: int
+    laplacian: csr_array,
+    ground: FloatArray | None,
+    nodes_per_block: int,
+    threads: int,
+    *,
+    coarsest: int = 60,
+    most_blocks: int = 8,
 ) -> tuple[Hierarchy, list[Blocks]]:
     n = int(laplacian.shape[0])
     # every level has at most three quarters of the nodes of the last, so 4 n are enough;
     # pages that are never touched take no memory
-    network = _empty_network(4 * n + _MAX_COARSEST_NODES, 2 * int(laplacian.nnz))
-    parents: Indices = np.empty(4 * n + _MAX_COARSEST_NODES, np.int32)
-    count = min(max(n // nodes_per_block, 1), _MOST_BLOCKS)
+    network = _empty_network(4 * n + coarsest, 2 * int(laplacian.nnz))
+    parents: Indices = np.empty(4 * n + coarsest, np.int32)
+    count = min(max(n // nodes_per_block, 1), most_blocks)
     block_bounds = np.arange(count + 1) * n // count
     spans = np.empty((count, 2), np.int64)
     operands = block_bounds, Rows.of(laplacian), network, spans
@@ -410,7 +410,7 @@ def _build_levels(
     _close_gaps(network, block_bounds, spans)
     _tie_to_ground(network, 0, ground)
     bounds, blocks = [0, n], []
-    while bounds[-1] - bounds[-2] > _MAX_COARSEST_NODES:
+    while bounds[-1] - bounds[-2] > coarsest:
         network, groups = _add_level(network, parents, block_bounds, nodes_per_block, threads)
         if len(block_bounds) > 2:
             cuts = _list_cuts(network, bounds[-2], bounds[-1])
@@ -441,25 +441,32 @@ def _tie_to_ground(network: Network, start: int, ground: FloatArray | None) -> N
 
 
 def _add_level(
-    network: Network, parents: Indices, blocks: IntArray, nodes_per_block: int, threads: int
+    network: Network,
+    parents: Indices,
+    blocks: IntArray,
+    nodes_per_block: int,
+    threads: int,
+    *,
+    weakest_tie: float = 0.2,
+    paired_share: float = 0.75,
 ) -> tuple[Network, IntArray]:
     """Pair the nodes of each block of the last level, and the pairs; return the groups' bounds."""
     start, stop = int(blocks[0]), int(blocks[-1])
     if stop - start > 1 and not network.degrees[start:stop].min() > 0.0:
         raise RuntimeError(_NOT_CONNECTED)
     inverses = np.empty(stop - start)
-    for weakest in (_MIN_TIE, 0.0):
+    for weakest in (weakest_tie, 0.0):
         pairing = _Pairing(network, weakest, network.inverse_degrees, parents, 0, inverses)
         pair_blocks = _pair_blocks(pairing, blocks, threads)
         count = int(pair_blocks[-1])
-        if count <= _MAX_PAIRED_SHARE * (stop - start):
+        if count <= paired_share * (stop - start):
             break
     else:
         raise RuntimeError("the fluxes between cells are not finite, or underflow")
     pairs = _empty_network(count, network.starts[stop] - network.starts[start])
     _contract(network, blocks, parents, pairs, pair_blocks, pair_blocks, threads)
     groups = np.empty(count, np.int32)
-    pairing = _Pairing(pairs, _MIN_TIE, inverses, groups, stop, np.empty(count))
+    pairing = _Pairing(pairs, weakest_tie, inverses, groups, stop, np.empty(count))
     ends = _pair_blocks(pairing, pair_blocks, threads)
     network = _grow_network(network, network.starts[stop] + pairs.starts[count])
     joined = _join_blocks(ends, nodes_per_block)
@@ -503,12 +510,15 @@ def _grow_network(network: Network, entries: int) -> Network:
     )
 
 
-def _choose_second_steps(network: Network, bounds: list[int]) -> BoolArray:
-    """Choose the levels with two steps a cycle: the first ones, if they cost less than level 0."""
+def _choose_second_steps(network: Network, bounds: list[int], *, last: int = 3) -> BoolArray:
+    """Choose the levels with two steps a cycle: the first ones, if they cost less than level 0.
+
+    More of them than up to the last one hardly save an iteration.
+    """
     entries = np.diff(network.starts[bounds])
     twice = np.zeros(len(entries), np.bool_)
     visits = 2
-    for level in range(1, min(_LAST_SECOND_STEP + 1, len(entries) - 1)):
+    for level in range(1, min(last + 1, len(entries) - 1)):
         if visits * entries[level] <= entries[0]:
             twice[level] = True
             visits *= 2

@@ -25,6 +25,7 @@ Sci. Comput. 34, A1079 (2012); A. George, SIAM J. Numer. Anal. 10, 345 (1973) (d
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -32,13 +33,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import SuperLU, splu
 
-from napari_shadowinv._system.machine import available_threads, in_ranges
+from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import kernel, njit
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.transport._coarsening import (
-    NODES_PER_BLOCK,
     Blocks,
     Cuts,
     Hierarchy,
@@ -47,8 +47,6 @@ from napari_shadowinv.transport._coarsening import (
     build_hierarchy,
     require_connected,
 )
-
-_MAX_UNDIVIDED = 16  # nodes
 
 
 @njit(nogil=True, cache=True)
@@ -119,13 +117,6 @@ class FactorisedLaplacian:
             solved = ordered[self._places]
             solution[self._pinned :, columns] = solved[:, : solution[:, columns].shape[1]]
         return solution
-
-
-_MAX_DIRECT_NODES = 200
-_ROWS_PER_THREAD = 1 << 15  # fewer are not worth a thread
-_EXTRA_ITERATIONS = 3  # that cost less than a new setup
-_REUSE_LENGTH = 0.4  # right-hand sides below this length, relative to the setup's, reuse it
-_MAX_KEPT_NODES = 500_000  # nodes; a larger setup takes the memory that trial steps need
 
 
 class _Vectors(NamedTuple):
@@ -358,7 +349,7 @@ class LaplacianSolver:
         laplacian: csr_array,
         ground: FloatArray | None = None,
         *,
-        nodes_per_block: int = NODES_PER_BLOCK,
+        nodes_per_block: int = 25_000,
         threads: int | None = 1,
     ) -> None:
         self._threads = available_threads(threads)
@@ -460,7 +451,7 @@ class LaplacianSolver:
     def _multiply(self, x: FloatArray, product: FloatArray) -> None:
         # Not with the hierarchy's rounded conductances.
         operands = self._rows, x, product
-        in_ranges(_multiply_rows, self._n, self._threads, *operands, smallest=_ROWS_PER_THREAD)
+        in_ranges(_multiply_rows, self._n, self._threads, *operands, smallest=LIGHT_ITEMS)
 
     def _norm(self, x: FloatArray) -> float:
         return float(np.sqrt(_dot(0, self._n, x, x)))
@@ -480,6 +471,7 @@ def _multiply_rows(start: int, stop: int, rows: Rows, x: FloatArray, product: Fl
         product[i] = total
 
 
+@dataclass(eq=False)
 class SimilarSystems:
     """Solver of consecutive systems that reuses its setup.
 
@@ -487,21 +479,25 @@ class SimilarSystems:
     have become short.
     """
 
-    def __init__(self, threads: int | None = 1) -> None:
-        self._threads = threads
-        self._solver: LaplacianSolver | None = None
-        self._most, self._longest = 0, 0.0
+    threads: int | None = 1
+    direct_nodes: int = 200  # fewer are solved for directly
+    extra_iterations: int = 3  # that cost less than a new setup
+    reuse_length: float = 0.4  # of right-hand sides that reuse a setup, relative to its own's
+    kept_nodes: int = 500_000  # a setup of more takes the memory that trial steps need
+    _solver: LaplacianSolver | None = field(default=None, init=False)
+    _most: int = field(default=0, init=False)
+    _longest: float = field(default=0.0, init=False)
 
     def solve(
         self,
         laplacian: csr_array,
         right: FloatArray,
-        tolerance: float,
+        tolerance: float = 1e-2,
         *,
         ground: FloatArray | None = None,
     ) -> FloatArray:
         """Solve L x = b as `LaplacianSolver` does, or by factors if small or too hard for it."""
-        if len(right) < _MAX_DIRECT_NODES:
+        if len(right) < self.direct_nodes:
             require_connected(laplacian)
             return _solve_by_factors(laplacian, right, ground)
         length = float(np.sqrt(np.sum(right * right)))
@@ -512,13 +508,13 @@ class SimilarSystems:
             if residual <= tolerance:
                 return solution
         self._solver = None  # one at a time: they are large
-        solver = LaplacianSolver(laplacian, ground, threads=self._threads)
+        solver = LaplacianSolver(laplacian, ground, threads=self.threads)
         solution, iterations, residual = solver.solve(right, tolerance)
         if residual > tolerance:
             return _solve_by_factors(laplacian, right, ground)
-        if len(right) < _MAX_KEPT_NODES:
-            self._solver, self._most = solver, iterations + _EXTRA_ITERATIONS
-            self._longest = _REUSE_LENGTH * length
+        if len(right) < self.kept_nodes:
+            self._solver, self._most = solver, iterations + self.extra_iterations
+            self._longest = self.reuse_length * length
         return solution
 
 
@@ -540,10 +536,12 @@ def _factors(matrix: csr_array, order: str = "MMD_AT_PLUS_A") -> SuperLU:
     return splu(matrix.tocsc(), permc_spec=order, diag_pivot_thresh=0.0, options=options)
 
 
-def _dissection_order(matrix: csr_array, positions: FloatArray) -> NDArray[np.intp]:
+def _dissection_order(
+    matrix: csr_array, positions: FloatArray, *, undivided: int = 16
+) -> NDArray[np.intp]:
     """Order nodes so that those which separate two halves come after both, in each half again."""
     n = len(positions)
-    depth = max(0, math.ceil(math.log2(max(n, 1) / _MAX_UNDIVIDED)))
+    depth = max(0, math.ceil(math.log2(max(n, 1) / undivided)))
     spans = np.ptp(positions, axis=0) if n else np.zeros(2)
     axes = np.empty(depth, np.int64)
     for division in range(depth):

@@ -159,17 +159,6 @@ class OpenObjective(TransportObjective):
         return weights
 
 
-SHORTEST_STEP = 1e-7
-EVEN_RESIDUAL = 1.0  # largest relative flux error of a cell
-
-_EVENING_STEPS = 3
-_EVENING_SHARE = 0.6
-_HALVING_STEPS = 15  # steps within which the error must halve, or the start was a bad one
-_LINEAR_TOLERANCE = 1e-2
-_SHARES_OF_START = (1.0, 0.999, 0.99, 0.9, 0.5)
-_MIN_START_FLUX = 1e-12  # of a mean cell's flux
-
-_MATRICES = 4  # n × n matrices that scipy's BFGS holds at once
 _METHODS: dict[str, tuple[str, dict[str, float]]] = {
     # maxcor: pairs of steps and gradients that it keeps
     "lbfgs": ("L-BFGS-B", {"maxcor": 20, "ftol": 0.0, "gtol": 0.0, "maxfun": 10**9}),
@@ -184,9 +173,9 @@ def newton(
     max_iterations: int,
     report: Reporter | None = None,
     *,
-    shortest_step: float = SHORTEST_STEP,
+    shortest_step: float = 1e-7,
     fill: bool = False,
-    even: float = EVEN_RESIDUAL,
+    even: float = 1.0,
 ) -> Solution:
     """Solve T(w) = S by damped Newton steps that never empty a cell.
 
@@ -218,7 +207,7 @@ def newton(
         del diagram  # the trial steps need its memory
         ground = objective.ground(weights)
         try:
-            step = systems.solve(laplacian, gap, _LINEAR_TOLERANCE, ground=ground)
+            step = systems.solve(laplacian, gap, ground=ground)
         except RuntimeError as error:
             reason = f"Newton's system cannot be solved: {error}"
             break
@@ -232,29 +221,35 @@ def newton(
         first = min(1.0, (8 if share == first else 2) * share)
         residual = objective.residual(diagram)
         errors.append(_length(mass - diagram.masses))
-        if len(errors) > _HALVING_STEPS and errors[-1] > 0.5 * errors[-1 - _HALVING_STEPS]:
-            reason = f"the error has not halved in {_HALVING_STEPS} steps"
+        if len(errors) > 15 and errors[-1] > 0.5 * errors[-16]:  # a bad start
+            reason = "the error has not halved in 15 steps"
             break
     converged = residual <= tolerance
     return Solution(weights, residual, len(errors) - 1, converged, "" if converged else reason)
 
 
 def _even_out(
-    objective: TransportObjective, weights: FloatArray, diagram: PowerDiagram, even: float
+    objective: TransportObjective,
+    weights: FloatArray,
+    diagram: PowerDiagram,
+    even: float,
+    *,
+    steps: int = 3,
+    share: float = 0.6,
 ) -> tuple[FloatArray, PowerDiagram]:
     """Let cells that are almost empty or far too full settle with their neighbours.
 
     A start from coarser sites has a few such cells near caustics, and they alone would keep
     Newton's steps short for the whole image.
     """
-    for _ in range(_EVENING_STEPS):
+    for _ in range(steps):
         if objective.residual(diagram) <= even:
             break
         gap = np.clip(objective.mass - diagram.masses, -objective.mass, objective.mass)
         stiffness = _stiffness(diagram.laplacian())
         if not stiffness.all():
             break
-        step = _EVENING_SHARE * gap / stiffness
+        step = share * gap / stiffness
         trial = objective.diagram_if_full(weights + step)
         if trial is None:
             # The triangulation has followed the trial.
@@ -303,7 +298,10 @@ def _length(vector: FloatArray) -> float:
 
 
 def with_full_cells(
-    objective: TransportObjective, weights: FloatArray
+    objective: TransportObjective,
+    weights: FloatArray,
+    *,
+    shares: tuple[float, ...] = (1.0, 0.999, 0.99, 0.9, 0.5),
 ) -> tuple[FloatArray, PowerDiagram]:
     """Find nearby weights for which every cell holds some flux, and their diagram.
 
@@ -314,9 +312,9 @@ def with_full_cells(
         weights, threads=available_threads(objective.threads)
     )
     all_seen = np.array_equal(visible, weights)
-    for share in _SHARES_OF_START if all_seen else _SHARES_OF_START[1:]:
+    for share in shares if all_seen else shares[1:]:
         diagram = objective.diagram_if_full(share * visible)
-        if diagram is not None and diagram.masses.min() > _MIN_START_FLUX * objective.mass.mean():
+        if diagram is not None and diagram.masses.min() > 1e-12 * objective.mass.mean():
             return share * visible, diagram
     weights = np.zeros(len(weights))
     return weights, objective.diagram(weights)
@@ -331,9 +329,9 @@ def descend(
     report: Reporter | None = None,
 ) -> Solution:
     """Minimise by one of scipy's methods; cells may be empty at the start."""
-    memory, needed = physical_memory(), 8 * _MATRICES * len(start) ** 2
+    memory, needed = physical_memory(), 32 * len(start) ** 2  # of four matrices
     if solver == "quasi-newton" and memory is not None and needed > memory:
-        most = int((memory / (8 * _MATRICES)) ** 0.5)
+        most = int((memory / 32) ** 0.5)
         raise InputError(
             f"quasi-newton keeps n × n matrices: {len(start):,} sites need {needed / 1e9:.3g} GB, "
             f"this machine has {memory / 1e9:.3g} GB: use lbfgs, or at most {most:,} sites"
@@ -378,20 +376,35 @@ def descend(
 
 Soften = Callable[[Level, float, int], TransportObjective]
 
-_MAX_BLUR_SHARE = 1 / 6  # of the image's longer side
-_SHARP_BLUR_SPACINGS = 0.5  # in site spacings: from there the sharp image is tried
-_RETRY_RATIO = 4.0  # times less blur before the sharp image is tried again
-_MIN_BLUR_PX = 1e-3
-_MIN_BLUR_RATIO = 1.02
-_PATH_TOLERANCE = 0.3  # a blurred image's solution only has to start the next
-_SHORTEST_STEP = 1e-2
+
+@dataclass(frozen=True)
+class BlurPath:
+    """Blurs from a wide one to none, along which a sharp image is approached."""
+
+    first: float = 1 / 6  # of the image's longer side
+    sharp_below: float = 0.5  # site spacings: from there the sharp image is tried
+    retry: float = 4.0  # times less blur before it is tried again
+    least: float = 1e-3  # px
+    least_ratio: float = 1.02  # of two blurs
+    tolerance: float = 0.3  # of a blurred image's solution, which only has to start the next
+    shortest_step: float = 1e-2
+    predicted: tuple[float, ...] = (1.0, 0.5, 0.25)  # of the step along the line through two
+    least_flux: float = 1e-2  # that a prediction leaves each cell, of the smallest one's
+
+    def next_width(
+        self, width: float, solved: list[_Solved], level: Level, sharp: float, *, converged: bool
+    ) -> float | None:
+        """Return the next blur to try, or None if there is none."""
+        if converged:
+            return width / 2 if width >= 2 * sharp else 0.0
+        if not solved:
+            return 2 * width if width < max(level.shape) else None
+        before = solved[-1].width
+        width = np.sqrt(width * before) if width else before / 2
+        return float(width) if self.least < width < before / self.least_ratio else None
+
+
 _MAX_BLUR_IN_PIXELS = 16.0  # wider blurs are computed on means of pixels
-_MIN_BLUR_IN_PIXELS = 1.5  # smallest blur, in pixels, that hides them
-_MAX_PARTS = 8  # of a pixel's side
-_MAX_PIXELS = 2**22  # after splitting
-_MIN_PIXELS_PER_WORKER = 2**17  # of a transform
-_SHARES_OF_PREDICTION = (1.0, 0.5, 0.25)
-_MIN_PREDICTED_SHARE = 1e-2  # of the smallest flux to reach
 
 
 def blur_image(image: FloatArray, width: float, threads: int | None = 1) -> FloatArray:
@@ -424,7 +437,7 @@ def _blur_means(image: FloatArray, width: float, parts: int, threads: int | None
     if height % parts or breadth % parts:
         image = np.pad(image, ((0, -height % parts), (0, -breadth % parts)), mode="edge")
     means = complete_block_means(image, parts)
-    workers = available_threads(threads) if means.size > _MIN_PIXELS_PER_WORKER else 1
+    workers = available_threads(threads) if means.size > 2**17 else 1
     spectrum = dctn(means, workers=workers)
     for axis in (0, 1):
         waves = np.pi * np.arange(means.shape[axis]) / means.shape[axis]
@@ -440,6 +453,8 @@ def sharpen(
     tolerance: float,
     max_iterations: int,
     report: Reporter | None = None,
+    *,
+    path: BlurPath = BlurPath(),
 ) -> Solution:
     """Solve one level from zero weights by following the solution from a blurred image.
 
@@ -450,8 +465,8 @@ def sharpen(
     """
     solved: list[_Solved] = []
     nearest: Solution | None = None
-    width: float | None = _MAX_BLUR_SHARE * max(level.shape)
-    sharp_below = _SHARP_BLUR_SPACINGS * level.spacing
+    width: float | None = path.first * max(level.shape)
+    sharp_below = path.sharp_below * level.spacing
     split = cache(level.split)
     steps = 0
     while width is not None and steps < max_iterations:
@@ -459,14 +474,14 @@ def sharpen(
         objective = soften(split(parts), parts * width, parts) if width else sharp
         # weights are squares of lengths
         before = [_Solved(earlier.width, parts**2 * earlier.weights) for earlier in solved[-2:]]
-        for start in _starts(objective, split(parts), width, before):
+        for start in _starts(objective, split(parts), width, before, path):
             solution = newton(
                 objective,
                 start,
-                _PATH_TOLERANCE if width else tolerance,
+                path.tolerance if width else tolerance,
                 max_iterations - steps,
                 report,
-                shortest_step=_SHORTEST_STEP,
+                shortest_step=path.shortest_step,
             )
             steps += solution.iterations
             if not width and (nearest is None or solution.residual < nearest.residual):
@@ -478,25 +493,26 @@ def sharpen(
         if solution.converged:
             solved.append(_Solved(width, solution.weights / parts**2))
         if solved and not width:
-            sharp_below = solved[-1].width / _RETRY_RATIO
-        width = _next_width(width, solved, level, sharp_below, converged=solution.converged)
+            sharp_below = solved[-1].width / path.retry
+        width = path.next_width(width, solved, level, sharp_below, converged=solution.converged)
     answer = _blurred_solution(sharp, solved, level, tolerance)
     used_up = f"the solver used all {max_iterations} iterations allowed"
-    if nearest is not None and nearest.residual < min(answer.residual, _PATH_TOLERANCE):
+    if nearest is not None and nearest.residual < min(answer.residual, path.tolerance):
         reason = used_up if steps >= max_iterations else nearest.reason
         return replace(nearest, iterations=steps, reason=reason)
     reason = f"{used_up}; {answer.reason}" if steps >= max_iterations else answer.reason
     return replace(answer, iterations=steps, reason=reason)
 
 
-def _parts(width: float, shape: tuple[int, int]) -> int:
-    """Return the number of parts into which a pixel's side is split for a blur in px."""
-    parts = 1
-    while (
-        0 < width * parts < _MIN_BLUR_IN_PIXELS
-        and parts < _MAX_PARTS
-        and 4 * parts**2 * shape[0] * shape[1] <= _MAX_PIXELS
-    ):
+def _parts(
+    width: float, shape: tuple[int, int], *, hidden: float = 1.5, most: int = 8, pixels: int = 2**22
+) -> int:
+    """Return the number of parts into which a pixel's side is split for a blur in px.
+
+    A blur by so many parts hides them; there are at most so many parts and pixels.
+    """
+    parts, area = 1, shape[0] * shape[1]
+    while 0 < width * parts < hidden and parts < most and 4 * parts**2 * area <= pixels:
         parts *= 2
     return parts
 
@@ -508,21 +524,8 @@ class _Solved(NamedTuple):
     weights: FloatArray
 
 
-def _next_width(
-    width: float, solved: list[_Solved], level: Level, sharp_below: float, *, converged: bool
-) -> float | None:
-    """Return the next blur to try, or None if there is none."""
-    if converged:
-        return width / 2 if width >= 2 * sharp_below else 0.0
-    if not solved:
-        return 2 * width if width < max(level.shape) else None
-    before = solved[-1].width
-    width = np.sqrt(width * before) if width else before / 2
-    return float(width) if _MIN_BLUR_PX < width < before / _MIN_BLUR_RATIO else None
-
-
 def _starts(
-    objective: TransportObjective, level: Level, width: float, solved: list[_Solved]
+    objective: TransportObjective, level: Level, width: float, solved: list[_Solved], path: BlurPath
 ) -> Iterator[FloatArray]:
     """Yield the weights to start from, the most promising first."""
     if not solved:
@@ -532,9 +535,9 @@ def _starts(
         return
     last = solved[-1]
     if len(solved) > 1:
-        least = _MIN_PREDICTED_SHARE * float(objective.mass.min())
+        least = path.least_flux * float(objective.mass.min())
         slope = (last.weights - solved[-2].weights) / (last.width - solved[-2].width)
-        for share in _SHARES_OF_PREDICTION:
+        for share in path.predicted:
             predicted = last.weights + share * (width - last.width) * slope
             diagram = objective.diagram_if_full(predicted)
             if diagram is not None and diagram.masses.min() > least:

@@ -118,11 +118,7 @@ def edge_flux(
     )
 
 
-COARSEST = 600  # sites with which the solver can start from zero weights
 RATIO = 4  # sites of a level per site of the next coarser one
-
-_POLL_S = 0.05  # between two looks at work in another thread
-_MIRROR_BAND = 3.0  # in site spacings: every border pixel must lie between sites
 
 
 @dataclass(frozen=True)
@@ -153,9 +149,8 @@ class Level:
     @cached_property
     def mirrored(self) -> Mirrored:
         """The sites with those near the border mirrored across it."""
-        points, origin, sense = with_mirror_images(
-            self.sites, self.shape, _MIRROR_BAND * self.spacing
-        )
+        # Every border pixel must lie between sites.
+        points, origin, sense = with_mirror_images(self.sites, self.shape, 3.0 * self.spacing)
         return Mirrored(
             self.triangulation.with_more(points[len(self.sites) :]),
             origin.astype(np.int32),
@@ -220,7 +215,7 @@ class Levels(Sequence[Level]):
     def at(self, count: int) -> Level:
         """Return the level with `count` sites."""
         slot = self._slots.setdefault(count, _Slot())
-        while not slot.lock.acquire(timeout=_POLL_S):
+        while not slot.lock.acquire(timeout=0.05):
             self._report("sites", 0, None, f"{count:,} sites")
         try:
             if slot.level is None:
@@ -387,10 +382,14 @@ def plan_levels(
     lloyd_tolerance: float = 0.0,
     seed: int = 0,
     threads: int | None = None,
+    coarsest: int = 600,
 ) -> SitePlan:
-    """Plan levels over a source; the finest has `n_sites`, others a quarter of the next."""
+    """Plan levels over a source; the finest has `n_sites`, others a quarter of the next.
+
+    The solver can start from zero weights with as many sites as the `coarsest`, or fewer.
+    """
     counts = [n_sites]
-    while counts[-1] > COARSEST:
+    while counts[-1] > coarsest:
         counts.append(max(4, counts[-1] // RATIO))
 
     @lru_cache(maxsize=1)

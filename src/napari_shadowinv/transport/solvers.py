@@ -38,17 +38,6 @@ from napari_shadowinv.transport.minimise import (
 )
 from napari_shadowinv.transport.sites import RATIO, Level, Levels, Margin
 
-_COARSE_TOLERANCE = 3e-2
-_PREPARED_SITES = 20_000  # levels up to this size are needed for almost any accuracy
-_MAX_KEPT_SURFACE_SITES = 50_000  # larger surfaces are computed again rather than kept
-_STALLED_RESIDUAL = 0.1  # above this a level counts as unsolved
-_MAX_WARM_STEPS = 10
-_FIT_SITES = 1500
-_FIT_STEPS = (0.03, 0.01)
-_MAX_FIT_SHIFT = 4.0  # steps
-_EVEN_WARM_RESIDUAL = 3.0  # a few cells of a similar image do not keep steps short
-_SHORTEST_WARM_STEP = 0.1  # where steps must be shorter, starting afresh is faster
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LevelSolution(Solution):
@@ -102,6 +91,16 @@ class LevelSolution(Solution):
         )
 
 
+@dataclass(frozen=True)
+class LevelLimits:
+    """When a coarser level has done its work."""
+
+    tolerance: float = 3e-2
+    stalled: float = 0.1  # residual above which it counts as unsolved
+    prepared: int = 20_000  # sites: levels up to this size are needed for almost any accuracy
+    kept: int = 50_000  # sites: larger surfaces are computed again rather than kept
+
+
 # From the solutions so far: the factor on the number of sites that would suffice.
 Needed = Callable[[Sequence[LevelSolution]], float]
 
@@ -146,16 +145,18 @@ def _solve_levels(
     needed: Needed | None,
     solved: Sequence[LevelSolution],
     begin: Callable[[Sequence[int]], None],
+    *,
+    limits: LevelLimits = LevelLimits(),
 ) -> list[LevelSolution]:
     """Solve level after level; `begin` prepares the next ones in the background."""
     options = target.options
     by_newton = options.solver == "newton"
     solutions = list(solved)
-    coarse = max(options.tolerance, _COARSE_TOLERANCE)
+    coarse = max(options.tolerance, limits.tolerance)
     fewest = len(solutions[-1].weights) if solutions else 0
     finer = [count for count in levels.counts if count > fewest]
     times = math.inf  # as many sites are needed as there are
-    begin(finer[::-1] if needed is None else [count for count in finer if count <= _PREPARED_SITES])
+    begin(finer[::-1] if needed is None else [count for count in finer if count <= limits.prepared])
     while finer:
         level = levels.at(finer.pop(0))
         finest = not finer
@@ -168,11 +169,11 @@ def _solve_levels(
             weights = None
             if solutions:
                 weights = 2 * solutions[-1].surface(level.sites)
-                if len(solutions[-1].weights) > _MAX_KEPT_SURFACE_SITES:
+                if len(solutions[-1].weights) > limits.kept:
                     solutions[-1].forget_surface()
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
-        if by_newton and solution.residual > _STALLED_RESIDUAL and len(levels) > 1:
+        if by_newton and solution.residual > limits.stalled and len(levels) > 1:
             return [*solutions, _restart(levels[-1], target, solution if finest else None, report)]
         if needed is None or finest:
             continue
@@ -202,15 +203,22 @@ def _restart(
 
 
 def fit_flux_factor(
-    levels: Levels, image: FloatArray, margin: Margin, options: InversionOptions, report: Reporter
+    levels: Levels,
+    image: FloatArray,
+    margin: Margin,
+    options: InversionOptions,
+    report: Reporter,
+    *,
+    sites: int = 1500,
+    steps: tuple[float, ...] = (0.03, 0.01),
 ) -> float:
     """Find the factor on an image of unknown exposure that moves the flux at the edge least.
 
     A wrong factor drives flux across the whole edge: it adds a displacement there in
-    proportion to the error. Few sites suffice to see it. The image must have the flux of the
-    source.
+    proportion to the error. Few `sites` suffice to see it. Parabolas through three factors, `steps`
+    apart, have their minimum within four steps. The image must have the flux of the source.
     """
-    few = levels[: max(1, sum(count <= _FIT_SITES for count in levels.counts))]
+    few = levels[: max(1, sum(count <= sites for count in levels.counts))]
     at_edge = np.abs(margin.edge_distance(few[-1].sites).min(axis=-1)) < few[-1].spacing
 
     def move_at_edge(trial: FloatArray) -> float:
@@ -218,19 +226,23 @@ def fit_flux_factor(
         return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
 
     factor = 1.0
-    for step in _FIT_STEPS:
+    for step in steps:
         trials = factor * (1 - step), factor, factor * (1 + step)
         moves = [move_at_edge(trial * image) for trial in trials]
         curvature = moves[0] - 2 * moves[1] + moves[2]
         lowest = 0.5 * (moves[0] - moves[2]) / curvature if curvature > 0 else 0.0
-        factor *= 1 + step * float(np.clip(lowest, -_MAX_FIT_SHIFT, _MAX_FIT_SHIFT))
+        factor *= 1 + step * float(np.clip(lowest, -4.0, 4.0))
     return factor
 
 
 def _solve_from(
     start: FloatArray, level: Level, target: Target, report: Reporter | None
 ) -> LevelSolution | None:
-    """Solve one level from similar weights; return None if that does not converge quickly."""
+    """Solve one level from similar weights; return None if that does not converge quickly.
+
+    A few cells of a similar image that are not even do not keep steps short. Where they must be
+    shorter than a tenth, or many, starting afresh is faster.
+    """
     options = target.options
     objective = target.objective(level)
     if options.solver == "newton":
@@ -240,11 +252,11 @@ def _solve_from(
             objective,
             start,
             options.tolerance,
-            min(_MAX_WARM_STEPS, options.max_iterations),
+            min(10, options.max_iterations),
             report,
-            shortest_step=_SHORTEST_WARM_STEP,
+            shortest_step=0.1,
             fill=not is_full,
-            even=_EVEN_WARM_RESIDUAL,
+            even=3.0,
         )
     else:
         solution = _solve_level(objective, start, options, options.tolerance, report)
