@@ -50,6 +50,7 @@ class TextureMatch:
     reach: int = 12  # samples, of films from where their edges are
     neighbours: int = 2  # films before and behind that one is compared with
     parts: tuple[int, int] = (3, 5)  # along y and x, which must agree
+    known_share: float = 0.99  # of usable pixels around a place that counts
     usable_share: float = 0.5  # of a part that counts
     correlation: float = 0.3  # of films, and of a part, that show the same
     agreeing_share: float = 0.6  # of the parts
@@ -397,7 +398,7 @@ def _compare(first: int, second: int, films: list[_Film], match: TextureMatch) -
     y, x = _from_middle(reference.shape)
     for _ in range(25):
         moved, share, *slopes = _move(pose, planes)
-        both = reference_mask & (share > 0.99)
+        both = reference_mask & (share > match.known_share)
         c, s = np.cos(pose[2]), np.sin(pose[2])
         turning = slopes[0] * (-s * y - c * x) + slopes[1] * (c * y - s * x)
         design = np.stack([slope[both] for slope in (*slopes, turning)], axis=1)
@@ -415,7 +416,8 @@ def _compare(first: int, second: int, films: list[_Film], match: TextureMatch) -
         if np.abs(step[:2]).max() < 1e-3:
             break
     moved, share, *slopes = _move(pose, planes)
-    error = match.disagreement(reference, moved, reference_mask & (share > 0.99), slopes)
+    both = reference_mask & (share > match.known_share)
+    error = match.disagreement(reference, moved, both, slopes)
     if error is None:
         return None
     shift_error = max(match.least_error, error)

@@ -236,14 +236,14 @@ def _fit_side(border: FloatArray, axis: int, end: int, sides: SideFit) -> _Line:
     return _fit_line(along[inner & near], across[inner & near], 0.5)
 
 
-def _fit_line(along: FloatArray, across: FloatArray, usual: float) -> _Line:
-    """Fit a line to most points; points closer than `usual` are no outliers."""
+def _fit_line(along: FloatArray, across: FloatArray, usual: float, most: float = 2.5) -> _Line:
+    """Fit a line to points within `most` deviations; those closer than `usual` are no outliers."""
     used = np.ones(along.size, bool)
     slope = offset = 0.0
     for _ in range(8):
         slope, offset = np.polyfit(along[used], across[used], 1)
         away = np.abs(across - offset - slope * along)
-        used = away <= max(2.5 * 1.5 * np.median(away), usual)
+        used = away <= max(most * 1.5 * np.median(away), usual)
     return float(offset), float(slope)
 
 

@@ -368,14 +368,14 @@ class Panel:
         style: Any = {"transform": self.axes.transAxes, "fontsize": 7, "color": "white"}
         self.axes.text(0.02, 0.02, text, bbox=box, va="bottom", zorder=5, **style)
 
-    def outline_caustics(self, caustic: BoolArray) -> None:
+    def outline_caustics(self, caustic: BoolArray, *, level: float = 0.15) -> None:
         """Draw a line around the caustics."""
         from scipy.ndimage import gaussian_filter
 
         # Noise breaks a caustic into specks; one line around them is readable.
         density = gaussian_filter(caustic.astype(np.float64), 1 + min(caustic.shape) / 200)
-        if density.min() < 0.15 < density.max():
-            self.contour(density, [0.15], "white", linewidths=1.1)
+        if density.min() < level < density.max():
+            self.contour(density, [level], "white", linewidths=1.1)
 
     def draw_cuts(self, field: ShownField, error: FloatArray | None = None) -> None:
         """Plot a field's magnitude along x and along y through its peak, with its error's band."""

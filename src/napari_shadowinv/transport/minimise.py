@@ -181,7 +181,7 @@ def newton(
 
     With `fill`, empty cells are filled first (`with_full_cells`). A start with a larger relative
     flux error of a cell than `even` is evened out before the first step. The solver stops without
-    convergence if the error has not halved in many steps (a bad start), or if less than
+    convergence if the error has not halved in 15 steps (a bad start), or if less than
     `shortest_step` of Newton's step is possible.
     """
     mass = objective.mass
@@ -221,7 +221,7 @@ def newton(
         first = min(1.0, (8 if share == first else 2) * share)
         residual = objective.residual(diagram)
         errors.append(_length(mass - diagram.masses))
-        if len(errors) > 15 and errors[-1] > 0.5 * errors[-16]:  # a bad start
+        if len(errors) > 15 and errors[-1] > 0.5 * errors[-16]:
             reason = "the error has not halved in 15 steps"
             break
     converged = residual <= tolerance
