@@ -482,20 +482,18 @@ def test_hilbert_order_is_a_permutation_with_short_steps() -> None:
     np.testing.assert_array_equal(hilbert_order(points[order]), np.arange(4096))
 
 
-def test_building_in_parts_gives_the_same_triangles(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_building_in_parts_gives_the_same_triangles() -> None:
     sites = np.random.default_rng(0).random((1000, 2))
     weights = np.random.default_rng(1).random(1000) / 500
     at_once = RegularTriangulation(sites, weights)
-    monkeypatch.setattr(module, "_SITES_PER_PART", 150)
     signs: list[int] = []
-    in_parts = RegularTriangulation(sites, weights, alive=lambda: signs.append(1))
+    in_parts = RegularTriangulation(sites, weights, alive=lambda: signs.append(1), part=150)
     assert len(signs) == 7
     np.testing.assert_array_equal(in_parts.vertices, at_once.vertices)
     np.testing.assert_array_equal(in_parts.hidden, at_once.hidden)
 
 
-def test_building_ends_when_a_sign_of_life_raises(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_SITES_PER_PART", 150)
+def test_building_ends_when_a_sign_of_life_raises() -> None:
     signs: list[int] = []
 
     def stopped() -> None:
@@ -504,7 +502,7 @@ def test_building_ends_when_a_sign_of_life_raises(monkeypatch: pytest.MonkeyPatc
             raise InversionCancelled("stopped")
 
     with pytest.raises(InversionCancelled):
-        RegularTriangulation(np.random.default_rng(0).random((1000, 2)), alive=stopped)
+        RegularTriangulation(np.random.default_rng(0).random((1000, 2)), alive=stopped, part=150)
     assert len(signs) == 2
 
 

@@ -109,8 +109,8 @@ class RegularTriangulation:
 
     Sites, shape (n, 2), are (y, x) in any unit, fastest in `hilbert_order`; weights, shape (n,),
     are in its square. The region, two opposite corners of a box that matters such as an image, is
-    only needed where it reaches much further than the sites. `alive` is called now and then while
-    many sites are put in, and may raise to end that. Four ghost sites, the corners of a square far
+    only needed where it reaches much further than the sites. `alive` is called before each `part`
+    of the sites is put in, and may raise to end that. Four ghost sites, the corners of a square far
     outside, close the plane: their cells stay outside three times the bounding box of sites and
     region. Cells of sites may end at them out there.
 
@@ -138,6 +138,7 @@ class RegularTriangulation:
         *,
         region: ArrayLike | None = None,
         alive: Callable[[], None] | None = None,
+        part: int = 1 << 17,
     ) -> None:
         positions = _checked_points(sites)
         n = positions.shape[0]
@@ -159,7 +160,7 @@ class RegularTriangulation:
         )
         self._is_regular = False  # for the weights of the mesh
         self._set_weights(np.zeros(n) if weights is None else _checked_weights(weights, n))
-        self._build(alive)
+        self._build(alive, part)
 
     @cached_property
     def points(self) -> FloatArray:
@@ -354,7 +355,7 @@ class RegularTriangulation:
             raise RuntimeError(twin._exhaustion_text())
         return twin
 
-    def _build(self, alive: Callable[[], None] | None = None, *, part: int = 1 << 17) -> None:
+    def _build(self, alive: Callable[[], None] | None = None, part: int = 1 << 17) -> None:
         order = insertion_order(self._mesh.hidden.size)
         for first in range(0, order.size, part):
             if alive is not None:
