@@ -17,7 +17,7 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.inversion.readout import read_centroids
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.transport.minimise import TransportObjective
-from napari_shadowinv.transport.sites import Level, lloyd, plan_levels, sample_sites
+from napari_shadowinv.transport.sites import SiteLevel, lloyd, plan_levels, sample_sites
 from paper_parts.drawing import (
     GREY,
     INTENSITY_MAP,
@@ -108,7 +108,7 @@ class Walkthrough:
     source: FloatArray
     target: FloatArray
     random_sites: FloatArray
-    level: Level
+    level: SiteLevel
     weights: list[FloatArray]
     site_moves: FloatArray
     potential: FloatArray

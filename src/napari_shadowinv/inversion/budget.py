@@ -48,7 +48,7 @@ from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument, InversionOptions
 from napari_shadowinv.physics.edge import edge_changes, edge_sides
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
-from napari_shadowinv.transport.sites import RATIO, Level, SitePlan
+from napari_shadowinv.transport.sites import RATIO, SiteLevel, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
 _AROUND = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])  # px
@@ -377,7 +377,7 @@ class Budget:
 
 
 @lru_cache(maxsize=4)
-def _unit_beams(level: Level, length: float, seed: int) -> FloatArray:
+def _unit_beams(level: SiteLevel, length: float, seed: int) -> FloatArray:
     """Return the flux that cells gain from random beams of r.m.s. 1, shape (k, n)."""
     mass = level.mass
     samples = random_waves(level.sites, length, _BEAM_SAMPLES, np.random.default_rng(seed))
@@ -388,7 +388,7 @@ def _unit_beams(level: Level, length: float, seed: int) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def _nearest_sites(level: Level) -> tuple[IntArray, int]:
+def _nearest_sites(level: SiteLevel) -> tuple[IntArray, int]:
     """Return the nearest site of squares as wide as the spacing, and how many make a row."""
     height, width = (int(side / level.spacing) + 1 for side in level.shape)
     middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * level.spacing - 0.5
@@ -396,7 +396,7 @@ def _nearest_sites(level: Level) -> tuple[IntArray, int]:
 
 
 def _look_ahead(
-    response: Callable[[], LinearResponse], level: Level, length: float, seed: int
+    response: Callable[[], LinearResponse], level: SiteLevel, length: float, seed: int
 ) -> None:
     """Compute what errors need of a level, once its response, which is needed sooner, is ready."""
     response()

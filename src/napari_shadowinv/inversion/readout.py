@@ -43,7 +43,7 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import FactorisedLaplacian
-from napari_shadowinv.transport.sites import Level, SitePlan
+from napari_shadowinv.transport.sites import SiteLevel, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
 
@@ -101,7 +101,7 @@ def _add_rows(
 class LinearReadout:
     """Read-out of a level at the pixels of a plan's image."""
 
-    def __init__(self, plan: SitePlan, level: Level, threads: int | None = None) -> None:
+    def __init__(self, plan: SitePlan, level: SiteLevel, threads: int | None = None) -> None:
         n = len(level.sites)
         self._triangulation = level.triangulation
         # One pixel more at each side; beyond the level's border the potential is its mirror image.
@@ -170,7 +170,7 @@ class LinearResponse:
 
     Attributes
     ----------
-    level : Level
+    level : SiteLevel
         The level, of n sites.
     spacing : float
         Distance between its sites, px.
@@ -332,7 +332,7 @@ def _differentiate(start: int, stop: int, potential: FloatArray, displacement: F
 
 
 def read_centroids(
-    level: Level,
+    level: SiteLevel,
     site_displacement: FloatArray,
     threads: int | None = None,
     *,

@@ -49,7 +49,7 @@ from napari_shadowinv.geometry.density import Density, side_of_squares, split_pi
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.transport.linear import SimilarSystems
-from napari_shadowinv.transport.sites import Level, Margin
+from napari_shadowinv.transport.sites import Margin, SiteLevel
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +122,7 @@ class OpenObjective(TransportObjective):
 
     def __init__(
         self,
-        level: Level,
+        level: SiteLevel,
         image: FloatArray,
         margin: Margin,
         decay_length: float,
@@ -374,7 +374,7 @@ def descend(
     return Solution(weights - weights.mean(), residual, steps, converged, reason)
 
 
-Soften = Callable[[Level, float, int], TransportObjective]
+Soften = Callable[[SiteLevel, float, int], TransportObjective]
 
 
 @dataclass(frozen=True)
@@ -392,16 +392,39 @@ class BlurPath:
     least_flux: float = 1e-2  # that a prediction leaves each cell, of the smallest one's
 
     def next_width(
-        self, width: float, solved: list[_Solved], level: Level, sharp: float, *, converged: bool
+        self, width: float, solved: list[_Solved], most: int, sharp: float, *, converged: bool
     ) -> float | None:
         """Return the next blur to try, or None if there is none."""
         if converged:
             return width / 2 if width >= 2 * sharp else 0.0
         if not solved:
-            return 2 * width if width < max(level.shape) else None
+            return 2 * width if width < most else None
         before = solved[-1].width
         width = np.sqrt(width * before) if width else before / 2
         return float(width) if self.least < width < before / self.least_ratio else None
+
+    def starts(
+        self, objective: TransportObjective, level: SiteLevel, width: float, solved: list[_Solved]
+    ) -> Iterator[FloatArray]:
+        """Yield the weights to start from, the most promising first."""
+        if not solved:
+            yield np.zeros(len(level.sites))
+            pixels = split_pixels(objective.image.image, objective.image.side)
+            yield with_full_cells(objective, _same_moments(level, pixels))[0]
+            return
+        last = solved[-1]
+        if len(solved) > 1:
+            least = self.least_flux * float(objective.mass.min())
+            slope = (last.weights - solved[-2].weights) / (last.width - solved[-2].width)
+            for share in self.predicted:
+                predicted = last.weights + share * (width - last.width) * slope
+                diagram = objective.diagram_if_full(predicted)
+                if diagram is not None and diagram.masses.min() > least:
+                    yield predicted
+                    if not width:
+                        return
+                    break
+        yield last.weights
 
 
 _MAX_BLUR_IN_PIXELS = 16.0  # wider blurs are computed on means of pixels
@@ -447,7 +470,7 @@ def _blur_means(image: FloatArray, width: float, parts: int, threads: int | None
 
 
 def sharpen(
-    level: Level,
+    level: SiteLevel,
     sharp: TransportObjective,
     soften: Soften,
     tolerance: float,
@@ -459,9 +482,9 @@ def sharpen(
     """Solve one level from zero weights by following the solution from a blurred image.
 
     `soften` makes the objective for the level of split pixels, the blur in those pixels, and the
-    parts of a pixel's side (see `Level.split`). The limit of iterations covers all images together.
-    If the sharp image cannot be solved, the solution of the sharpest solved image is returned and
-    the reason names its blur; if the sharp image was nearly solved, that solution is returned.
+    parts of a pixel's side (see `SiteLevel.split`). The limit of iterations covers all images
+    together. If the sharp image cannot be solved, the solution of the sharpest solved image is
+    returned and the reason names its blur; if the sharp image was nearly solved, that solution is.
     """
     solved: list[_Solved] = []
     nearest: Solution | None = None
@@ -474,7 +497,7 @@ def sharpen(
         objective = soften(split(parts), parts * width, parts) if width else sharp
         # weights are squares of lengths
         before = [_Solved(earlier.width, parts**2 * earlier.weights) for earlier in solved[-2:]]
-        for start in _starts(objective, split(parts), width, before, path):
+        for start in path.starts(objective, split(parts), width, before):
             solution = newton(
                 objective,
                 start,
@@ -494,7 +517,9 @@ def sharpen(
             solved.append(_Solved(width, solution.weights / parts**2))
         if solved and not width:
             sharp_below = solved[-1].width / path.retry
-        width = path.next_width(width, solved, level, sharp_below, converged=solution.converged)
+        width = path.next_width(
+            width, solved, max(level.shape), sharp_below, converged=solution.converged
+        )
     answer = _blurred_solution(sharp, solved, level, tolerance)
     used_up = f"the solver used all {max_iterations} iterations allowed"
     if nearest is not None and nearest.residual < min(answer.residual, path.tolerance):
@@ -524,31 +549,7 @@ class _Solved(NamedTuple):
     weights: FloatArray
 
 
-def _starts(
-    objective: TransportObjective, level: Level, width: float, solved: list[_Solved], path: BlurPath
-) -> Iterator[FloatArray]:
-    """Yield the weights to start from, the most promising first."""
-    if not solved:
-        yield np.zeros(len(level.sites))
-        pixels = split_pixels(objective.image.image, objective.image.side)
-        yield with_full_cells(objective, _same_moments(level, pixels))[0]
-        return
-    last = solved[-1]
-    if len(solved) > 1:
-        least = path.least_flux * float(objective.mass.min())
-        slope = (last.weights - solved[-2].weights) / (last.width - solved[-2].width)
-        for share in path.predicted:
-            predicted = last.weights + share * (width - last.width) * slope
-            diagram = objective.diagram_if_full(predicted)
-            if diagram is not None and diagram.masses.min() > least:
-                yield predicted
-                if not width:
-                    return
-                break
-    yield last.weights
-
-
-def _same_moments(level: Level, image: FloatArray) -> FloatArray:
+def _same_moments(level: SiteLevel, image: FloatArray) -> FloatArray:
     """Return the weights of the affine map that gives the source the image's first two moments."""
     pixels = np.indices(image.shape).reshape(2, -1).T.astype(np.float64)
     centre, spread = _moments(level.sites, level.mass)
@@ -577,7 +578,7 @@ def _square_root(matrix: FloatArray) -> FloatArray:
 
 
 def _blurred_solution(
-    sharp: TransportObjective, solved: list[_Solved], level: Level, tolerance: float
+    sharp: TransportObjective, solved: list[_Solved], level: SiteLevel, tolerance: float
 ) -> Solution:
     """Return the sharpest solution, with its residual for the sharp image."""
     width, weights = solved[-1] if solved else _Solved(np.inf, np.zeros(len(level.sites)))

@@ -131,7 +131,7 @@ class Mirrored:
 
 
 @dataclass(frozen=True, eq=False)
-class Level:
+class SiteLevel:
     """The n sites of one level of the multilevel solution."""
 
     sites: FloatArray  # (n, 2); neighbours in the plane are near in the order, mostly
@@ -157,7 +157,7 @@ class Level:
             sense.astype(np.int8),
         )
 
-    def split(self, factor: int) -> Level:
+    def split(self, factor: int) -> SiteLevel:
         """Return the same sites, in px of an image whose pixels are split into factor × factor."""
         if factor == 1:
             return self
@@ -173,7 +173,7 @@ class Level:
         )
 
 
-class Levels(Sequence[Level]):
+class Levels(Sequence[SiteLevel]):
     """Levels, coarse to fine, each computed on first use; a slice shares them.
 
     >>> levels = plan_levels(np.ones((60, 60)), 3600, lloyd_iterations=2).levels
@@ -184,7 +184,7 @@ class Levels(Sequence[Level]):
     def __init__(
         self,
         counts: tuple[int, ...],
-        make: Callable[[int, Reporter], Level],
+        make: Callable[[int, Reporter], SiteLevel],
         slots: dict[int, _Slot] | None = None,
         report: Reporter | None = None,
     ) -> None:
@@ -202,17 +202,17 @@ class Levels(Sequence[Level]):
         return len(self.counts)
 
     @overload
-    def __getitem__(self, number: int) -> Level: ...
+    def __getitem__(self, number: int) -> SiteLevel: ...
 
     @overload
     def __getitem__(self, number: slice) -> Levels: ...
 
-    def __getitem__(self, number: int | slice) -> Level | Levels:
+    def __getitem__(self, number: int | slice) -> SiteLevel | Levels:
         if isinstance(number, slice):
             return Levels(self.counts[number], self._make, self._slots, self._report)
         return self.at(self.counts[number])
 
-    def at(self, count: int) -> Level:
+    def at(self, count: int) -> SiteLevel:
         """Return the level with `count` sites."""
         slot = self._slots.setdefault(count, _Slot())
         while not slot.lock.acquire(timeout=0.05):
@@ -273,7 +273,7 @@ class Levels(Sequence[Level]):
             pool.shutdown(cancel_futures=True)
 
 
-def _refuse_level(count: int, report: Reporter) -> Level:
+def _refuse_level(count: int, report: Reporter) -> SiteLevel:
     raise LookupError(f"there is no level of {count:,} sites")
 
 
@@ -282,7 +282,7 @@ class _Slot:
     """A level, computed or in preparation."""
 
     lock: Any = field(default_factory=Lock, repr=False)
-    level: Level | None = None
+    level: SiteLevel | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,7 +396,7 @@ def plan_levels(
     def density() -> Density:
         return Density.from_image(source, threads=threads)
 
-    def level(count: int, report: Reporter) -> Level:
+    def level(count: int, report: Reporter) -> SiteLevel:
         beam = density()
 
         def on_step(step: int) -> None:
@@ -416,6 +416,6 @@ def plan_levels(
             density.cache_clear()  # it is large, and others are seldom made after the finest
         sites, masses, centroids = triangulation.sites, diagram.masses, diagram.centroids
         triangulation.forget()
-        return Level(sites, masses, centroids, triangulation, beam.shape, steps)
+        return SiteLevel(sites, masses, centroids, triangulation, beam.shape, steps)
 
     return SitePlan(source, Levels(tuple(reversed(counts)), level))

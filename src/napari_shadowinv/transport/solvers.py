@@ -36,14 +36,14 @@ from napari_shadowinv.transport.minimise import (
     newton,
     sharpen,
 )
-from napari_shadowinv.transport.sites import RATIO, Level, Levels, Margin
+from napari_shadowinv.transport.sites import RATIO, Levels, Margin, SiteLevel
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LevelSolution(Solution):
     """A solution and where it moves the n sites of its level."""
 
-    level: Level
+    level: SiteLevel
     threads: int | None
     flux: FloatArray  # (n,): the image's flux in each cell
     # (n, 2), px: centroid of each cell in the image minus that of the same site's cell in the
@@ -53,7 +53,7 @@ class LevelSolution(Solution):
 
     @classmethod
     def of_level(
-        cls, level: Level, objective: TransportObjective, solution: Solution
+        cls, level: SiteLevel, objective: TransportObjective, solution: Solution
     ) -> LevelSolution:
         """Add flux and centroids of the cells to a solution of `objective`."""
         diagram = objective.diagram(solution.weights, with_moments=True)
@@ -193,7 +193,7 @@ def _solve_levels(
 
 
 def _restart(
-    level: Level, target: Target, stalled: Solution | None, report: Reporter | None
+    level: SiteLevel, target: Target, stalled: Solution | None, report: Reporter | None
 ) -> LevelSolution:
     """Solve the finest level from zero weights, because a coarser one stalled."""
     solution = target.solve_blurred_first(level, target.options.tolerance, report)
@@ -236,7 +236,7 @@ def fit_flux_factor(
 
 
 def _solve_from(
-    start: FloatArray, level: Level, target: Target, report: Reporter | None
+    start: FloatArray, level: SiteLevel, target: Target, report: Reporter | None
 ) -> LevelSolution | None:
     """Solve one level from similar weights; return None if that does not converge quickly.
 
@@ -275,7 +275,7 @@ class Target:
     def of(cls, image: FloatArray, margin: Margin | None, options: InversionOptions) -> Target:
         return cls(Density.from_image(image, threads=options.threads), margin, options)
 
-    def objective(self, level: Level) -> TransportObjective:
+    def objective(self, level: SiteLevel) -> TransportObjective:
         """Pose the problem for the sites of a level."""
         threads = self.options.threads
         if self.margin is not None:
@@ -285,7 +285,7 @@ class Target:
         triangulation = level.triangulation.copy()
         return TransportObjective(triangulation, level.mass, self.density, threads=threads)
 
-    def blurred_objective(self, level: Level, blur: float, factor: int) -> TransportObjective:
+    def blurred_objective(self, level: SiteLevel, blur: float, factor: int) -> TransportObjective:
         """Pose it for pixels split by a factor along each side, then blurred by `blur` of them."""
         pixels = split_pixels(self.density.image, factor)
         margin = self.margin and self.margin.split(factor)
@@ -298,7 +298,7 @@ class Target:
         return target.objective(level)
 
     def solve_blurred_first(
-        self, level: Level, tolerance: float, report: Reporter | None
+        self, level: SiteLevel, tolerance: float, report: Reporter | None
     ) -> Solution:
         """Solve a level from zero weights, by way of blurred images."""
         sharp, most = self.objective(level), self.options.max_iterations
