@@ -187,10 +187,9 @@ class MoveLimits:
     """How far a comparison may move films; chosen by ``benchmarks/film_pack.py``.
 
     Of corners, over the error of both films' edges: less if no third film of their kind confirms
-    it, because what moves may be the beam. A triangle of comparisons may stay open by the larger
-    gap. Fields displace what films show by different amounts, too: of films with exact edges, by
-    which fields came out 4 to 6 % wrong, images shifted by less than `from_edges` made it 10 to
-    17 %.
+    it, because the beam may have moved. A triangle of comparisons may stay open by the larger gap.
+    Fields displace the structure by different amounts, too: of films with exact edges, by which
+    fields came out 4 to 6 % wrong, images shifted by less than `from_edges` made it 10 to 17 %.
     """
 
     confirmed: float = 4.0
@@ -331,9 +330,9 @@ def check_orientation(
     """Reject films that lie another way round than most films do, and name all of them.
 
     Neighbours must show the same large structure, turned or mirrored: where the films show too
-    little, or their structure is symmetric, they are not rejected. The structure is that of means
-    over `block` px. Turned over, it must correlate better than `correlation`, and lack at most
-    `deficit_ratio` of what it lacks to a correlation of 1 as it lies.
+    little, or their structure is symmetric, they are not rejected. Means over `block` px are
+    compared. Turned over, a film must correlate better than `correlation`, with a deficit from 1
+    below `deficit_ratio` of its deficit as it lies.
 
     Raises
     ------
@@ -494,7 +493,7 @@ def _fit_poses(pairs: list[_Pair], edges: FloatArray, turn_error: float) -> Pose
 
 
 def _greatest_correlation(first: FloatArray, second: FloatArray, *, steps: int = 1) -> float:
-    """Of two images with their known shares, over shifts by so many pixels."""
+    """Of two images with their known shares, over shifts by a few pixels."""
     greatest = -1.0
     for shift in product(range(-steps, steps + 1), repeat=2):
         on_first = tuple(slice(max(0, step) or None, min(0, step) or None) for step in shift)

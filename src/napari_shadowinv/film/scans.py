@@ -46,7 +46,7 @@ class _CornerRow(CheckedModel):
 
 @dataclass(frozen=True)
 class SideFit:
-    """How films are told from the bed, and lines laid along their sides; lengths in px."""
+    """Search for films on the bed, and for lines along their sides; lengths in px."""
 
     brightness: float = 0.75  # of a film, over the bed's, in the film's darkest colour
     dust: int = 2
@@ -60,7 +60,7 @@ class SideFit:
 
 @dataclass(frozen=True)
 class MarkCheck:
-    """What is a mark on a film; chosen by the tests of films with writing and without."""
+    """Limits of a mark on a film, chosen by the tests of films with writing and without."""
 
     sampling: int = 8  # px between the samples of the smooth background
     background: int = 13  # samples, side of the median that gives the background
@@ -75,7 +75,7 @@ class MarkCheck:
 
 @dataclass(frozen=True)
 class BurnCheck:
-    """What is a burnt edge, measured on real EBT3: 1.6 to 40 times the dose, over in 8 to 38 px."""
+    """Limits of a burnt edge; on real EBT3: 1.6 to 40 times the dose, over in 8 to 38 px."""
 
     depth: int = 40  # px, at most
     cut: int = 3  # px, the outermost, which are partly bed
@@ -100,7 +100,7 @@ def find_films(
     least_side : float, optional
         Smaller side of the smallest film in px. Default: a seventh of the scan's.
     sides : SideFit, optional
-        How films are told from the bed, and their sides found.
+        Limits of the search.
 
     Returns
     -------
@@ -387,7 +387,7 @@ def usable_pixels(
     rim : int, default 6
         Pixels along the edges that do not count.
     marks : MarkCheck, optional
-        What is a mark.
+        Limits of a mark.
 
     Returns
     -------
@@ -442,7 +442,7 @@ def burnt_edges(dose: ArrayLike, *, burn: BurnCheck = BurnCheck()) -> BoolArray:
     dose : array_like, shape (H, W)
         Dose of an upright film, positive.
     burn : BurnCheck, optional
-        What is a burnt edge.
+        Limits of a burnt edge.
 
     Returns
     -------

@@ -409,7 +409,7 @@ def length_unit(length: float) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class UsualGeometry:
-    """What common experiments have; those of ``benchmarks/wrong_inputs.py`` are beyond it."""
+    """Limits of common experiments; mistakes in ``benchmarks/wrong_inputs.py`` are beyond them."""
 
     pixels: tuple[float, float] = (10e-9, 1e-3)  # m, at the object
     detector_pixel: float = 3e-6  # m, at least: no film scanner or plate reader resolves less
@@ -471,7 +471,7 @@ def setup_warnings(
     metadata : mapping, optional
         Of the image, with the ``geometry`` in its file and the factor of its ``bin``.
     usual : UsualGeometry, optional
-        What is not doubtful.
+        Limits of common experiments.
 
     Returns
     -------
@@ -502,7 +502,7 @@ def deflection_warnings(
     displacement : ndarray, shape (2, H, W)
         In px of the object plane.
     usual : UsualGeometry, optional
-        What is not doubtful.
+        Limits of common experiments.
     """
     largest = float(np.nanmax(np.hypot(*displacement), initial=0.0))
     angle, main = float(setup.deflection_angle(largest)), setup.main_field.name

@@ -534,7 +534,7 @@ def _parts(
 ) -> int:
     """Return the number of parts into which a pixel's side is split for a blur in px.
 
-    A blur by so many parts hides them; there are at most so many parts and pixels.
+    A blur by `hidden` parts hides them; `most` limits the parts, and `pixels` all of the image's.
     """
     parts, area = 1, shape[0] * shape[1]
     while 0 < width * parts < hidden and parts < most and 4 * parts**2 * area <= pixels:
