@@ -13,7 +13,7 @@ from scipy.io import savemat
 
 from napari_shadowinv import FileFormatError, InputError, read
 from napari_shadowinv.io import hdf5, read_radiograph
-from napari_shadowinv.io.frames import Frame, find_frames, images_in, left_out_of
+from napari_shadowinv.io.frames import FileFrame, find_frames, images_in, left_out_of
 from napari_shadowinv.io.read_write import read_frame
 
 CUBE = np.arange(2 * 3 * 5 * 7, dtype=np.uint16).reshape(2, 3, 5, 7)
@@ -111,10 +111,10 @@ def test_frame_that_is_not_written_yet_is_refused(tmp_path):
         data[:2] = 7
         data[2, :4] = 7
         file.create_dataset("never", (4, 8, 8), "u2")
-    assert read_frame(Frame(path, "data[1]", 1, "data")).image.min() == 7
+    assert read_frame(FileFrame(path, "data[1]", 1, "data")).image.min() == 7
     for number, name in ((2, "data"), (3, "data"), (0, "never")):
         with pytest.raises(FileFormatError, match=f"does not hold frame {number} of '/{name}' yet"):
-            read_frame(Frame(path, name, number, name))
+            read_frame(FileFrame(path, name, number, name))
 
 
 def test_filter_that_is_not_installed_is_named(tmp_path, monkeypatch):
@@ -191,7 +191,7 @@ def write_spe(path: Path, frames: np.ndarray) -> None:
     body = b"".join(frame.astype("<u2").tobytes() + b"\xff" * 8 for frame in frames)
     struct.pack_into("<Q", header, 678, 4100 + len(body))
     size = 2 * height * width
-    footer = f'<DataBlock type="Frame" count="{count}" size="{size}" stride="{size + 8}">'
+    footer = f'<DataBlock type="FileFrame" count="{count}" size="{size}" stride="{size + 8}">'
     path.write_bytes(bytes(header) + body + footer.encode())
 
 

@@ -11,12 +11,19 @@ from helpers.command_line import flat, shadowinv
 from napari_shadowinv._napari.stores import shot_rows
 from napari_shadowinv.io import store_columns
 from napari_shadowinv.io.store import StackStore
-from napari_shadowinv.io.store_columns import COLUMNS, FITS, INVERSIONS, ROWS, Column, columns_of
+from napari_shadowinv.io.store_columns import (
+    COLUMNS,
+    FITS,
+    INVERSIONS,
+    ROWS,
+    ShotColumn,
+    columns_of,
+)
 
 
 @pytest.fixture
-def site_column(monkeypatch) -> Column:
-    column = Column(
+def site_column(monkeypatch) -> ShotColumn:
+    column = ShotColumn(
         "site_count",
         "Number of sites",
         title="places",

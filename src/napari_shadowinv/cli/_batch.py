@@ -49,7 +49,7 @@ from napari_shadowinv.physics.setup import beam_quantities
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from napari_shadowinv.io.store_columns import Column as StoreColumn
+    from napari_shadowinv.io.store_columns import ShotColumn
     from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunStatus
@@ -342,7 +342,7 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     return tables, is_damaged
 
 
-def _column_table(store: StackStore, columns: Sequence[StoreColumn]) -> Table:
+def _column_table(store: StackStore, columns: Sequence[ShotColumn]) -> Table:
     shots = Table(box=box.SIMPLE, pad_edge=False)
     for heading in ("shot", "name"):
         shots.add_column(heading, overflow="fold")

@@ -40,7 +40,7 @@ FRAMES_FORMAT = "shadowinv frames"
 
 
 @dataclass(frozen=True)
-class Frame:
+class FileFrame:
     """One image of a file."""
 
     path: Path
@@ -118,7 +118,7 @@ def _files_in(folder: Path) -> list[Path]:
 
 def find_frames(
     path: str | Path, variable: str | None = None, *, numbered: bool = True
-) -> list[Frame]:
+) -> list[FileFrame]:
     """Return the frames of a TIFF, of an array of an HDF5 file, of a folder or of a pattern.
 
     Parameters
@@ -133,7 +133,7 @@ def find_frames(
 
     Returns
     -------
-    list of Frame
+    list of FileFrame
         Without a number where a file holds one image. The files of a folder or pattern are opened
         only to count the frames in their arrays.
 
@@ -162,40 +162,40 @@ def find_frames(
     else:
         files = [file]
     if not numbered or variable is None:
-        return [Frame(each, text_of(each.name), variable=variable) for each in files]
+        return [FileFrame(each, text_of(each.name), variable=variable) for each in files]
     if len(files) == 1:
         return _frames_of_file(files[0], variable)
     return [frame for each in files for frame in _readable_frames(each, variable)]
 
 
-def _readable_frames(path: Path, variable: str) -> list[Frame]:
+def _readable_frames(path: Path, variable: str) -> list[FileFrame]:
     """Return the frames of one file among many, which fails alone if it cannot be read."""
     try:
         return _frames_of_file(path, variable)
     except (OSError, ValueError):
-        return [Frame(path, text_of(path.name), variable=variable)]
+        return [FileFrame(path, text_of(path.name), variable=variable)]
 
 
 @as_file_errors
-def _frames_of_file(path: Path, variable: str | None = None) -> list[Frame]:
+def _frames_of_file(path: Path, variable: str | None = None) -> list[FileFrame]:
     """Return the pages of a TIFF, or the frames of an array."""
     name, file_format = text_of(path.name), format_of(path)
     variable = file_format.array_name(path, variable)
     axes = file_format.count_frames(path, variable)
     if math.prod(axes) == 1:
-        return [Frame(path, name, variable=variable)]
+        return [FileFrame(path, name, variable=variable)]
     return [
-        Frame(path, f"{name}[{','.join(map(str, index))}]", number, variable)
+        FileFrame(path, f"{name}[{','.join(map(str, index))}]", number, variable)
         for number, index in enumerate(np.ndindex(*axes))
     ]
 
 
-def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], Shot]) -> xarray.Dataset:
+def lazy_frames(frames: Sequence[FileFrame], read: Callable[[FileFrame], Shot]) -> xarray.Dataset:
     """Describe frames as a dataset whose images dask reads on demand.
 
     Parameters
     ----------
-    frames : sequence of Frame
+    frames : sequence of FileFrame
     read : callable
         Returns a frame. The first is read now.
 
@@ -232,7 +232,9 @@ def lazy_frames(frames: Sequence[Frame], read: Callable[[Frame], Shot]) -> xarra
     )
 
 
-def _read_block(read: Callable[[Frame], Shot], frame: Frame, shape: tuple[int, ...]) -> AnyArray:
+def _read_block(
+    read: Callable[[FileFrame], Shot], frame: FileFrame, shape: tuple[int, ...]
+) -> AnyArray:
     image = read(frame).image
     if image.shape != shape:
         raise FileFormatError(

@@ -111,7 +111,7 @@ def image_names(path: Path) -> list[str]:
         default = _member_or_default(path, file, "/")
         if default is not None and not _reason(default):
             return [str(default.name)]
-        names = [entry.name for entry in _entries(file) if not entry.reason]
+        names = [entry.name for entry in _objects(file) if not entry.reason]
         return [name for name in names if not name.endswith("pixel_mask")]
 
 
@@ -179,7 +179,7 @@ def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:
     return all(chunk.byte_offset is not None for chunk in chunks)
 
 
-class _Entry(NamedTuple):
+class _HDF5Object(NamedTuple):
     """An array in a file, and the reason why it is no image; empty if it is one."""
 
     name: str
@@ -193,11 +193,11 @@ class _Entry(NamedTuple):
 
 def list_arrays(file: Any, name: str = "") -> str:
     """Describe the first arrays of an open file, or those with a name most like `name`."""
-    entries = list(_entries(file))
+    entries = list(_objects(file))
     if name:
         matcher = difflib.SequenceMatcher(b=name.strip("/").lower())
 
-        def likeness(entry: _Entry) -> float:
+        def likeness(entry: _HDF5Object) -> float:
             matcher.set_seq1(entry.name.lower())
             return matcher.ratio()
 
@@ -210,7 +210,7 @@ def list_arrays(file: Any, name: str = "") -> str:
     return ", ".join([*names, *more]) or "no array"
 
 
-def _entries(file: Any) -> Iterator[_Entry]:
+def _objects(file: Any) -> Iterator[_HDF5Object]:
     """Yield the arrays of a file once each, from the top down; others' files are not followed."""
     import h5py
 
@@ -224,7 +224,7 @@ def _entries(file: Any) -> Iterator[_Entry]:
             link = group.id.links.get_info(name.encode())
             if link.type == h5py.h5l.TYPE_EXTERNAL:
                 target = group.id.links.get_val(name.encode())[0].decode(errors="replace")
-                yield _Entry(f"{prefix}{name}", "", f"in another file, {target!r}")
+                yield _HDF5Object(f"{prefix}{name}", "", f"in another file, {target!r}")
             if link.type != h5py.h5l.TYPE_HARD:
                 continue
             item = group[name]
@@ -235,7 +235,7 @@ def _entries(file: Any) -> Iterator[_Entry]:
             if isinstance(item, h5py.Group):
                 groups.append((f"{prefix}{name}/", item))
             elif isinstance(item, h5py.Dataset) and item.shape:
-                yield _Entry(f"{prefix}{name}", _size_text(item), _reason(item))
+                yield _HDF5Object(f"{prefix}{name}", _size_text(item), _reason(item))
 
 
 def _size_text(dataset: Any) -> str:

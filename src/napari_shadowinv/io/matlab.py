@@ -54,7 +54,7 @@ _Bytes: TypeAlias = bytes | memoryview
 
 
 @dataclass(frozen=True)
-class Variable:
+class MatlabArray:
     """An array in a MAT-file, read when `load` is called; the shape is as MATLAB shows it."""
 
     name: str
@@ -119,7 +119,7 @@ def count_mat(path: Path, variable: str | None = None) -> tuple[int, ...]:
 
 
 @as_file_errors
-def mat_variables(path: Path) -> list[Variable]:
+def mat_variables(path: Path) -> list[MatlabArray]:
     """List the variables of a MAT-file in its order, without their values."""
     with path.open("rb") as file:
         head = file.read(_HDF5_OFFSET + 4)
@@ -137,7 +137,7 @@ def image_names(path: Path) -> list[str]:
     return [variable.name for variable in mat_variables(path) if variable.is_image]
 
 
-def _choose_image(path: Path, name: str | None) -> tuple[Variable, tuple[int, ...] | None]:
+def _choose_image(path: Path, name: str | None) -> tuple[MatlabArray, tuple[int, ...] | None]:
     """Return the only image or the named one, and the index of a frame that the name ends with."""
     variables, index = mat_variables(path), None
     if name is not None and (match := FRAME_INDEX.fullmatch(name)):
@@ -163,14 +163,14 @@ def _choose_image(path: Path, name: str | None) -> tuple[Variable, tuple[int, ..
     return images[0], index
 
 
-def _describe_variable(path: Path, name: str, item: Any) -> Variable:
+def _describe_variable(path: Path, name: str, item: Any) -> MatlabArray:
     import h5py
 
     mark = item.attrs.get("MATLAB_class", b"")
     type_name = mark.decode() if isinstance(mark, bytes) else str(mark)
     if not isinstance(item, h5py.Dataset) or "MATLAB_empty" in item.attrs:
         shape: tuple[int, ...] = (0, 0) if isinstance(item, h5py.Dataset) else (1, 1)
-        return Variable(name, shape, type_name or "struct", lambda: np.empty(shape))
+        return MatlabArray(name, shape, type_name or "struct", lambda: np.empty(shape))
     if item.dtype.names is not None:
         type_name = f"complex {type_name}".rstrip()
     if not type_name:
@@ -181,10 +181,10 @@ def _describe_variable(path: Path, name: str, item: Any) -> Variable:
             return load_dataset(path, member(path, file, name)).T
 
     # HDF5 counts its axes from the other end than MATLAB does.
-    return Variable(name, item.shape[::-1], type_name, load)
+    return MatlabArray(name, item.shape[::-1], type_name, load)
 
 
-def _variables_5(path: Path, file: BinaryIO) -> Iterator[Variable]:
+def _variables_5(path: Path, file: BinaryIO) -> Iterator[MatlabArray]:
     """Variables of MATLAB's own layout: their headers are read, not yet their values."""
     size = path.stat().st_size
     order = _byte_order(file)
@@ -203,7 +203,9 @@ def _variables_5(path: Path, file: BinaryIO) -> Iterator[Variable]:
             name, shape, type_name, _ = _read_preamble(body, order)
             check_promise(path, "MATLAB", math.prod(shape), DEFLATE_RATIO * count)
             if name:
-                yield Variable(name, shape, type_name, partial(_load_5, path, start, count, shape))
+                yield MatlabArray(
+                    name, shape, type_name, partial(_load_5, path, start, count, shape)
+                )
         start += 8 + count
 
 

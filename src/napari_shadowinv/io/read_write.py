@@ -31,7 +31,7 @@ from napari_shadowinv.io.formats import (
     function,
     suffixes_for,
 )
-from napari_shadowinv.io.frames import Frame, find_frames, lazy_frames
+from napari_shadowinv.io.frames import FileFrame, find_frames, lazy_frames
 from napari_shadowinv.io.hdf5 import (
     check_arrays,
     check_hdf5_seal,
@@ -106,7 +106,7 @@ def _read(path: Path, channel: str | int | None, variable: str | None) -> Shot |
     return _read_file(frames[0].path, channel, frames[0].variable)
 
 
-def read_frame(frame: Frame, *, channel: str | int | None = None) -> Shot:
+def read_frame(frame: FileFrame, *, channel: str | int | None = None) -> Shot:
     """Read one of the frames that a path stands for, with the errors of `read_radiograph`."""
     if frame.number is None:
         return read_radiograph(frame.path, channel=channel, variable=frame.variable)

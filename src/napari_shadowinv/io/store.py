@@ -31,7 +31,7 @@ from napari_shadowinv.inversion.variables import (
 )
 from napari_shadowinv.io.files import check_folder_of
 from napari_shadowinv.io.formats import STORE
-from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, Column, columns_of
+from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, ShotColumn, columns_of
 from napari_shadowinv.io.store_damage import (
     Damage,
     Status,
@@ -81,7 +81,7 @@ def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
     return str(names[0]) if names else None
 
 
-def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[Column, ...]:
+def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[ShotColumn, ...]:
     """Return the columns of a store, by its attributes."""
     if fitted_field(attributes) is not None:
         return columns_of(FITS)
@@ -114,7 +114,7 @@ class StackStore:
     ----------
     field : str or None
         The fitted field; None where shots were inverted.
-    columns : tuple of Column
+    columns : tuple of ShotColumn
         The quantities that it lists of each shot.
     """
 
@@ -174,7 +174,7 @@ def check_files(store: StackStore) -> None:
 
 
 @as_file_errors
-def _contents(_: Path, attributes: Mapping[Any, Any]) -> tuple[str | None, tuple[Column, ...]]:
+def _contents(_: Path, attributes: Mapping[Any, Any]) -> tuple[str | None, tuple[ShotColumn, ...]]:
     return fitted_field(attributes), columns_of_store(attributes)
 
 

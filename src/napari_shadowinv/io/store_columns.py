@@ -26,7 +26,7 @@ FITS = "fits"
 
 
 @dataclass(frozen=True)
-class Column:
+class ShotColumn:
     """Quantity of each shot of a store."""
 
     key: str  # name of its array and of its entry in a shot's report
@@ -75,8 +75,8 @@ class Column:
         return format(report[self.entry], self.format) if self.entry in report else ""
 
 
-_of_inversions = partial(Column, stores=(INVERSIONS, ROWS))
-_of_fits = partial(Column, stores=(FITS,))
+_of_inversions = partial(ShotColumn, stores=(INVERSIONS, ROWS))
+_of_fits = partial(ShotColumn, stores=(FITS,))
 
 
 def _error(part: str) -> Callable[[Any], float]:
@@ -86,9 +86,9 @@ def _error(part: str) -> Callable[[Any], float]:
 
 
 # In the order of all tables.
-COLUMNS: tuple[Column, ...] = (
-    Column("seconds", "Time its worker spent on the shot", unit="s"),
-    Column(
+COLUMNS: tuple[ShotColumn, ...] = (
+    ShotColumn("seconds", "Time its worker spent on the shot", unit="s"),
+    ShotColumn(
         "verdict",
         "Whether the field may be believed",
         kind=str,
@@ -96,7 +96,7 @@ COLUMNS: tuple[Column, ...] = (
         format="s",
         width=len("determined"),  # not broken into letters
     ),
-    Column(
+    ShotColumn(
         "cautions",
         "Codes of the reasons to doubt the result",
         kind=str,
@@ -116,13 +116,13 @@ COLUMNS: tuple[Column, ...] = (
         value=attrgetter("folded"),
         format=".1%",
     ),
-    Column(
+    ShotColumn(
         "total_error",
         "Error of the displacement, r.m.s., as a share of it",
         title="errors",
         value=attrgetter("total_error"),
     ),
-    Column(
+    ShotColumn(
         "limited_by",
         "Largest part of the error, as a share of the displacement",
         kind=str,
@@ -130,7 +130,7 @@ COLUMNS: tuple[Column, ...] = (
         format="s",
         width=len("beam 12 %"),
     ),
-    Column(
+    ShotColumn(
         "converged", "Whether the solver converged", kind=bool, value=attrgetter("report.converged")
     ),
     _of_inversions(
@@ -168,18 +168,18 @@ COLUMNS: tuple[Column, ...] = (
 )
 
 
-def columns_of(store: str, setup_kind: str = "proton") -> tuple[Column, ...]:
+def columns_of(store: str, setup_kind: str = "proton") -> tuple[ShotColumn, ...]:
     """Return the columns of a kind of stores, with the energy or wavelength of a table's shots."""
     first, *others = (column for column in COLUMNS if store in column.stores)
     beam = (_beam_column(setup_kind),) if store == ROWS else ()
     return (first, *beam, *others)
 
 
-def _beam_column(setup_kind: str) -> Column:
+def _beam_column(setup_kind: str) -> ShotColumn:
     from napari_shadowinv.physics.setup import SETUPS
 
     quantity = SETUPS.get(setup_kind, SETUPS["proton"]).beam_quantity()
-    return Column(
+    return ShotColumn(
         quantity.name,
         quantity.long_name,
         title=quantity.noun if quantity.unit == "m" else quantity.unit,

@@ -42,7 +42,7 @@ from napari_shadowinv.io.store import (
     columns_of_store,
     read_attributes,
 )
-from napari_shadowinv.io.store_columns import Column
+from napari_shadowinv.io.store_columns import ShotColumn
 from napari_shadowinv.io.store_damage import chunk_file, fields_of, is_along_shots
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
@@ -122,7 +122,7 @@ class ShotWriter:
                 chunk_file(self.path, group[name], index).unlink(missing_ok=True)
 
     def write_columns(
-        self, columns: Sequence[Column], reports: Sequence[Mapping[str, Any]], shots: slice
+        self, columns: Sequence[ShotColumn], reports: Sequence[Mapping[str, Any]], shots: slice
     ) -> None:
         """Gather the columns of some shots from their reports, as far as the store has them."""
         arrays = self.arrays()
@@ -162,7 +162,7 @@ def summarise(store: StackStore) -> None:
 
 
 @dataclass(frozen=True)
-class Variable:
+class StoreArray:
     """Array of a store to create."""
 
     dims: tuple[str, ...]
@@ -180,8 +180,8 @@ class Contents:
     """Content of a store to create: arrays, lengths of dimensions, attributes of all shots."""
 
     sizes: Mapping[str, int]
-    variables: Mapping[str, Variable]
-    coordinates: Mapping[str, Variable]
+    variables: Mapping[str, StoreArray]
+    coordinates: Mapping[str, StoreArray]
     attributes: Mapping[str, Any]
 
 
@@ -278,7 +278,7 @@ def _write_template(path: Path, contents: Contents) -> None:
         zarr.consolidate_metadata(path)
 
 
-def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Variable]:
+def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, StoreArray]:
     status = {
         "units": "1",
         "long_name": "Status of the shot",
@@ -287,20 +287,20 @@ def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Vari
     }
     report = {"units": "1", "long_name": "Report, or reason for failure (JSON)"}
     variables = {
-        "status": Variable(("shot",), np.dtype("int8"), status),
-        "report": Variable(("shot",), str, report),
+        "status": StoreArray(("shot",), np.dtype("int8"), status),
+        "report": StoreArray(("shot",), str, report),
     }
     columns = columns_of_store(attributes)
-    return variables | {column.key: _variable_of(column, shots) for column in columns}
+    return variables | {column.key: _array_of(column, shots) for column in columns}
 
 
-def _variable_of(column: Column, shots: int) -> Variable:
+def _array_of(column: ShotColumn, shots: int) -> StoreArray:
     dtype = str if column.kind is str else np.dtype(column.kind)
     fill: AnyArray = np.full(shots, column.fill, dtype=column.dtype)
-    return Variable(("shot",), dtype, column.labels, fill)
+    return StoreArray(("shot",), dtype, column.labels, fill)
 
 
-def _create_array(group: Any, name: str, variable: Variable, sizes: Mapping[str, int]) -> None:
+def _create_array(group: Any, name: str, variable: StoreArray, sizes: Mapping[str, int]) -> None:
     shape = tuple(sizes[dim] for dim in variable.dims)
     # A chunk is one file. Values of the start are in few files, with room for new shots; others in
     # a file for each shot.

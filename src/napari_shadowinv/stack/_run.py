@@ -46,7 +46,7 @@ from napari_shadowinv.io.store_writing import (
     NUMBERED_AS_ARRIVED,
     Contents,
     ShotWriter,
-    Variable,
+    StoreArray,
     create_store,
     grow_store,
     remove_unfinished,
@@ -402,7 +402,7 @@ def contents_of(stack: Stack) -> Contents:
     return Contents(stack.sizes, _variables(stack), _coordinates(stack), attributes)
 
 
-def _coordinates(stack: Stack) -> dict[str, Variable]:
+def _coordinates(stack: Stack) -> dict[str, StoreArray]:
     import xarray as xr
 
     coordinates = {}
@@ -416,12 +416,12 @@ def _coordinates(stack: Stack) -> dict[str, Variable]:
         is_text = values.dtype.kind in "UO"
         values = values.astype(object) if is_text else values
         dims, dtype = tuple(map(str, labelled.dims)), str if is_text else values.dtype
-        coordinates[name] = Variable(dims, dtype, attributes, values)
+        coordinates[name] = StoreArray(dims, dtype, attributes, values)
     return coordinates
 
 
-def _variables(stack: Stack) -> dict[str, Variable]:
-    variables: dict[str, Variable] = {}
+def _variables(stack: Stack) -> dict[str, StoreArray]:
+    variables: dict[str, StoreArray] = {}
     for name, (dims, labels) in stack.task.labels.items():
         if name not in stack.task.variables:
             continue
@@ -429,9 +429,9 @@ def _variables(stack: Stack) -> dict[str, Variable]:
         stored = dtype_of(name) if exact else np.dtype(stack.dtype)
         if stack.beam is not None and stack.is_shared(name):
             values = np.asarray(values_of_beam(stack.beam, stack.task.recipe.options)[name])
-            variables[name] = Variable(dims, stored, labels, values)
+            variables[name] = StoreArray(dims, stored, labels, values)
         else:
-            variables[name] = Variable(("shot", *dims), stored, labels, None)
+            variables[name] = StoreArray(("shot", *dims), stored, labels, None)
     return variables
 
 

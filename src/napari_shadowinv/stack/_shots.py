@@ -29,7 +29,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import name_of, sha256, split_address, text_of
 from napari_shadowinv.io.formats import HDF5, PRADFORMAT, TEXT, format_of
-from napari_shadowinv.io.frames import Frame, find_frames
+from napari_shadowinv.io.frames import FileFrame, find_frames
 from napari_shadowinv.io.read_write import read_frame
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline.files import read_part
@@ -285,7 +285,7 @@ def read_shot(
     ndarray or MaskedArray, shape (H, W)
         Masked where the file says that pixels do not count.
     """
-    shot = read_frame(Frame(path, str(path), page, variable), channel=channel)
+    shot = read_frame(FileFrame(path, str(path), page, variable), channel=channel)
     if warnings is not None:
         warnings.extend(file_doubts(shot))
     return shot.image if shot.mask is None else np.ma.MaskedArray(shot.image, ~shot.mask)
@@ -406,7 +406,7 @@ def _shots_at(path: str, reader: Reader) -> list[Exposure]:
     return _shots_of(find_frames(path, **_parts_of(path, reader)), reader)
 
 
-def _shots_of(frames: Sequence[Frame], reader: Reader) -> list[Exposure]:
+def _shots_of(frames: Sequence[FileFrame], reader: Reader) -> list[Exposure]:
     names = _distinct_names(frames)
     return [
         Exposure(name, FileReference(frame.path.absolute(), reader, frame.number, frame.variable))
@@ -417,17 +417,17 @@ def _shots_of(frames: Sequence[Frame], reader: Reader) -> list[Exposure]:
 def _shots_of_files(paths: Sequence[str | Path], reader: Reader) -> list[Exposure]:
     if not paths:
         raise InputError("shots are an empty list: expected at least one path")
-    frames: list[Frame] = []
+    frames: list[FileFrame] = []
     for path in paths:
         parts = _parts_of(str(path), reader)
         if split_address(path, parts["variable"])[1] is None:
-            frames.append(Frame(Path(path), text_of(Path(path).name)))
+            frames.append(FileFrame(Path(path), text_of(Path(path).name)))
         else:
             frames += find_frames(path, **parts)
     return _shots_of(frames, reader)
 
 
-def _distinct_names(frames: Sequence[Frame]) -> tuple[str, ...]:
+def _distinct_names(frames: Sequence[FileFrame]) -> tuple[str, ...]:
     """Return the names of frames, with their folders if they differ only there."""
     names = tuple(frame.name for frame in frames)
     if len(set(names)) < len(names):
@@ -565,7 +565,7 @@ def table_shots(
         ]
     rows, unused = rows_to_invert(table)
     shots = []
-    files = [Frame(row.file, name_of(row.file)) for row in rows]
+    files = [FileFrame(row.file, name_of(row.file)) for row in rows]
     for name, row in zip(_distinct_names(files), _with_absolute_paths(rows), strict=True):
         setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
         images = RowsReference((row,), recipe, channel, variable, True, setup, unused)
