@@ -98,7 +98,7 @@ def test_a_pack_that_stops_all_is_refused() -> None:
     [
         ({"film": "HD-V2"}, "has no entry under [films]: did you mean 'HDV2'?"),
         ({"film": "EBT3", "filters": [{"material": "Wood", "thickness": 1e-4}]}, "has 'Wood'"),
-        ({"film": "EBT3", "filters": [{"material": "Al", "thickness": 25}]}, "less than or equal"),
+        ({"film": "EBT3", "filters": [{"material": "Al", "thickness": 25}]}, "must be at most"),
     ],
 )
 def test_unknown_films_and_materials_are_refused(layer: dict, message: str) -> None:

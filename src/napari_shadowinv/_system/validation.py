@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
-from pydantic._internal._model_construction import ModelMetaclass
 
 from napari_shadowinv.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
+
+# The model that has a wrong field, the names from the outermost model to it, pydantic's details.
+_Mistake = tuple[type[BaseModel], list[str], dict[str, Any]]
 
 # Name of a bound in pydantic: its key there, and its wording after "it must be".
 _BOUNDS = {
@@ -23,20 +25,6 @@ _BOUNDS = {
     "less_than": ("lt", "less than"),
     "less_than_equal": ("le", "at most"),
 }
-
-
-class _CheckedMeta(ModelMetaclass):
-    """Metaclass whose classes, when called, raise an `InputError` with one sentence."""
-
-    # Only a call by name comes here: models inside of others are made by pydantic, which collects
-    # their errors.
-    if not TYPE_CHECKING:
-
-        def __call__(self, *args: Any, **values: Any) -> Any:
-            try:
-                return super().__call__(*args, **values)
-            except ValidationError as error:
-                raise FieldError(self, error, self.__name__) from error
 
 
 class FieldError(InputError):
@@ -49,9 +37,10 @@ class FieldError(InputError):
         where: str,
         names: Mapping[str, str] | None = None,
     ) -> None:
-        super().__init__(_error_sentence(model_class, error, where, names or {}))
+        self.mistakes = list(_mistakes_in(model_class, error))
+        super().__init__(_error_sentence(self.mistakes, where, names or {}))
         labels = labels_of(model_class) | dict(names or {})
-        self.labelled = _error_sentence(model_class, error, where, labels)
+        self.labelled = _error_sentence(self.mistakes, where, labels)
 
     def about(self, name: object) -> InputError:  # type: ignore[override]
         return InputError(f"{name}: {self}")
@@ -80,7 +69,7 @@ class CombinationError(ValueError):
         return self.text(repr)
 
 
-class CheckedModel(BaseModel, metaclass=_CheckedMeta):
+class CheckedModel(BaseModel):
     """Model that refuses a wrong value with an `InputError` of one sentence.
 
     It cannot be changed and has no other fields. A field that is described has its name as its
@@ -89,6 +78,14 @@ class CheckedModel(BaseModel, metaclass=_CheckedMeta):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
+
+    if not TYPE_CHECKING:  # the fields are the arguments
+
+        def __init__(self, /, **values: Any) -> None:
+            try:
+                super().__init__(**values)
+            except ValidationError as error:
+                raise FieldError(type(self), error, type(self).__name__) from error
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
@@ -173,62 +170,41 @@ def suggestion(name: str, choices: Collection[str]) -> str:
     return f"did you mean '{match}'?" if match else f"expected one of {', '.join(choices)}"
 
 
-def _error_sentence(
-    model_class: type[BaseModel], error: ValidationError, where: str, names: Mapping[str, str]
-) -> str:
-    details = error.errors(include_url=False)
+def _mistakes_in(model_class: type[BaseModel], error: ValidationError) -> Iterator[_Mistake]:
+    """Yield the mistakes in a model, and those in the models inside of it."""
+    for detail in error.errors(include_url=False):
+        loc = detail["loc"]
+        # Without tags of unions.
+        path = [str(k) for k in loc if isinstance(k, int) or k in model_class.model_fields]
+        inner = detail.get("ctx", {}).get("error")
+        if isinstance(inner, FieldError):
+            for model, names, each in inner.mistakes:
+                yield model, [*path, *names], each
+        else:
+            is_last = not loc or isinstance(loc[-1], int) or loc[-1] in model_class.model_fields
+            yield model_class, path if is_last else [*path, str(loc[-1])], dict(detail)
+
+
+def _error_sentence(mistakes: Sequence[_Mistake], where: str, names: Mapping[str, str]) -> str:
     intended = {
-        nearest(str(detail["loc"][-1]), _locate(model_class, detail["loc"])[0].model_fields)
-        for detail in details
+        nearest(path[-1], model.model_fields)
+        for model, path, detail in mistakes
         if detail["type"] == "extra_forbidden"
     }
     text = "; ".join(
-        _error_clause(model_class, dict(detail), names)
-        for detail in details
-        if not (detail["type"] == "missing" and detail["loc"][-1] in intended)
+        _error_clause(mistake, names)
+        for mistake in mistakes
+        if not (mistake[2]["type"] == "missing" and mistake[1][-1] in intended)
     )
     return f"{where}: {text}" if where else text
 
 
-def _locate(
-    model_class: type[BaseModel], loc: tuple[int | str, ...]
-) -> tuple[type[BaseModel], list[str]]:
-    """Return the model that contains a value, and the names of the path to it, without unions."""
-    names: list[str] = []
-    models = [model_class]
-    for part in loc:
-        field = models[0].model_fields.get(str(part)) if len(models) == 1 else None
-        if field is not None and part != loc[-1]:
-            names.append(str(part))
-            models = _models_in(field.annotation) or models
-        elif isinstance(part, int) or part == loc[-1]:
-            names.append(str(part))
-        else:  # the tag of a union
-            tagged = [
-                model
-                for base in models
-                for model in (base, *base.__subclasses__())
-                for field in model.model_fields.values()
-                if get_origin(field.annotation) is Literal and field.default == part
-            ]
-            models = tagged or models
-    return models[0], names
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for part in get_args(annotation) for model in _models_in(part)]
-
-
-def _error_clause(
-    model_class: type[BaseModel], detail: dict[str, Any], names: Mapping[str, str]
-) -> str:
+def _error_clause(mistake: _Mistake, names: Mapping[str, str]) -> str:
     def name_of(*path: str) -> str:
         key = ".".join(path)
         return names.get(key, f"'{key}'")
 
-    model, path = _locate(model_class, detail["loc"])
+    model, path, detail = mistake
     kind, context = detail["type"], detail.get("ctx", {})
     if isinstance(error := context.get("error"), CombinationError):
         return error.text(partial(name_of, *path))
