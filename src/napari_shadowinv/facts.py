@@ -60,8 +60,12 @@ def to_figures(value: float, figures: int = 2) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a share in per cent to two figures, such as "2.1 %"."""
-    return f"{to_figures(100 * share)} %"
+    """Write a share in per cent to two figures.
+
+    >>> [percent(share) for share in (0.0214, 0.996, 0.0, 3e-6)]
+    ['2.1 %', '100 %', '0 %', 'below 0.01 %']
+    """
+    return "below 0.01 %" if 0 < share < 1e-4 else f"{to_figures(100 * share)} %"
 
 
 def decimals_of(error: float) -> int:
@@ -285,7 +289,7 @@ def caution_facts(cautions: Iterable[Caution]) -> list[Fact]:
 def masked_fact(mask: BoolArray) -> list[Fact]:
     """Return the share of the pixels that a mask of used pixels excludes, if there are any."""
     excluded = 1 - float(mask.mean())
-    return [Fact("masked", "Masked", f"{excluded:.2%} of the pixels")] if excluded else []
+    return [Fact("masked", "Masked", f"{percent(excluded)} of the pixels")] if excluded else []
 
 
 def error_fact(name: str, text: str) -> Fact:

@@ -409,7 +409,7 @@ def test_info_shows_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
     output = flat(shadowinv("info", "fit.shadowinv").stdout)
     assert "one of several peak " in output
     assert "; 2 different fields explain the data" in output
-    assert "alternative from near: objective +20.00%, displacement 30.00% away" in output
+    assert "alternative from near: objective +20 %, displacement 30 % away" in output
     assert "brightness 1.1, shifted by y" in output
 
 

@@ -29,6 +29,7 @@ from napari_shadowinv.cli import _info, app
 from napari_shadowinv.cli._flags import recipe_of
 from napari_shadowinv.cli._inputs import setup_for
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.film import Pack
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.inversion import Inversion, invert, machine_code
@@ -356,7 +357,7 @@ def test_free_boundary_is_chosen_reported_and_kept(folder: Path) -> None:
     assert inversion.options.margin == 6
     assert inversion.report.flux_left["left"] > 0.001
     text = " ".join(result.stdout.split())
-    assert f"left {inversion.report.flux_left['left']:.2%}" in text
+    assert f"left {percent(inversion.report.flux_left['left'])}" in text
     refused = shadowinv("invert", "shot.npy", "--flux", "known", "--out", "other.shadowinv")
     assert refused.exit_code == 2
     assert "--flux is 'known' and --boundary is 'closed'" in " ".join(refused.stderr.split())

@@ -11,7 +11,7 @@ import pytest
 from helpers.fit_images import bump, counted, distance, fit_images, noisy, on_pixels
 from napari_shadowinv import Instrument, ProtonSetup
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Verdict, percent
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.fitting.descent import coarser
 from napari_shadowinv.fitting.instrument import (
@@ -159,7 +159,9 @@ def test_errors_have_a_part_for_all_that_is_stated() -> None:
     assert parts.keys() - {"edge"} == {"noise", "beam", "background"}
     assert list(parts.values()) == sorted(parts.values(), reverse=True)
     facts = {fact.title: fact.text for fact in result.facts}
-    assert facts["Errors"].startswith(f"{result.report.total:.2%} of the displacement (r.m.s.): ")
+    assert facts["Errors"].startswith(
+        f"{percent(result.report.total)} of the displacement (r.m.s.): "
+    )
     assert all(title in facts["Errors"] for title in ("noise", "beam", "background"))
     assert "background" in facts["Instrument"]
     assert "beam between energies" in facts["Instrument"]

@@ -17,7 +17,7 @@ from scipy import ndimage
 from helpers.public_data import load_donut, public_file, public_names
 from helpers.toroid import noisy_toroid_image, toroid_image
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Verdict, percent
 from napari_shadowinv.inversion import invert, solution_checks
 from napari_shadowinv.inversion.error_budget import ErrorEstimate
 from napari_shadowinv.inversion.noise import ImageNoise
@@ -131,13 +131,13 @@ def test_the_report_has_the_residual_of_the_used_pixels():
     expected = np.sqrt((off**2).mean()) / inversion.image[30:].mean()
     assert inversion.report.image_residual == pytest.approx(expected)
     assert inversion.to_dataset().attrs["image_residual"] == pytest.approx(expected)
-    percent = f"{100 * expected:.3g} %"
+    share = percent(expected)
     residual = next(fact for fact in inversion.facts if fact.key == "image_residual")
-    assert residual.text.startswith(f"{percent} of the mean")
+    assert residual.text.startswith(f"{share} of the mean")
     titles = [
         axes.get_title(loc) for axes in report_figure(inversion).axes for loc in ("left", "center")
     ]
-    assert f"Residual {percent}" in titles
+    assert f"Residual {share}" in titles
 
 
 # The picture does not fit

@@ -252,7 +252,7 @@ class FitReport:
     @property
     def ranking(self) -> str:
         """The parts as shares of the displacement, the largest first."""
-        return ", ".join(f"{TITLES[key]} {share:.2%}" for key, share in self.parts.items())
+        return ", ".join(f"{TITLES[key]} {percent(share)}" for key, share in self.parts.items())
 
     @property
     def error_name(self) -> str:
@@ -376,7 +376,7 @@ class Fit(Summarised):
         report = self.report
         if np.isnan(report.total):
             return
-        text = f"{report.total:.2%} of the displacement (r.m.s.): {report.ranking}"
+        text = f"{percent(report.total)} of the displacement (r.m.s.): {report.ranking}"
         if report.noise_correlation > 0:
             text += f"; noise is correlated over {report.noise_correlation:.1f} px"
         yield error_fact("errors", text)
@@ -389,7 +389,9 @@ class Fit(Summarised):
             yield error_fact("beam", f"{origin}{report.beam.text}")
         names = {each.key: each.name(each.tested) for each in IMPERFECTIONS}
         effects = ", ".join(
-            f"{to_figures(share)} ({names[key]})" if share > 1 else f"{share:.2%} ({names[key]})"
+            f"{to_figures(share)} ({names[key]})"
+            if share > 1
+            else f"{percent(share)} ({names[key]})"
             for key, share in report.sensitivities.items()
             if key not in report.parts
         )
@@ -577,13 +579,13 @@ class Fit(Summarised):
         for solution in alternatives:
             excess = solution.objective / best.objective - 1
             text = (
-                f"{solution.start}: objective {excess:+.2%}, displacement {solution.distance:.2%} "
-                "away"
+                f"{solution.start}: objective +{percent(excess)}, displacement "
+                f"{percent(solution.distance)} away"
             )
             yield Fact("alternative", "Alternative", text)
         yield from masked_fact(self.mask)
         if self.folded:
-            yield Fact("crossed_rays", "Crossed rays", f"{self.folded:.1%} of the pixels")
+            yield Fact("crossed_rays", "Crossed rays", f"{percent(self.folded)} of the pixels")
         if self.report.converged:
             yield Fact("converged", "Converged", f"in {self.report.iterations} iterations")
         else:

@@ -377,15 +377,19 @@ class Inversion(Summarised):
             Fact(
                 "image_residual",
                 "Image residual",
-                f"{100 * report.image_residual:.3g} % of the mean (r.m.s.)",
-                short=f"residual {100 * report.image_residual:.3g} %",
+                f"{percent(report.image_residual)} of the mean (r.m.s.)",
+                short=f"residual {percent(report.image_residual)}",
             ),
             *_significance_facts(self.structures, self.pixel_errors),
             *(error_fact(name, text) for name, text in self._error_rows(errors)),
-            Fact("caustics", "Caustics", f"{self.caustic.mean():.2%} of the pixels"),
+            Fact("caustics", "Caustics", f"{percent(self.caustic.mean())} of the pixels"),
             *masked_fact(self.mask),
             *(
-                Fact(key, title, ", ".join(f"{side} {share:.2%}" for side, share in flow.items()))
+                Fact(
+                    key,
+                    title,
+                    ", ".join(f"{side} {percent(share)}" for side, share in flow.items()),
+                )
                 for key, (title, flow) in flows.items()
                 if flow
             ),

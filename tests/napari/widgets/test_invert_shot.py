@@ -32,6 +32,7 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.facts import percent
 from napari_shadowinv.options import BEAM_SOURCES, DETECTORS
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
@@ -605,7 +606,7 @@ def test_preview_shows_its_verdict_and_residual(
     qtbot.waitUntil(lambda: len(tool.previewed.layers) == 2 and settled(tool), timeout=PATIENCE)
     assert "Preview: " in tool.verdict.text()
     content = result_of(layer_of(window, "field", "preview")).content
-    assert f"{100 * content.report.image_residual:.3g} %" in tool.panel.status.text()
+    assert percent(content.report.image_residual) in tool.panel.status.text()
     assert messages == []
 
 
