@@ -28,19 +28,15 @@ import numpy as np
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 
-_MIN_PLAIN, _MAX_PLAIN = 1e-3, 1e5  # other numbers have a power of ten
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-_MAX_LINES, _LINE_LETTERS = 5, 160  # of a summary, below its title
-_PICTURE_PX = 256
-_SHOWN_PERCENTILES = 0.5, 99.5
 _COLOURS = (68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)
 
 
-def power_of_ten(largest: float, least: float = _MIN_PLAIN) -> tuple[int, str]:
+def power_of_ten(largest: float, least: float = 1e-3, greatest: float = 1e5) -> tuple[int, str]:
     """Return the power of ten of a number that is not plain, rounded, and its text; else 0, ""."""
     rounded = float(f"{abs(largest):.3g}")
-    if not 0 < rounded < math.inf or least <= rounded < _MAX_PLAIN:
+    if not 0 < rounded < math.inf or least <= rounded < greatest:
         return 0, ""
     power = math.floor(math.log10(rounded))
     return power, f"× 10{str(power).translate(_RAISED)}"
@@ -109,15 +105,13 @@ class Summarised:
         """Return the plane to show, NaN where there is nothing; None without a picture."""
         return None
 
-    def _lines(self) -> list[str]:
+    def _lines(self, most: int = 5, letters: int = 160) -> list[str]:
         plane, title = self._picture(), type(self).__name__
         if plane is not None:
             title += f", {plane.shape[1]} × {plane.shape[0]} px (width × height)"
-        lines = [
-            textwrap.shorten(line, _LINE_LETTERS, placeholder=" …") for line in self._summary()
-        ]
-        if len(lines) > _MAX_LINES:
-            lines[_MAX_LINES - 1 :] = [f"and {len(lines) - _MAX_LINES + 1} more"]
+        lines = [textwrap.shorten(line, letters, placeholder=" …") for line in self._summary()]
+        if len(lines) > most:
+            lines[most - 1 :] = [f"and {len(lines) - most + 1} more"]
         return [title, *lines]
 
     def __repr__(self) -> str:
@@ -131,20 +125,22 @@ class Summarised:
         return f"<b>{title}</b><ul>{items}</ul>{picture}"
 
 
-def _picture_html(plane: FloatArray) -> str:
+def _picture_html(
+    plane: FloatArray, side: int = 256, percentiles: tuple[float, float] = (0.5, 99.5)
+) -> str:
     """Return an image tag with a plane in colours, transparent where it is NaN."""
     import imageio.v3 as iio
 
-    step = -(-max(plane.shape) // _PICTURE_PX)
+    step = -(-max(plane.shape) // side)
     shown = np.asarray(plane[::step, ::step], float)
     is_shown = np.isfinite(shown)
-    low, high = np.percentile(shown[is_shown], _SHOWN_PERCENTILES) if is_shown.any() else (0, 1)
+    low, high = np.percentile(shown[is_shown], percentiles) if is_shown.any() else (0, 1)
     share = np.clip((np.where(is_shown, shown, low) - low) / ((high - low) or 1.0), 0, 1)
     stops = np.linspace(0, 1, len(_COLOURS))
     channels = [np.interp(share, stops, channel) for channel in zip(*_COLOURS, strict=True)]
     pixels = np.stack([*channels, 255.0 * is_shown], axis=-1).astype(np.uint8)
     data = base64.b64encode(iio.imwrite("<bytes>", pixels, plugin="pillow", format="PNG")).decode()
-    return f'<img src="data:image/png;base64,{data}" width="{_PICTURE_PX}">'
+    return f'<img src="data:image/png;base64,{data}" width="{side}">'
 
 
 class ResultKind(StrEnum):

@@ -3,6 +3,7 @@
 import ast
 import re
 from collections.abc import Iterator
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,7 @@ def test_its_functions_exist(each: Format) -> None:
 
 def test_marks_are_in_the_head_of_a_file() -> None:
     ends = [at + len(mark) for each in FORMATS for at, mark in each.marks]
-    assert max(ends) <= formats._HEAD_BYTES
+    assert max(ends) <= signature(format_of).parameters["head_bytes"].default
 
 
 def test_messages_and_help_list_every_format(tmp_path: Path) -> None:

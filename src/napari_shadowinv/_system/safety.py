@@ -32,11 +32,7 @@ from napari_shadowinv.errors import FileFormatError, InputError, InversionCancel
 LIMIT_VARIABLE = "SHADOWINV_MAX_GB"
 
 # Reading needs a few copies of the image, and other programs some memory too.
-_SHARE_OF_MEMORY = 1 / 8
-_MEMORY_IF_UNKNOWN = 8_000_000_000
 _ALWAYS_FITS = 1_000_000
-_LARGEST_TEXT = 1_000_000
-_LONGEST_SHOWN = 300  # characters of a path
 
 _DECODING_ERRORS: tuple[type[Exception], ...] = (OSError, EOFError, SyntaxError, UnicodeError)
 _DECODING_ERRORS += (struct.error, zlib.error, lzma.LZMAError)
@@ -144,7 +140,7 @@ def as_input_errors(name: str) -> Iterator[None]:
         ) from error
 
 
-def check_regular(path: Path, expected: str) -> None:
+def check_regular(path: Path, expected: str, *, longest_shown: int = 300) -> None:
     """Refuse anything but a regular file before it is opened: a pipe would block for ever."""
     try:
         mode = path.stat().st_mode
@@ -154,7 +150,7 @@ def check_regular(path: Path, expected: str) -> None:
         ) from None
     except OSError as error:
         text = str(path)
-        shown = text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}…"
+        shown = text if len(text) <= longest_shown else f"{text[:longest_shown]}…"
         raise FileFormatError(
             f"{shown} cannot be opened ({error.strerror}): check its permissions and the path"
         ) from None
@@ -179,11 +175,14 @@ def resolved_path(path: str | Path) -> Path:
         ) from None
 
 
-def size_limit() -> int:
-    """Return the largest size of a file in memory (bytes), by `LIMIT_VARIABLE` or the memory."""
+def size_limit(*, share: float = 1 / 8, memory_if_unknown: int = 8_000_000_000) -> int:
+    """Return the largest size of a file in memory (bytes).
+
+    By `LIMIT_VARIABLE`, or as a share of the memory.
+    """
     text = os.environ.get(LIMIT_VARIABLE)
     if text is None:
-        return int(_SHARE_OF_MEMORY * (physical_memory() or _MEMORY_IF_UNKNOWN))
+        return int(share * (physical_memory() or memory_if_unknown))
     try:
         limit = float(text)
     except ValueError:
@@ -221,14 +220,16 @@ def check_memory(shape: Sequence[int], bytes_per_pixel: float, work: str) -> Non
         )
 
 
-def small_text(path: Path, expected: str, encoding: str = "utf-8") -> str:
+def small_text(
+    path: Path, expected: str, encoding: str = "utf-8", *, most_bytes: int = 1_000_000
+) -> str:
     """Return the text of a file, refusing a large one."""
     check_regular(path, expected)
     with path.open("rb") as file:
-        raw = file.read(_LARGEST_TEXT + 1)
-    if len(raw) > _LARGEST_TEXT:
+        raw = file.read(most_bytes + 1)
+    if len(raw) > most_bytes:
         raise FileFormatError(
-            f"{path} is larger than {_LARGEST_TEXT // 1_000_000} MB: expected {expected}; check "
+            f"{path} is larger than {most_bytes // 1_000_000} MB: expected {expected}; check "
             "that it is the right file"
         )
     try:

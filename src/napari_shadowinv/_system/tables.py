@@ -19,7 +19,6 @@ from napari_shadowinv._system.safety import as_file_errors, check_regular, small
 from napari_shadowinv._system.validation import Model, suggestion, validate
 from napari_shadowinv.errors import FileFormatError, InputError
 
-_MAX_HEADER_BYTES = 100_000
 _SEPARATORS = ";\t,"
 _EXPECTED = "a table as comma-separated values"
 
@@ -131,11 +130,11 @@ def write_cells(
         writer.writerows(rows)
 
 
-def has_column_names(path: Path) -> bool:
+def has_column_names(path: Path, *, most_bytes: int = 100_000) -> bool:
     """Return whether a file begins with column names, not with numbers."""
     check_regular(path, _EXPECTED)
     with path.open("rb") as file:  # it may be a large image
-        head = file.read(_MAX_HEADER_BYTES).decode("utf-8-sig", errors="replace")
+        head = file.read(most_bytes).decode("utf-8-sig", errors="replace")
     _, names = next(_records(path, head), (0, []))
     return bool(names) and not any(map(is_number, names))
 

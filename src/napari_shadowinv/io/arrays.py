@@ -18,7 +18,6 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 
 FRAME_INDEX = re.compile(r"(?P<name>.*)\[(?P<index>\d+(,\d+)*)\]")  # of an array, as data[3]
-_COLOURS = (3, 4)  # of a picture, on its last axis
 
 
 def frame_axes(path: Path, title: str, shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -28,7 +27,7 @@ def frame_axes(path: Path, title: str, shape: tuple[int, ...]) -> tuple[int, ...
             f"{path} holds {title} with shape {shape}: expected an image of shape "
             "(height, width), or many with the shots first; choose another array"
         )
-    if len(shape) > 2 and shape[-1] in _COLOURS:
+    if len(shape) > 2 and shape[-1] in (3, 4):  # colours of a picture
         raise FileFormatError(
             f"{path} holds {title} with shape {shape}, as of pictures in colour: expected images "
             "of shape (height, width), many with the shots first; save one colour, or turn the axes"

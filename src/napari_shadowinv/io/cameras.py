@@ -27,7 +27,6 @@ _SPE_HEADER = 4100
 _SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
 _SPE_REGION = re.compile(rb'<DataBlock\b[^>]*\btype="Region"[^>]*>')
 _SPE_STRIDE = re.compile(rb'<DataBlock\b(?=[^>]*\btype="Frame")[^>]*\bstride="(\d{1,12})"')
-_LONGEST_FOOTER = 2_000_000  # that of one frame has some kilobytes
 
 
 def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
@@ -102,12 +101,12 @@ def _unpack_number(header: bytes, code: str, offset: int) -> Any:
     return struct.unpack_from(f"<{code}", header, offset)[0]
 
 
-def _footer_stride(path: Path, start: int) -> int:
+def _footer_stride(path: Path, start: int, most_bytes: int = 2_000_000) -> int:
     """Return the stride of frames by the XML at the end; refuse several sensor regions in each."""
     check_promise(path, "SPE", start, path.stat().st_size)
     with path.open("rb") as file:
         file.seek(start)
-        footer = file.read(_LONGEST_FOOTER)
+        footer = file.read(most_bytes)  # one frame has some kilobytes
     regions = len(_SPE_REGION.findall(footer))
     if regions > 1:
         raise FileFormatError(

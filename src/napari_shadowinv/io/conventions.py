@@ -33,7 +33,6 @@ from napari_shadowinv.io.hdf5 import load_dataset, member
 
 _PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned")
 _LIMITS = ("valid_range", "valid_min", "valid_max")
-_BAD_PIXEL = 0xFFFF  # bits of a NeXus pixel mask that reject a pixel; higher ones only describe it
 _FRAME_KINDS = {1: "flat", 2: "dark", 3: "invalid"}  # by the image_key of NXtomo; 0 is a shot
 _FLIPS = {"LL": (0,), "UR": (1,), "LR": (0, 1)}  # axes to reverse, by the corner of the first pixel
 
@@ -185,7 +184,8 @@ def _unusable_pixels(
         flags = load_dataset(path, item)
         flags = flags.reshape(-1, *stored.shape)
         flags = flags[number if number is not None and len(flags) > 1 else 0]
-        unusable["pixel_mask"] = (flags.astype(np.int64) & _BAD_PIXEL) != 0
+        # These bits reject a pixel, higher ones only describe it.
+        unusable["pixel_mask"] = (flags.astype(np.int64) & 0xFFFF) != 0
         break
     for name, is_beyond in (("saturation_value", np.greater), ("underload_value", np.less)):
         item = member(path, detector, name)

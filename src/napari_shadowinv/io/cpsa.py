@@ -41,11 +41,6 @@ from napari_shadowinv.film.other_detectors import Tracks
 from napari_shadowinv.io.files import check_promise
 
 _HEADER, _FRAME, _TRACK = struct.Struct("<4i2f6i"), struct.Struct("<10i"), 9
-_IN_MEMORY = 10  # times the size of a file: its bytes and the arrays of its tracks
-_MOST_FRAMES = 500_000  # scans have some ten thousand
-_STAGE_STEP = 1e-7  # m
-_WIDEST_PIXEL = 100.0  # µm; usual ones have 0.3
-_SAME_PITCH = 0.02  # of the scanned area, by which frames that abut may miss it
 _RANGES = ("diameter", "contrast", "eccentricity")
 _WORD = re.compile(r"(\w+)\s*=\s*([^\s,]+)[\s,]*")
 
@@ -121,7 +116,7 @@ def _parse_ranges(text: str) -> dict[str, Any]:
 
 def _read_scan(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
     check_regular(path, "a CR-39 scan, .cpsa")
-    check_size(path, _IN_MEMORY * path.stat().st_size)
+    check_size(path, 10 * path.stat().st_size)  # its bytes and the arrays of its tracks
     data = path.read_bytes()
     shape, pixel, frame_size = _read_header(path, data)
     frames = _read_frames(path, data, shape)
@@ -133,7 +128,7 @@ def _read_scan(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
         for name, kind in columns.items() if last > first else ():
             fields[name][first:last] = np.frombuffer(data, kind, last - first, place)
             place += (last - first) * np.dtype(kind).itemsize
-    middles = frames[:, 1:3] * _STAGE_STEP
+    middles = frames[:, 1:3] * 1e-7  # m, of steps of the stage
     x_left, y_bottom = middles.min(axis=0) - frame_size / 2
     x_right, y_top = middles.max(axis=0) + frame_size / 2
     x = np.repeat(middles[:, 0] + frame_size[0] / 2 - x_left, hits) - fields["x"] * (pixel * 1e-6)
@@ -144,8 +139,13 @@ def _read_scan(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
     return tracks, _pitch_warnings(shape, np.array([width, height]), frame_size)
 
 
-def _read_header(path: Path, data: bytes) -> tuple[tuple[int, int], float, FloatArray]:
-    """Return the frames along x and y, a pixel's width (µm), and a frame's size in x, y (m)."""
+def _read_header(
+    path: Path, data: bytes, *, widest_pixel: float = 100.0, most_frames: int = 500_000
+) -> tuple[tuple[int, int], float, FloatArray]:
+    """Return the frames along x and y, a pixel's width (µm), and a frame's size in x, y (m).
+
+    Usual scans have pixels of 0.3 µm and some ten thousand frames.
+    """
     check_promise(path, "CPSA", _HEADER.size, len(data))
     version, columns, rows, _, pixel, _, _, _, _, _, width, height = _HEADER.unpack_from(data)
     if version >= 0:
@@ -153,15 +153,15 @@ def _read_header(path: Path, data: bytes) -> tuple[tuple[int, int], float, Float
             f"{path} is no CR-39 scan or damaged: its version is {version}, expected a negative "
             "number; export the tracks again"
         )
-    if min(columns, rows, width, height) < 1 or not 0 < pixel <= _WIDEST_PIXEL:
+    if min(columns, rows, width, height) < 1 or not 0 < pixel <= widest_pixel:
         raise FileFormatError(
             f"{path} is damaged: its CPSA header gives {columns} × {rows} frames of "
             f"{width} × {height} pixels of {pixel:g} µm; copy it again"
         )
-    if columns * rows > _MOST_FRAMES:
+    if columns * rows > most_frames:
         raise FileFormatError(
             f"{path} is damaged: its CPSA header gives {columns} × {rows} frames, expected at most "
-            f"{_MOST_FRAMES}; copy it again"
+            f"{most_frames}; copy it again"
         )
     check_promise(path, "CPSA", _HEADER.size + columns * rows * _FRAME.size, len(data))
     return (columns, rows), pixel, np.array([width, height]) * (pixel * 1e-6)
@@ -190,11 +190,11 @@ def _read_frames(path: Path, data: bytes, shape: tuple[int, int]) -> AnyArray:
 
 
 def _pitch_warnings(
-    shape: tuple[int, int], extent: FloatArray, frame_size: FloatArray
+    shape: tuple[int, int], extent: FloatArray, frame_size: FloatArray, tolerance: float = 0.02
 ) -> tuple[Caution, ...]:
-    """Warn of frames with gaps between them, or that overlap."""
+    """Warn of frames with gaps between them, or that overlap, by a share of the scanned area."""
     ratios = extent / (np.array(shape) * frame_size)
-    if (np.abs(ratios - 1) <= _SAME_PITCH).all():
+    if (np.abs(ratios - 1) <= tolerance).all():
         return ()
     text = (
         f"the scanned area is {ratios[0]:.3g} times as wide and {ratios[1]:.3g} times as high as "

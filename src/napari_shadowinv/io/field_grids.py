@@ -29,8 +29,6 @@ _EXPECTED = "an openPMD file or a NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez"
 _SAME_PLACE = 1e-6  # of a cell
 # By the powers of length, mass, time, current, temperature, amount and luminous intensity.
 _UNITS = {(0, 1, -2, -1, 0, 0, 0): "T", (1, 1, -3, -1, 0, 0, 0): "V/m"}
-_MAX_LISTED = 10
-_BYTES_PER_NODE = 100  # six components, twice in double precision
 
 
 @as_file_errors
@@ -49,7 +47,7 @@ def is_field_grid(path: Path) -> bool:
 
 
 @as_file_errors
-def describe_field_grid(path: Path) -> list[tuple[str, str]]:
+def describe_field_grid(path: Path, *, most: int = 10) -> list[tuple[str, str]]:
     """Return title and text of the kind, and of each field with its shape, unit and spacing."""
     with open_hdf5(path) as content:
         is_openpmd = "openPMD" in content.attrs
@@ -65,7 +63,7 @@ def describe_field_grid(path: Path) -> list[tuple[str, str]]:
         base = _text(content.attrs.get("basePath", "/data/%T/"))
         parent: Any = member(path, content, base.partition("%T")[0].strip("/")) or {}
         meshes = _text(content.attrs.get("meshesPath", "fields/"))
-        for number in sorted(filter(str.isdecimal, parent), key=int)[:_MAX_LISTED]:
+        for number in sorted(filter(str.isdecimal, parent), key=int)[:most]:
             for name, record in members(member(path, parent[number], meshes) or {}):
                 parts = [("", record)] if hasattr(record, "shape") else members(record)
                 rows += [
@@ -160,16 +158,16 @@ def _read_openpmd(path: Path, content: Any, iteration: str | int | None) -> Fiel
     return FieldGrid(magnetic, electric, spacing=spacing.tolist(), centre=centre.tolist())
 
 
-def _choose_iteration(path: Path, content: Any, iteration: str | int | None) -> Any:
+def _choose_iteration(path: Path, content: Any, iteration: str | int | None, most: int = 10) -> Any:
     """Return the group of the only iteration, or of the chosen one."""
     base = _text(content.attrs.get("basePath", "/data/%T/"))
     parent = member(path, content, base.partition("%T")[0].strip("/"))
     names = [] if parent is None else [name for name in parent if name.isdecimal()]
     if not names:
         raise InputError(f"{path} has no iteration in {base!r}: expected an openPMD file with data")
-    listed = ", ".join(sorted(names, key=int)[:_MAX_LISTED])
+    listed = ", ".join(sorted(names, key=int)[:most])
     if iteration is None and len(names) > 1:
-        more = ", …" if len(names) > _MAX_LISTED else ""
+        more = ", …" if len(names) > most else ""
         raise InputError(f"{path} has the iterations {listed}{more}: choose one of them")
     number = names[0] if iteration is None else str(iteration)
     if number not in names:
@@ -216,7 +214,8 @@ def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatA
             raise InputError(
                 f"{path} has {symbol}/{axis} with shape {values.shape}: expected three dimensions"
             )
-        check_memory(values.shape, _BYTES_PER_NODE, "a field")
+        # Six components, twice in double precision.
+        check_memory(values.shape, 100, "a field")
         place = np.ravel(item.attrs.get("position", [0.0] * 3)).astype(float)[::step]
         parts.append(values.transpose(order))
         places.append(place[order])

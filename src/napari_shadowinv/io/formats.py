@@ -23,9 +23,6 @@ from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.files import split_address
 
-_HEAD_BYTES = 4100  # they hold every mark
-_EXCERPT_BYTES = 64  # they show the kind of a file without a mark
-
 
 @dataclass(frozen=True)
 class Format:
@@ -82,7 +79,7 @@ class Format:
         """Return whether a file that begins with `head` is of this format."""
         if any(head[at : at + len(mark)] == mark for at, mark in self.marks):
             return not self.test or bool(function(self.test)(path))
-        appearance = "text" if _is_text(head[:_EXCERPT_BYTES]) else "binary"
+        appearance = "text" if _is_text(head) else "binary"
         return appearance == self.unmarked and path.suffix.lower() in self.suffixes
 
 
@@ -248,15 +245,16 @@ def _foreign_title(head: bytes, suffix: str) -> str | None:
 
 
 @as_file_errors
-def format_of(path: Path) -> Format:
+def format_of(path: Path, *, head_bytes: int = 4100) -> Format:
     """Return the format of a file by its content, because its name may be wrong.
 
-    Numbers as text have no mark, so they also need one of the usual endings.
+    Numbers as text have no mark, so they also need one of the usual endings. The head holds every
+    mark.
     """
     path, _ = split_address(path)
     check_regular(path, f"a file ({READABLE})")
     with path.open("rb") as file:
-        head = file.read(_HEAD_BYTES)
+        head = file.read(head_bytes)
     if not head:
         raise FileFormatError(f"{path} is empty (0 bytes): expected {READABLE}; copy it again")
     title = _foreign_title(head, path.suffix)
@@ -266,8 +264,7 @@ def format_of(path: Path) -> Format:
     if title is None and (raw := _RAW_SUFFIXES.fullmatch(path.suffix)):
         title = f"a file of a camera's own program, such as FLI's ({raw[1].upper()})"
     elif title is None:
-        is_text = _is_text(head[:_EXCERPT_BYTES])
-        title = "a text file" if is_text else "not in a recognised image format"
+        title = "a text file" if _is_text(head) else "not in a recognised image format"
     raise FileFormatError(
         f"{path} is {title}: expected {READABLE}; export the image to one of these, such as "
         "16-bit TIFF"
@@ -279,7 +276,9 @@ def kind_of(path: str | Path) -> str:
     return format_of(path).name
 
 
-def _is_text(head: bytes) -> bool:
+def _is_text(head: bytes, enough: int = 64) -> bool:
+    """Return whether a file's first bytes are text; the first few show the kind."""
+    head = head[:enough]
     try:
         # Incremental, because the last character may have been cut in two.
         text = codecs.getincrementaldecoder("utf-8-sig")().decode(head)

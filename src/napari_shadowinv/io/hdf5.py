@@ -29,7 +29,6 @@ from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
 _SEAL = b"\nshadowinv sha256 "
-_BLOCK_BYTES = 1 << 20
 MAX_LINKS = 16  # that lead to one item
 
 
@@ -199,7 +198,7 @@ def hdf5_in_memory(path: Path, *, seal: bool = False) -> Iterator[BytesIO]:
     path.write_bytes(content.getvalue())
 
 
-def check_hdf5_seal(path: Path) -> None:
+def check_hdf5_seal(path: Path, *, block_bytes: int = 1 << 20) -> None:
     """Refuse a file that has changed since `hdf5_in_memory` sealed it; others pass.
 
     A program that changes the file by the HDF5 library removes the seal.
@@ -215,7 +214,7 @@ def check_hdf5_seal(path: Path) -> None:
             return
         file.seek(0)
         checksum = hashlib.sha256()
-        while remaining > 0 and (block := file.read(min(_BLOCK_BYTES, remaining))):
+        while remaining > 0 and (block := file.read(min(block_bytes, remaining))):
             checksum.update(block)
             remaining -= len(block)
     if checksum.hexdigest().encode() != end.removeprefix(_SEAL):

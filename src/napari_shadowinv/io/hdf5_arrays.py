@@ -39,9 +39,7 @@ from napari_shadowinv.io.hdf5 import (
     stored_elsewhere,
 )
 
-_MAX_LISTED = 8
 _ONE_AXIS = "1 axis"
-_MAX_ITEMS = 10_000  # that a walk through a file visits
 _DEFAULTS = ("signal", "default")  # attributes of a NeXus group: its array, or the group to look in
 _KINDS = {"c": "complex", "S": "text", "U": "text", "O": "text or references", "V": "compound"}
 
@@ -191,7 +189,7 @@ class _HDF5Object(NamedTuple):
         return f"{self.name!r} ({notes})"
 
 
-def list_arrays(file: Any, name: str = "") -> str:
+def list_arrays(file: Any, name: str = "", *, most: int = 8) -> str:
     """Describe the first arrays of an open file, or those with a name most like `name`."""
     entries = list(_objects(file))
     if name:
@@ -205,12 +203,12 @@ def list_arrays(file: Any, name: str = "") -> str:
     entries.sort(key=lambda entry: (bool(entry.reason), entry.reason == _ONE_AXIS))
     # Times and names are no choice where there are images.
     count = sum(entry.reason != _ONE_AXIS for entry in entries) or len(entries)
-    names = [str(entry) for entry in entries[: min(count, _MAX_LISTED)]]
-    more = [f"and {count - _MAX_LISTED} more"] if count > _MAX_LISTED else []
+    names = [str(entry) for entry in entries[: min(count, most)]]
+    more = [f"and {count - most} more"] if count > most else []
     return ", ".join([*names, *more]) or "no array"
 
 
-def _objects(file: Any) -> Iterator[_HDF5Object]:
+def _objects(file: Any, most_visits: int = 10_000) -> Iterator[_HDF5Object]:
     """Yield the arrays of a file once each, from the top down; others' files are not followed."""
     import h5py
 
@@ -219,7 +217,7 @@ def _objects(file: Any) -> Iterator[_HDF5Object]:
         prefix, group = groups.popleft()
         for name in group:
             visited += 1
-            if visited > _MAX_ITEMS:
+            if visited > most_visits:
                 return
             link = group.id.links.get_info(name.encode())
             if link.type == h5py.h5l.TYPE_EXTERNAL:

@@ -27,9 +27,6 @@ from napari_shadowinv.io.formats import format_of
 CHANNELS = ("red", "green", "blue", "mean")
 
 INCH_M = 0.0254
-_LEAST_PRINTED_M = 80e-6  # picture programs write resolutions up to 300 per inch without knowing it
-_LINEAR_GAMMA = 0.01  # deviation of the exponent
-_ORIENTATION = 274  # number of the tag
 _MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I", "I;16", "I;16B", "F"}  # pillow's
 TURNED_NOTE = "turned upright as the file says"
 
@@ -140,9 +137,15 @@ def gaps_in(array: AnyArray) -> dict[str, Any]:
 
 
 def geometry_of(
-    sides: tuple[float, ...], is_length: bool, is_drawn: bool = False
+    sides: tuple[float, ...],
+    is_length: bool,
+    is_drawn: bool = False,
+    *,
+    least_printed: float = 80e-6,
 ) -> dict[str, Any]:
     """Return a file's size of a pixel (m) as metadata, and as geometry unless it may be a default.
+
+    Picture programs write resolutions up to 300 per inch, `least_printed`, without knowing it.
 
     `is_length` says whether the file means a length and no resolution of printing. `is_drawn` is
     true of this package's own images, whose pixels are those at the object.
@@ -151,7 +154,7 @@ def geometry_of(
         return {}
     metres = sides[0]
     name = "pixel_size" if is_drawn else "detector_pixel_size"
-    is_measured = is_length or is_drawn or metres < _LEAST_PRINTED_M
+    is_measured = is_length or is_drawn or metres < least_printed
     return {"stated_pixel_size": metres, **({"geometry": {name: metres}} if is_measured else {})}
 
 
@@ -211,7 +214,7 @@ def _open_picture(file: BinaryIO) -> Any:
 
 def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Read a PNG, BMP or JPEG: upright, with NaN at transparent pixels."""
-    from PIL import ImageOps
+    from PIL import ExifTags, ImageOps
 
     # A file object, because pillow may believe the name.
     with path.open("rb") as file, _open_picture(file) as picture:
@@ -224,7 +227,7 @@ def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
                 f"{path} holds pixels of the kind {picture.mode}, which are not proportional to "
                 "the light: expected grey or RGB; export it as 16-bit TIFF"
             )
-        is_turned = picture.getexif().get(_ORIENTATION, 1) in range(2, 9)
+        is_turned = picture.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
         array, missing = _pixels_and_gaps(ImageOps.exif_transpose(picture))
         array = without_pixels(array, missing)
         gaps, sides = gaps_in(array), _printed_sides(picture.info)
@@ -252,12 +255,14 @@ def _pixels_and_gaps(picture: Any) -> tuple[AnyArray, BoolArray | None]:
     return array, None if colour is None else array == colour
 
 
-def _light_warnings(form: str, info: dict[str, Any]) -> tuple[Caution, ...]:
+def _light_warnings(
+    form: str, info: dict[str, Any], gamma_tolerance: float = 0.01
+) -> tuple[Caution, ...]:
     """Warn of pixels that are no linear measure of the light by their format."""
     profile = info.get("icc_profile")
     if form in ("JPEG", "MPO"):
         kind = "a JPEG"
-    elif "srgb" in info or abs(info.get("gamma", 1.0) - 1.0) > _LINEAR_GAMMA:
+    elif "srgb" in info or abs(info.get("gamma", 1.0) - 1.0) > gamma_tolerance:
         kind = f"a {form} for screens"
     elif profile and not is_linear_profile(profile):
         kind = f"a {form} with a colour profile"

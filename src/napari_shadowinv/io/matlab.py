@@ -20,6 +20,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from enum import IntEnum, IntFlag
 from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias
@@ -33,13 +34,11 @@ from napari_shadowinv.io.arrays import FRAME_INDEX, check_one_frame
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.hdf5 import load_dataset, member, members, open_hdf5
 
-_HDF5_OFFSET = 512
 # Attributes of pradformat and of .shadowinv, which MATLAB's save does not write.
 _FOREIGN_MARKS = {"object_type", "format"}
 _HEADER = 128
-_MATRIX, _COMPRESSED = 14, 15
-_COMPLEX, _LOGICAL = 0x0800, 0x0200
-_PREAMBLE = 1024  # enough for a variable's flags, dimensions and name
+_Element = IntEnum("_Element", {"MATRIX": 14, "COMPRESSED": 15})
+_Flag = IntFlag("_Flag", {"LOGICAL": 0x0200, "COMPLEX": 0x0800})
 
 # By their number, from 1.
 _PLAIN = "cell struct object char sparse double single int8 uint8 int16 uint16 int32 uint32"
@@ -122,8 +121,9 @@ def count_mat(path: Path, variable: str | None = None) -> tuple[int, ...]:
 def mat_variables(path: Path) -> list[MatlabArray]:
     """List the variables of a MAT-file in its order, without their values."""
     with path.open("rb") as file:
-        head = file.read(_HDF5_OFFSET + 4)
-        if b"\x89HDF" not in (head[:4], head[_HDF5_OFFSET:]) and head[:10] != b"MATLAB 7.3":
+        head = file.read(516)
+        # MATLAB writes a text before the HDF5.
+        if b"\x89HDF" not in (head[:4], head[512:]) and head[:10] != b"MATLAB 7.3":
             file.seek(0)
             return list(_variables_5(path, file))
     with open_hdf5(path) as content:
@@ -184,8 +184,11 @@ def _describe_variable(path: Path, name: str, item: Any) -> MatlabArray:
     return MatlabArray(name, item.shape[::-1], type_name, load)
 
 
-def _variables_5(path: Path, file: BinaryIO) -> Iterator[MatlabArray]:
-    """Variables of MATLAB's own layout: their headers are read, not yet their values."""
+def _variables_5(path: Path, file: BinaryIO, preamble: int = 1024) -> Iterator[MatlabArray]:
+    """Variables of MATLAB's own layout: their headers are read, not yet their values.
+
+    Flags, dimensions and name of a variable are in the bytes of the preamble.
+    """
     size = path.stat().st_size
     order = _byte_order(file)
     start = _HEADER
@@ -193,13 +196,13 @@ def _variables_5(path: Path, file: BinaryIO) -> Iterator[MatlabArray]:
         file.seek(start)
         kind, count = struct.unpack(f"{order}II", file.read(8))
         check_promise(path, "MATLAB", start + 8 + count, size)
-        body = file.read(min(count, _PREAMBLE))
-        if kind == _COMPRESSED:
-            body = zlib.decompressobj().decompress(body, _PREAMBLE)
+        body = file.read(min(count, preamble))
+        if kind == _Element.COMPRESSED:
+            body = zlib.decompressobj().decompress(body, preamble)
             kind, inner = struct.unpack(f"{order}II", body[:8])
             check_promise(path, "MATLAB", inner, DEFLATE_RATIO * count)
             body = body[8:]
-        if kind == _MATRIX:
+        if kind == _Element.MATRIX:
             name, shape, type_name, _ = _read_preamble(body, order)
             check_promise(path, "MATLAB", math.prod(shape), DEFLATE_RATIO * count)
             if name:
@@ -219,11 +222,11 @@ def _byte_order(file: BinaryIO) -> str:
 def _read_preamble(body: _Bytes, order: str) -> tuple[str, tuple[int, ...], str, int]:
     """Name, shape and class of a variable, and where its values begin."""
     flags = struct.unpack_from(f"{order}I", body, 8)[0]
-    type_name = "logical" if flags & _LOGICAL else _CLASSES.get(flags & 0xFF, "object")
+    type_name = "logical" if flags & _Flag.LOGICAL else _CLASSES.get(flags & 0xFF, "object")
     if type_name == "object":
         # Opaque objects have no dimensions here.
         return "an object", (), type_name, 0
-    if flags & _COMPLEX:
+    if flags & _Flag.COMPLEX:
         type_name = f"complex {type_name}"
     _, dims, after = _read_field(body, 16, order)
     shape = struct.unpack(f"{order}{len(dims) // 4}i", dims)
@@ -252,7 +255,7 @@ def _load_5(path: Path, start: int, count: int, shape: tuple[int, ...]) -> AnyAr
         file.seek(start)
         (kind,) = struct.unpack(f"{order}I4x", file.read(8))
         body = file.read(count)
-    if kind == _COMPRESSED:
+    if kind == _Element.COMPRESSED:
         unpacker = zlib.decompressobj()
         count = struct.unpack(f"{order}4xI", unpacker.decompress(body, 8))[0]
         check_size(path, count)

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-_TIMEOUT_S = 10.0
-
 
 @dataclass(frozen=True)
 class PublicFile:
@@ -40,7 +38,7 @@ def cache_folder() -> Path:
     return Path(pooch.os_cache("napari-shadowinv"))
 
 
-def fetch_public_file(name: str, *, cache: Path | None = None) -> Path:
+def fetch_public_file(name: str, *, cache: Path | None = None, timeout: float = 10.0) -> Path:
     """Download a public file, unless it is in the cache already.
 
     Parameters
@@ -71,7 +69,7 @@ def fetch_public_file(name: str, *, cache: Path | None = None) -> Path:
             f"sha256:{file.sha256}",
             fname=path.name,
             path=path.parent,
-            downloader=pooch.HTTPDownloader(timeout=_TIMEOUT_S),
+            downloader=pooch.HTTPDownloader(timeout=timeout),
         )
     except (OSError, ValueError) as error:
         reason = "no connection"

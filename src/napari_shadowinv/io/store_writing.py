@@ -46,10 +46,8 @@ from napari_shadowinv.io.store_columns import ShotColumn
 from napari_shadowinv.io.store_damage import chunk_file, fields_of, is_along_shots
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
-_SMALL = 64  # values that are not worth compressing
 # Attribute: the order of the shots does not follow from their names.
 NUMBERED_AS_ARRIVED = {"order": "as they arrived"}
-_ROOM = 64  # shots for which the arrays of a growing store are extended at a time
 
 
 class StoreError(OSError):
@@ -300,7 +298,10 @@ def _array_of(column: ShotColumn, shots: int) -> StoreArray:
     return StoreArray(("shot",), dtype, column.labels, fill)
 
 
-def _create_array(group: Any, name: str, variable: StoreArray, sizes: Mapping[str, int]) -> None:
+def _create_array(
+    group: Any, name: str, variable: StoreArray, sizes: Mapping[str, int], small: int = 64
+) -> None:
+    """Create an array of a store; `small` chunks are not worth compressing."""
     shape = tuple(sizes[dim] for dim in variable.dims)
     # A chunk is one file. Values of the start are in few files, with room for new shots; others in
     # a file for each shot.
@@ -311,7 +312,7 @@ def _create_array(group: Any, name: str, variable: StoreArray, sizes: Mapping[st
     is_float = not is_text and np.dtype(variable.dtype).kind == "f"
     # Fields compress well once their slowly changing bytes are next to each other.
     fields = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
-    is_plain = is_text or np.prod(chunks) <= _SMALL
+    is_plain = is_text or np.prod(chunks) <= small
     array = group.create_array(
         name,
         shape=shape,
@@ -368,7 +369,7 @@ class GrowingStore:
         if new:
             numbers = range(len(self), len(self) + len(new))
             values = {"shot": np.array(numbers), "name": np.array(new, dtype=object)}
-            grow_store(self.path, values, NUMBERED_AS_ARRIVED, self._writer.arrays(), _ROOM)
+            grow_store(self.path, values, NUMBERED_AS_ARRIVED, self._writer.arrays(), room=64)
             self._numbers.update(zip(new, numbers, strict=True))
             self._statuses.extend([PENDING] * len(new))
         return self._numbers[names[-1]]

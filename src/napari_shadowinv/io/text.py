@@ -40,7 +40,6 @@ from napari_shadowinv._system.tables import is_number
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 
-_LONGEST_LINE = 4_000_000  # a row of 100 000 pixels with all their digits has 2.5 MB
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "nm": 1e-9}
 LENGTHS |= dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e-6)
 _UNITS = {**LENGTHS, "mev": 1.0, "kev": 1e-3, "ev": 1e-6}
@@ -58,7 +57,6 @@ _KEYS = {key: name for name, keys in _NAMES.items() for key in keys.split()}
 # Plain words in other programs' files, where without a unit they mean something else.
 _KEYS_WITH_UNIT = {"s2r", "s2d", "bin", "ep"}
 _PARTICLE_ENERGY = "energy"  # without a unit in MeV
-_LONGEST_ENTRY = 200  # longer comments are prose
 _ENTRY = re.compile(
     r"^[#%\s]*(?P<key>[^\W\d][\w\- ()\[\]]*?)\s*(?P<sign>[=:]\s*|\s)(?P<value>[-+.\d].*)$"
 )
@@ -68,8 +66,6 @@ _SELECTED = re.compile(r"^[#%]\s*([xy])-mask\s+([\d.]+)\s*%?\s*-\s*([\d.]+)")
 
 
 # Of a column or row that counts: noise and slopes of light have no such steps.
-_MIN_STEPS, _STEP_DEVIATION = 4, 0.3
-_MIN_TRIPLETS = 16  # rows of x, y and value
 
 
 def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
@@ -148,8 +144,8 @@ def _split_blocks(
     return image, parts
 
 
-def _check_no_coordinates(path: Path, image: FloatArray) -> None:
-    """Refuse a table whose outer column or row counts, or that lists x, y and value."""
+def _check_no_coordinates(path: Path, image: FloatArray, least_places: int = 16) -> None:
+    """Refuse a table whose outer column or row counts, or that lists x, y and value of places."""
     sides = {"first column": image, "first row": image.T}
     sides |= {"last column": image[:, ::-1], "last row": image[::-1].T}
     for name, table in sides.items():
@@ -162,7 +158,7 @@ def _check_no_coordinates(path: Path, image: FloatArray) -> None:
                 "or export the image as a matrix without axes"
             )
     height, width = image.shape
-    if width in (3, 4) and height >= _MIN_TRIPLETS:
+    if width in (3, 4) and height >= least_places:
         counts = [np.unique(image[:, column]).size for column in (0, 1)]
         if math.prod(counts) == height and min(counts) > 1:
             raise FileFormatError(
@@ -171,13 +167,13 @@ def _check_no_coordinates(path: Path, image: FloatArray) -> None:
             )
 
 
-def _is_axis(numbers: FloatArray) -> bool:
+def _is_axis(numbers: FloatArray, least_steps: int = 4, deviation: float = 0.3) -> bool:
     """Return whether numbers rise or fall by steps of nearly one size."""
     steps = np.diff(numbers)
-    if len(steps) < _MIN_STEPS or not np.isfinite(steps).all():
+    if len(steps) < least_steps or not np.isfinite(steps).all():
         return False
     usual = float(np.median(steps))
-    return usual != 0 and bool((np.abs(steps / usual - 1) < _STEP_DEVIATION).all())
+    return usual != 0 and bool((np.abs(steps / usual - 1) < deviation).all())
 
 
 def _read_rows(path: Path, height: int, width: int) -> FloatArray:
@@ -197,16 +193,19 @@ def _read_rows(path: Path, height: int, width: int) -> FloatArray:
     return image
 
 
-def _read_lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the lines that are not blank, with their numbers from 1."""
+def _read_lines(path: Path, most_bytes: int = 4_000_000) -> Iterator[tuple[int, str]]:
+    """Yield the lines that are not blank, with their numbers from 1.
+
+    A row of 100,000 pixels with all their digits has 2.5 MB.
+    """
     with path.open("rb") as file:
         for number in itertools.count(1):
-            raw = file.readline(_LONGEST_LINE)
+            raw = file.readline(most_bytes)
             if not raw:
                 return
-            if len(raw) == _LONGEST_LINE and not raw.endswith(b"\n"):
+            if len(raw) == most_bytes and not raw.endswith(b"\n"):
                 raise FileFormatError(
-                    f"{path}, line {number} is longer than {_LONGEST_LINE} bytes: expected one "
+                    f"{path}, line {number} is longer than {most_bytes} bytes: expected one "
                     "row of pixels per line; split it"
                 )
             raw = raw.removeprefix(b"\xef\xbb\xbf") if number == 1 else raw
@@ -240,11 +239,14 @@ def _parse_row(path: Path, number: int, line: str, width: int | None) -> FloatAr
         ) from None
 
 
-def _parse_geometry(path: Path, number: int, line: str) -> dict[str, float]:
-    """Return the geometry that a comment states, in the setup's units: one entry or none."""
+def _parse_geometry(path: Path, number: int, line: str, most: int = 200) -> dict[str, float]:
+    """Return the geometry that a comment states, in the setup's units: one entry or none.
+
+    Comments of more letters are prose.
+    """
     from napari_shadowinv.physics.setup import beam_quantities
 
-    entry = _ENTRY.match(line) if len(line) <= _LONGEST_ENTRY else None
+    entry = _ENTRY.match(line) if len(line) <= most else None
     if entry is None:
         return {}
     words = [word for word in re.split(r"[\W_]+", entry["key"].lower()) if word]

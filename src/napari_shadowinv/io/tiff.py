@@ -23,6 +23,8 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
+import tifffile
+from tifffile import PHOTOMETRIC
 
 from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._typing import AnyArray, BoolArray
@@ -43,7 +45,6 @@ from napari_shadowinv.io.images import (
 from napari_shadowinv.io.text import LENGTHS
 
 _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
-_SMALL_STRIP = 50_000_000  # bytes, which do not matter
 _UNPACKERS: dict[int, Callable[[], Any]] = {
     **dict.fromkeys((8, 32946), zlib.decompressobj),
     34925: lzma.LZMADecompressor,
@@ -51,12 +52,8 @@ _UNPACKERS: dict[int, Callable[[], Any]] = {
 _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
 
 _JPEG = {6, 7}
-_WHITE_IS_ZERO, _RGB, _PALETTE, _MASK, _YCBCR = 0, 2, 3, 4, 6
-_GREY_OR_RGB = {_WHITE_IS_ZERO, 1, _RGB, _PALETTE}
 _ALPHA = {1, 2}  # of the tag ExtraSamples
 _UNITS_M: dict[Any, float] = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M, **LENGTHS}
-_POLYNOMIALS, _UNCALIBRATED = range(4), 20  # of ImageJ's calibration functions
-_ROOTS, _PROPORTIONAL = 2, 128  # of gel scanners' values
 
 
 class _Layout(NamedTuple):
@@ -71,8 +68,6 @@ class _Layout(NamedTuple):
 @contextmanager
 def _open_tiff(path: Path) -> Iterator[Any]:
     """Open a TIFF with the decoder's log silenced, because the error says it once."""
-    import tifffile
-
     check_regular(path, "a TIFF")
     logger = logging.getLogger("tifffile")
     before = logger.disabled
@@ -98,7 +93,8 @@ def _find_frames(path: Path, _modified_ns: int, size: int) -> _Layout:
         _check_directories(path, tiff, size)
         series = [level for each in tiff.series for level in each.levels]
         pictures = [s for s in series if not (s.keyframe.is_reduced or s.keyframe.is_subifd)]
-        masks = [s for s in pictures if s.keyframe.is_mask or s.keyframe.photometric == _MASK]
+        frames = [(s, s.keyframe) for s in pictures]
+        masks = [s for s, key in frames if key.is_mask or key.photometric == PHOTOMETRIC.MASK]
         pictures = [s for s in pictures if s not in masks]
         if not pictures:
             raise FileFormatError(
@@ -212,9 +208,10 @@ def _tag(tiff: Any, page: Any, number: int, default: Any = None, *, among: int =
 
 
 def _check_kind(path: Path, page: Any) -> None:
-    colours = page.photometric
-    is_decoded = colours == _YCBCR and page.compression in _PICTURE_CODECS
-    if 262 in page.tags and not (colours in _GREY_OR_RGB or is_decoded):
+    colours, grey = page.photometric, (PHOTOMETRIC.MINISWHITE, PHOTOMETRIC.MINISBLACK)
+    is_decoded = colours == PHOTOMETRIC.YCBCR and page.compression in _PICTURE_CODECS
+    is_known = colours in (*grey, PHOTOMETRIC.RGB, PHOTOMETRIC.PALETTE)
+    if 262 in page.tags and not (is_known or is_decoded):
         raise FileFormatError(
             f"{path} holds pixels of the photometric kind {_name(colours)}, which are not "
             "proportional to the light: expected grey or RGB; export it as greyscale TIFF"
@@ -251,10 +248,13 @@ def _check_complete(path: Path, page: Any) -> None:
     _check_strips(path, page)
 
 
-def _check_strips(path: Path, page: Any) -> None:
-    """Refuse a strip or tile that unpacks to far more than its pixels; the decoder accepts it."""
+def _check_strips(path: Path, page: Any, small: int = 50_000_000) -> None:
+    """Refuse a strip or tile that unpacks to far more than its pixels; the decoder accepts it.
+
+    `small` strips (bytes) do not matter.
+    """
     pixels = math.prod(page.chunks) * page.dtype.itemsize
-    most = max(2 * pixels, _SMALL_STRIP)
+    most = max(2 * pixels, small)
     with path.open("rb") as file:
         for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
             file.seek(offset)
@@ -316,16 +316,16 @@ def _convert_values(
 ) -> tuple[AnyArray, tuple[str, ...]]:
     """Turn stored values into those that the file means, and say how."""
     kind = _tag(tiff, page, 33445, among=2)
-    if kind in (_ROOTS, _PROPORTIONAL):
+    if kind in (2, 128):  # a gel scanner's square roots, or values in proportion
         counts, per = _tag(tiff, page, 33446, (1, 1), among=2)
-        power = 2 if kind == _ROOTS else 1
+        power = 2 if kind == 2 else 1
         values = array.astype(np.float64) ** power * (counts / per if counts and per else 1.0)
         return values, (f"values of a gel scanner, to the power {power}, as the file says",)
     stated = tiff.imagej_metadata or {}
     if tiff.is_imagej:
         # ImageJ shows tables of colours and inverted greys, and leaves the pixels as they are.
         return _calibrate(path, array, stated)
-    if 262 in page.tags and page.photometric == _WHITE_IS_ZERO:
+    if 262 in page.tags and page.photometric == PHOTOMETRIC.MINISWHITE:
         if array.dtype.kind not in "bu":
             raise FileFormatError(
                 f"{path} says that 0 is white, but holds {array.dtype} pixels, which have no "
@@ -335,7 +335,7 @@ def _convert_values(
             return ~array, ("0 is white, inverted as the file says",)
         white = 2**page.bitspersample - 1
         return (white - array).astype(array.dtype), ("0 is white, inverted as the file says",)
-    if page.photometric == _PALETTE and page.colormap is not None and array.ndim == 2:
+    if page.photometric == PHOTOMETRIC.PALETTE and page.colormap is not None and array.ndim == 2:
         return np.moveaxis(page.colormap[:, array.astype(np.intp)], 0, -1), ()
     return _scale(_tag(tiff, page, 42112), array)
 
@@ -344,10 +344,10 @@ def _calibrate(
     path: Path, array: AnyArray, stated: dict[str, Any]
 ) -> tuple[AnyArray, tuple[str, ...]]:
     """Apply the calibration of ImageJ, which has one for whole numbers of 8 and 16 bits."""
-    function = int(stated.get("cf", _UNCALIBRATED))
-    if function == _UNCALIBRATED or array.dtype.kind != "u" or array.dtype.itemsize > 2:
+    function = int(stated.get("cf", 20))  # 20 is none, 0 to 3 are polynomials
+    if function == 20 or array.dtype.kind != "u" or array.dtype.itemsize > 2:
         return array, ()
-    if function not in _POLYNOMIALS:
+    if function not in range(4):
         raise FileFormatError(
             f"{path} has ImageJ's calibration function {function} of unit "
             f"{stated.get('vunit', 'none')!r}: expected a straight line or a polynomial; choose "
@@ -391,7 +391,9 @@ def _warnings(page: Any, layout: _Layout) -> tuple[Caution, ...]:
         cautions.append(gamma_warning("a TIFF with a colour profile"))
     elif curve is not None and not _is_straight(np.asarray(curve, dtype=np.float64)):
         cautions.append(gamma_warning("a TIFF with a transfer function"))
-    elif page.photometric == _YCBCR or (page.compression in _JPEG and page.dtype == np.uint8):
+    elif page.photometric == PHOTOMETRIC.YCBCR or (
+        page.compression in _JPEG and page.dtype == np.uint8
+    ):
         cautions.append(gamma_warning("a JPEG in a TIFF"))
     if layout.left_out:
         text = (
@@ -433,8 +435,6 @@ def _pixel_sides(tiff: Any, page: Any) -> tuple[tuple[float, ...], bool]:
 
 def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
     """Write a plane as float32 TIFF, the width of a pixel (m) as its resolution."""
-    import tifffile
-
     options: dict[str, Any] = {}
     if pixel_size is not None:
         per_centimetre = 0.01 / pixel_size
