@@ -191,7 +191,7 @@ def write_spe(path: Path, frames: np.ndarray) -> None:
     body = b"".join(frame.astype("<u2").tobytes() + b"\xff" * 8 for frame in frames)
     struct.pack_into("<Q", header, 678, 4100 + len(body))
     size = 2 * height * width
-    footer = f'<DataBlock type="FileFrame" count="{count}" size="{size}" stride="{size + 8}">'
+    footer = f'<DataBlock type="Frame" count="{count}" size="{size}" stride="{size + 8}">'
     path.write_bytes(bytes(header) + body + footer.encode())
 
 
