@@ -176,10 +176,7 @@ def resolved_path(path: str | Path) -> Path:
 
 
 def size_limit(*, share: float = 1 / 8, memory_if_unknown: int = 8_000_000_000) -> int:
-    """Return the largest size of a file in memory (bytes).
-
-    By `LIMIT_VARIABLE`, or as a share of the memory.
-    """
+    """Return the most bytes of a file in memory, by `LIMIT_VARIABLE` or a share of the memory."""
     text = os.environ.get(LIMIT_VARIABLE)
     if text is None:
         return int(share * (physical_memory() or memory_if_unknown))

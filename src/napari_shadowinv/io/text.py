@@ -194,10 +194,7 @@ def _read_rows(path: Path, height: int, width: int) -> FloatArray:
 
 
 def _read_lines(path: Path, most_bytes: int = 4_000_000) -> Iterator[tuple[int, str]]:
-    """Yield the lines that are not blank, with their numbers from 1.
-
-    A row of 100,000 pixels with all their digits has 2.5 MB.
-    """
+    """Yield the lines that are not blank, with numbers from 1; 100,000 pixels have 2.5 MB."""
     with path.open("rb") as file:
         for number in itertools.count(1):
             raw = file.readline(most_bytes)
@@ -240,10 +237,7 @@ def _parse_row(path: Path, number: int, line: str, width: int | None) -> FloatAr
 
 
 def _parse_geometry(path: Path, number: int, line: str, most: int = 200) -> dict[str, float]:
-    """Return the geometry that a comment states, in the setup's units: one entry or none.
-
-    Comments of more letters are prose.
-    """
+    """Return the geometry in the setup's units that a comment, no prose, states: one or none."""
     from napari_shadowinv.physics.setup import beam_quantities
 
     entry = _ENTRY.match(line) if len(line) <= most else None
