@@ -5,16 +5,15 @@
 
 from __future__ import annotations
 
-import base64
 import json
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from napari_shadowinv import __version__
+from napari_shadowinv._system.arrays import checksum
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.cautions import Caution
@@ -24,9 +23,13 @@ from napari_shadowinv.options import Noise
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.recipe import Recipe
 
-# Characters of a mask, of a table and of the whole: HDF5 keeps no attribute longer than 64,000.
-_MAX_MASK, _MAX_FIDUCIALS, _MAX_TEXT = 48_000, 9_000, 54_000
+if TYPE_CHECKING:
+    import xarray
+
 _MASKS = ("mask", "source_mask")
+_MASK_NAME = "input_mask_{}"  # of a dataset's variable, by the index of the mask
+
+MaskVariable: TypeAlias = tuple[tuple[str, ...], BoolArray | None, dict[str, str]]
 
 
 class Origin(CheckedModel):
@@ -50,30 +53,36 @@ class Origin(CheckedModel):
 
 
 class MaskOrigin(Origin):
-    """Origin of a mask, with its `pixels`, packed, unless it is too complicated."""
+    """Origin of a mask.
 
-    pixels: str | None = None
+    Attributes
+    ----------
+    checksum : str
+        SHA-256 of its pixels.
+    pixels : ndarray of bool or None
+        The mask, an array beside the provenance; None where that is missing.
+    """
+
+    checksum: str = ""
+    pixels: Any = Field(None, exclude=True, repr=False)
 
     @classmethod
     def of(cls, mask: BoolArray) -> MaskOrigin:
-        """Pack a mask, unless it is too complicated for the file."""
-        packed = base64.b85encode(zlib.compress(np.packbits(mask).tobytes(), 9)).decode()
-        height, width = mask.shape
-        return cls(pixels=packed if len(packed) <= _MAX_MASK else None, shape=(height, width))
+        """Return the origin of an array."""
+        return cls(checksum=checksum(mask), pixels=mask)
 
-    def mask(self) -> BoolArray | None:
-        """Unpack a mask."""
-        if self.pixels is None or self.shape is None:
-            return None
-        size = self.shape[0] * self.shape[1]
-        try:
-            bits = zlib.decompressobj().decompress(base64.b85decode(self.pixels), size // 8 + 8)
-        except (ValueError, zlib.error):
-            bits = b""
-        if min(self.shape) < 1 or len(bits) != -(-size // 8):
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, MaskOrigin) and self.model_dump() == other.model_dump()
+
+    def __hash__(self) -> int:
+        return hash(self.checksum)
+
+    def mask(self) -> BoolArray:
+        """Return the mask; an `InputError` if it is missing or damaged."""
+        if self.pixels is None or checksum(self.pixels) != self.checksum:
             raise InputError("the mask stored in the result is damaged: give the mask again")
-        packed = np.frombuffer(bits, np.uint8)
-        return np.unpackbits(packed, count=size).reshape(self.shape).astype(bool)
+        mask: BoolArray = self.pixels
+        return mask
 
 
 class ImageOrigin(Origin):
@@ -126,13 +135,13 @@ class Provenance(CheckedModel):
     images : tuple of ImageOrigin
         The images, in their order; the scans of a film pack.
     masks : tuple of MaskOrigin
-        All masks of images and sources, each once.
+        All masks of images and sources, each once; their pixels are variables of the dataset.
     setup : Setup or None
         Geometry of the pixels of an inversion.
     fiducials : Origin or None
         The table of known displacements.
     fiducial_rows : tuple or None
-        Its rows, if they are not too many.
+        Its rows.
     start : Provenance or None
         The inversion that a fit refines, with the same image, source and masks.
     pack : Pack or None
@@ -164,15 +173,17 @@ class Provenance(CheckedModel):
         return self
 
     @classmethod
-    def of(cls, attributes: Mapping[str, Any]) -> Provenance | None:
+    def of(
+        cls, attributes: Mapping[str, Any], variables: Mapping[Any, Any] | None = None
+    ) -> Provenance | None:
         """Read the provenance from the attributes of a dataset or the report of a shot.
 
-        None if it is missing or unreadable.
+        The dataset's variables have the pixels of the masks. None if it is missing or unreadable.
         """
         content = attributes.get("provenance", "")
         try:
             text = content if isinstance(content, str) else json.dumps(content)
-            return cls.model_validate_json(text)
+            return cls.model_validate_json(text).with_pixels(variables or {})
         except (ValidationError, RecursionError):
             return None
 
@@ -194,17 +205,37 @@ class Provenance(CheckedModel):
         first = self.image.model_copy(update=entries)
         return self.model_copy(update={"images": (first, *self.images[1:])})
 
-    def shorten(self) -> Provenance:
-        """Return it without the pixels of masks and the rows of a table that exceed the file."""
-        rows = self.fiducial_rows
-        if rows is not None and len(str(rows)) > _MAX_FIDUCIALS:
-            rows = None
-        bare = self.model_copy(update={"fiducial_rows": rows, "masks": ()})
-        room, masks = _MAX_TEXT - len(bare.to_json()), []
-        for mask in self.masks:
-            room -= len(mask.pixels or "")
-            masks.append(mask if room >= 0 else mask.model_copy(update={"pixels": None}))
-        return bare.model_copy(update={"masks": tuple(masks)})
+    @property
+    def mask_variables(self) -> dict[str, MaskVariable]:
+        """The masks as variables of a dataset."""
+        return mask_variables([mask.pixels for mask in (self.start or self).masks])
+
+    def added_to(self, dataset: xarray.Dataset) -> xarray.Dataset:
+        """Return a dataset with this in its attributes, and with its masks."""
+        present = {k: each for k, each in self.mask_variables.items() if each[1] is not None}
+        return dataset.assign(present).assign_attrs(provenance=self.to_json())
+
+    def with_pixels(self, variables: Mapping[Any, Any]) -> Provenance:
+        """Return a copy whose masks have the pixels that the variables hold."""
+        masks = [
+            mask.model_copy(update={"pixels": _pixels_in(variables, _MASK_NAME.format(k))})
+            for k, mask in enumerate(self.masks)
+        ]
+        start = self.start and self.start.with_pixels(variables)
+        return self.model_copy(update={"masks": tuple(masks), "start": start})
+
+
+def mask_variables(masks: Sequence[BoolArray | None], *along: str) -> dict[str, MaskVariable]:
+    """Return masks by the names of their variables; `along` are dimensions before y and x."""
+    labels = {"units": "1", "long_name": "Usable pixels of an input, as recorded"}
+    return {
+        _MASK_NAME.format(k): ((*along, f"input_y_{k}", f"input_x_{k}"), mask, labels)
+        for k, mask in enumerate(masks)
+    }
+
+
+def _pixels_in(variables: Mapping[Any, Any], name: str) -> BoolArray | None:
+    return np.asarray(variables[name]).astype(bool) if name in variables else None
 
 
 def index_masks(

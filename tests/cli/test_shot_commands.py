@@ -980,10 +980,15 @@ def test_a_damaged_mask_in_a_result_is_reported(
     provenance = Provenance.of(saved.attrs)
     assert provenance is not None
     (original,) = provenance.masks
-    for change in ({"pixels": "nonsense"}, {"pixels": "\N{BULLET}"}, {"shape": (10**9, 10**9)}):
-        mask = original.model_copy(update=change)
-        text = provenance.model_copy(update={"masks": (mask,)}).model_dump_json()
-        write("bad.shadowinv", saved.assign_attrs(provenance=text), overwrite=True)
+    mask = original.model_copy(update={"checksum": "nonsense"})
+    text = provenance.model_copy(update={"masks": (mask,)}).model_dump_json()
+    for bad in (
+        saved.assign_attrs(provenance=text),
+        saved.drop_vars("input_mask_0"),
+        saved.assign(input_mask_0=~saved["input_mask_0"]),
+        saved.drop_vars("input_mask_0").assign(input_mask_0=("name", ["nonsense"])),
+    ):
+        write("bad.shadowinv", bad, overwrite=True)
         refused("rerun", "bad.shadowinv", names="the mask stored in the result is damaged")
 
 

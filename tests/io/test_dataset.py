@@ -142,7 +142,7 @@ def test_attributes_contain_recipe_and_origins(tmp_path: Path, proton_setup: Pro
     )
     inversion = run(recipe, Shot(tmp_path / "shot.npy", source=tmp_path / "beam.npy", mask=dead))
     dataset = inversion.to_dataset()
-    provenance = Provenance.of(dataset.attrs)
+    provenance = Provenance.of(dataset.attrs, dataset.variables)
     assert provenance == inversion.provenance == Inversion.from_dataset(dataset).provenance
     assert provenance is not None
     assert provenance.recipe == recipe.model_copy(update={"source": MeasuredSource()})

@@ -11,9 +11,6 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 from scipy.io import savemat
 
 from napari_shadowinv import (
@@ -50,7 +47,7 @@ from napari_shadowinv.preprocessing import (
     polynomial_source,
     remove_background,
 )
-from napari_shadowinv.provenance import MaskOrigin
+from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.shot import Shot
 
 SHAPE = (40, 52)
@@ -165,10 +162,18 @@ def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step,
         np.testing.assert_allclose(ratio, ratio.mean(), rtol=2e-4)
 
 
-@given(arrays(bool, st.tuples(st.integers(4, 30), st.integers(4, 30))))
-def test_a_mask_is_kept_whole(mask: Any) -> None:
-    stored = MaskOrigin.model_validate_json(MaskOrigin.of(mask).model_dump_json())
-    np.testing.assert_array_equal(stored.mask(), mask)
+def test_masks_of_random_pixels_are_kept_whole_beside_the_result(image: FloatArray) -> None:
+    mask, source_mask = np.random.default_rng(0).random((2, *image.shape)) > 0.1
+    source_mask[8:12, 8:14] = False
+    recipe = Recipe(source=PolynomialEstimate(degree=0), options=OPTIONS)
+    dataset = run(recipe, image, mask=mask, source_mask=source_mask).to_dataset()
+    provenance = Provenance.of(dataset.attrs, dataset.variables)
+    assert provenance is not None
+    origin = provenance.image
+    for index, expected in ((origin.mask, mask), (origin.source_mask, source_mask)):
+        kept = provenance.mask_of(index)
+        assert kept is not None
+        np.testing.assert_array_equal(kept.mask(), expected)
 
 
 @pytest.mark.parametrize("n_bad", [0, 9])
@@ -185,11 +190,6 @@ def test_a_mask_of_bad_pixels_is_called_inverted(
     leaves = f"mask leaves {n_bad} of {bad.size:,} pixels usable"
     with pytest.raises(InputError, match=f"{leaves}.*NeXus pixel masks 0 is usable"):
         run(recipe, Shot(image, source=np.ones(SHAPE), **masks))
-
-
-def test_a_mask_too_complex_for_an_attribute_is_not_kept_in_part() -> None:
-    noise = np.random.default_rng(0).random((900, 900)) > 0.5
-    assert MaskOrigin.of(noise).mask() is None
 
 
 def changed(choice: type[Choice]) -> Choice:

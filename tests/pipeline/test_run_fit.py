@@ -12,12 +12,13 @@ import tifffile
 from helpers.fit_images import of_each
 from napari_shadowinv import Fit, InputError, Instrument, ProtonSetup, fit, rerun
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.io import read, write
+from napari_shadowinv.io import read, read_dataset, write
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import read_recipe, run_fit, write_recipe
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
+from napari_shadowinv.pipeline.rerun import provenance_of
 from napari_shadowinv.preprocessing import (
     Bin,
     Crop,
@@ -26,7 +27,6 @@ from napari_shadowinv.preprocessing import (
     Recipe,
     low_pass_source,
 )
-from napari_shadowinv.provenance import Origin
 from napari_shadowinv.shot import Shot, shots_of
 
 SHAPE = (84, 92)
@@ -119,21 +119,26 @@ def test_provenance_is_complete_and_survives_its_file(
     assert provenance.fiducial_rows == ((5, 6, 0.1, 0.2, 0.5),)
 
 
-def test_provenance_too_large_for_an_attribute_is_omitted() -> None:
+def test_masks_of_random_pixels_and_a_long_table_are_kept_whole(
+    tmp_path: Path, images: list[FloatArray]
+) -> None:
     rng = np.random.default_rng(2)
-    shots = [
-        Shot(rng.normal(10, 1, (400, 400)), mask=rng.random((400, 400)) > 0.4, strength=(k,))
-        for k in (1.0, 2.0, 3.0)
-    ]
-    rows = np.column_stack([rng.uniform(0, 390, (900, 2)), np.zeros((900, 2)), np.ones(900)])
+    large = [np.pad(image, ((0, 400), (0, 400)), mode="edge") for image in images[:2]]
+    masks = [rng.random(image.shape) > 0.4 for image in large]
+    for mask in masks:
+        mask[:40, :40] = True
+    rows = np.column_stack([rng.uniform(0, 30, (2000, 2)), np.zeros((2000, 2)), np.ones(2000)])
+    shots = [Shot(large[k], SETUPS[k], mask=masks[k]) for k in range(2)]
     shots[0] = replace(shots[0], fiducials=rows)
-    inputs = collect_fit_inputs(Recipe(), shots)
-    provenance = inputs.provenance
-    assert [mask.pixels is None for mask in provenance.masks] == [False, False, True]
-    assert provenance.fiducial_rows is None
-    assert provenance.fiducials == Origin()
-    assert len(provenance.to_json()) < 60_000
-    np.testing.assert_array_equal(of_each(inputs.shots, "mask"), [shot.mask for shot in shots])
+    crop = Crop(y=(0, 40), x=(0, 48))
+    result = run_fit(Recipe(steps=(crop,), fit=FitChoices(options=HASTY)), shots)
+    write(tmp_path / "fit.shadowinv", result)
+    provenance = provenance_of(read_dataset(tmp_path / "fit.shadowinv"))
+    assert provenance == result.provenance
+    assert provenance is not None
+    np.testing.assert_array_equal([mask.mask() for mask in provenance.masks], masks)
+    np.testing.assert_array_equal(provenance.fiducial_rows, rows)
+    assert rerun(tmp_path / "fit.shadowinv", large).is_identical
 
 
 def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[FloatArray]) -> None:

@@ -224,7 +224,8 @@ def test_a_tiff_with_pages_a_mask_and_bins(night, folder):
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     dataset = read("f.shadowinv.zarr")
-    assert dict(dataset.sizes) == {"shot": 6, "y": 12, "x": 14, "component": 2}
+    recorded = {"input_y_0": 24, "input_x_0": 28}  # of the mask
+    assert dict(dataset.sizes) == {"shot": 6, "y": 12, "x": 14, "component": 2, **recorded}
     assert float(dataset.x[1]) == pytest.approx(4e-5)
 
     def binned(image: np.ndarray) -> np.ndarray:

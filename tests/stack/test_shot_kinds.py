@@ -23,7 +23,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.io.store import DONE
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.pipeline import RunOptions
+from napari_shadowinv.pipeline import RunOptions, rerun
 from napari_shadowinv.stack._shots import find_shots
 
 SHAPE, COUNT = (32, 36), 4
@@ -142,3 +142,7 @@ def test_each_shot_has_the_mask_of_its_own_file(images: np.ndarray, tmp_path: Pa
         np.testing.assert_array_equal(stored["mask"][index], usable)
         potential = alone.potential - stored["potential"][index].values
         assert np.ptp(potential[usable]) < 1e-3 * np.ptp(alone.potential)
+    again = rerun(stored.isel(shot=1), tmp_path / "shot_1.tif")
+    np.testing.assert_array_equal(again.dataset["mask"], stored["mask"][1])
+    potential = (again.dataset["potential"] - stored["potential"][1]).values[usable]
+    assert np.ptp(potential) < 1e-3 * np.ptp(again.dataset["potential"].values[usable])

@@ -7,13 +7,14 @@
 - two masks together: `join_masks`; enough usable pixels: `check_usable`
 - size of a pixel by the coordinates: `coordinate_spacing`
 - blocks of a plane: `block_sums`, `block_means`, `complete_block_means`
-- places of values in their order: `order_by_value`
+- places of values in their order: `order_by_value`; their `checksum`
 
 Everything else, dask arrays included, passes through untouched.
 """
 
 from __future__ import annotations
 
+import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import PurePath
@@ -36,9 +37,6 @@ METRES |= {"metre": 1.0, "meter": 1.0, "micrometer": 1e-6, "micron": 1e-6, "mill
 _PIXEL_NAMES = {"px", "pixel", "pixels"}
 _SQUARES = {f"{name}{power}" for name in _PIXEL_NAMES for power in ("²", "^2", "**2", "2")}
 _UNITS = {PIXELS: _PIXEL_NAMES, SQUARE_PIXELS: _SQUARES}
-_UNEVEN = 1e-2  # of the mean spacing
-_MIN_USABLE_PX = 4  # side of the smallest image
-_FEW_USABLE = 0.1  # of the pixels
 
 
 def unpack_array(
@@ -177,17 +175,19 @@ def check_mask(mask: ArrayLike | None, shape: tuple[int, ...], name: str = "imag
     return usable
 
 
-def check_usable(usable: BoolArray, name: str = "mask") -> None:
-    """Raise an `InputError` if a mask leaves no part of an image usable."""
+def check_usable(
+    usable: BoolArray, name: str = "mask", *, share: float = 0.1, side: int = 4
+) -> None:
+    """Raise an `InputError` if a mask leaves neither a `share` usable nor a square of a `side`."""
     from scipy.ndimage import binary_erosion
 
     count = int(np.count_nonzero(usable))
-    block = np.ones((_MIN_USABLE_PX,) * usable.ndim)
-    if count > _FEW_USABLE * usable.size or binary_erosion(usable, block).any():
+    block = np.ones((side,) * usable.ndim)
+    if count > share * usable.size or binary_erosion(usable, block).any():
         return
     raise InputError(
         f"{name} leaves {count:,} of {usable.size:,} pixels usable, expected at least "
-        f"{_MIN_USABLE_PX} × {_MIN_USABLE_PX} next to each other: a mask is true, in a file not "
+        f"{side} × {side} next to each other: a mask is true, in a file not "
         "0, where a pixel is usable; in NeXus pixel masks 0 is usable, so invert such a mask"
     )
 
@@ -210,13 +210,16 @@ def as_numbers(name: str, values: ArrayLike) -> FloatArray:
         raise InputError(f"{name} is {text:.60}: expected numbers, as many in each row") from error
 
 
-def coordinate_spacing(values: Any, name: str) -> float | None:
-    """Return the size of a pixel in m by the coordinates y and x; None if they do not have it."""
+def coordinate_spacing(values: Any, name: str, *, uneven: float = 1e-2) -> float | None:
+    """Return the size of a pixel in m by the coordinates y and x; None if they do not have it.
+
+    Spacings may be `uneven` by this share of their mean.
+    """
     if not _is_labelled(values):
         return None
-    sizes = [_spacing(values, dim, name) for dim in PLANE if dim in values.dims]
+    sizes = [_spacing(values, dim, name, uneven) for dim in PLANE if dim in values.dims]
     lengths = [size for size in sizes if size is not None]
-    if len(lengths) == len(PLANE) and abs(lengths[0] - lengths[1]) > _UNEVEN * max(lengths):
+    if len(lengths) == len(PLANE) and abs(lengths[0] - lengths[1]) > uneven * max(lengths):
         raise InputError(
             f"{name} has pixels of {lengths[0]:.4g} m along y and {lengths[1]:.4g} m along x by "
             "its coordinates: expected square ones; resample it"
@@ -224,10 +227,10 @@ def coordinate_spacing(values: Any, name: str) -> float | None:
     return lengths[0] if lengths else None
 
 
-def check_spacing(values: Any, name: str, sizes: Sequence[float]) -> None:
+def check_spacing(values: Any, name: str, sizes: Sequence[float], *, uneven: float = 1e-2) -> None:
     """Refuse an image whose coordinates contradict all pixel sizes (m) that a setup has."""
-    spacing = coordinate_spacing(values, name)
-    if spacing is None or any(abs(spacing - size) <= _UNEVEN * size for size in sizes):
+    spacing = coordinate_spacing(values, name, uneven=uneven)
+    if spacing is None or any(abs(spacing - size) <= uneven * size for size in sizes):
         return
     raise InputError(
         f"{name} has pixels of {spacing:.4g} m by its coordinates, the setup "
@@ -261,7 +264,7 @@ def _order_axes(array: Any, name: str, dims: Sequence[str], unit: str) -> Any:
     return array.transpose(*leading, *plane).data
 
 
-def _spacing(array: Any, dim: str, name: str) -> float | None:
+def _spacing(array: Any, dim: str, name: str, uneven: float) -> float | None:
     """Return the distance between pixels along one dimension in m, or None if unknown."""
     if dim not in array.coords:
         return None
@@ -271,7 +274,7 @@ def _spacing(array: Any, dim: str, name: str) -> float | None:
         return None
     steps = np.diff(places.astype(np.float64))
     mean = float(steps.mean())
-    if not np.isfinite(steps).all() or np.abs(steps - mean).max() > _UNEVEN * abs(mean):
+    if not np.isfinite(steps).all() or np.abs(steps - mean).max() > uneven * abs(mean):
         raise InputError(
             f"{name} has coordinates along {dim} that are not evenly spaced: expected pixels of "
             "one size; resample it, or drop the coordinates"
@@ -321,3 +324,10 @@ def order_by_value(values: FloatArray) -> AnyArray:
     order = np.argsort(bits.astype(np.uint16), kind="stable")
     highs = (bits >> 16).astype(np.uint16)
     return np.asarray(order[np.argsort(highs[order], kind="stable")])
+
+
+def checksum(array: AnyArray) -> str:
+    """Return the SHA-256 of an array's values, shape and type, in hexadecimal."""
+    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+    digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()

@@ -389,9 +389,7 @@ class Fit(Summarised):
             yield error_fact("beam", f"{origin}{report.beam.text}")
         names = {each.key: each.name(each.tested) for each in IMPERFECTIONS}
         effects = ", ".join(
-            f"{to_figures(share)} ({names[key]})"
-            if share > 1
-            else f"{percent(share)} ({names[key]})"
+            f"{percent(share)} ({names[key]})"
             for key, share in report.sensitivities.items()
             if key not in report.parts
         )
@@ -621,8 +619,6 @@ class Fit(Summarised):
             "fields": json.dumps(names),
             "setups": json.dumps([each.model_dump(mode="json") for each in self.setups]),
         }
-        if self.provenance is not None:
-            history["provenance"] = self.provenance.to_json()
         merged = merge_fields(names, [field_dataset(field, self.setup) for field in self.fields])
         merged.attrs.update(history | dict(attributes or {}))
         merged["field"] = ("field", names)
@@ -641,7 +637,7 @@ class Fit(Summarised):
         for name, values in arrays.items():
             dims, units, text = _VARIABLES[name]
             merged[name] = dims[: values.ndim], values, label(units, text)
-        return merged
+        return merged if self.provenance is None else self.provenance.added_to(merged)
 
     @classmethod
     @as_input_errors("the fit")
@@ -691,7 +687,7 @@ class Fit(Summarised):
             options=FitOptions.model_validate_json(attributes["options"]),
             instrument=Instrument.model_validate_json(attributes["instrument"]),
             setups=setups_in(dataset),
-            provenance=Provenance.of(attributes),
+            provenance=Provenance.of(attributes, dataset.variables),
             noise=noise_in(dataset, "noise"),
         )
 

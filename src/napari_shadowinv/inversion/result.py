@@ -446,7 +446,6 @@ class Inversion(Summarised):
             "image_residual": self.report.image_residual,
         }
         if self.provenance is not None:
-            history["provenance"] = self.provenance.to_json()
             setup = self.setup if setup is None else setup
         if self.pixel_errors is not None:
             history["error_causes"] = json.dumps(self.pixel_errors.causes)
@@ -464,13 +463,14 @@ class Inversion(Summarised):
         if self.pixel_errors is not None:
             dims, *words = DISPLACEMENT_STD
             dataset["displacement_std"] = dims, self.pixel_errors.std, label(*words)
-        return dataset.assign(
+        dataset = dataset.assign(
             {
                 name: (dims, getattr(self, name), label(units, long_name))
                 for name, (dims, units, long_name) in VARIABLES.items()
                 if name not in dataset
             }
         )
+        return dataset if self.provenance is None else self.provenance.added_to(dataset)
 
     @classmethod
     @as_input_errors("the result")
@@ -499,7 +499,7 @@ class Inversion(Summarised):
             report=_report_schema().validate_python(content),
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             instrument=Instrument.model_validate_json(dataset.attrs["instrument"]),
-            provenance=Provenance.of(dataset.attrs),
+            provenance=Provenance.of(dataset.attrs, dataset.variables),
             pixel_errors=_pixel_errors(dataset, "displacement_std"),
         )
 
@@ -559,7 +559,7 @@ class RetrievedField(Summarised):
     @property
     def provenance(self) -> Provenance | None:
         """Provenance of the shot, if the dataset contains it."""
-        return Provenance.of(self.dataset.attrs)
+        return Provenance.of(self.dataset.attrs, self.dataset.variables)
 
     @property
     def headline(self) -> Headline:

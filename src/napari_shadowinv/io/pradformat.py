@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy import constants
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 
 _VERSION = "0.2.0"
 _OBJECT_TYPES = ("radiograph", "inversion")
-_EV_PER_MEV = 1e6
 _SYMBOLS: dict[Species, str] = {
     "proton": "p+",
     "deuteron": "D 1+",
@@ -122,7 +122,7 @@ def _read_geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[s
         pixel: attributes.get(width),
         "species": species if "spec_name" in attributes else None,
         # The energy of a species that nobody here knows gives no field.
-        "energy": energy / _EV_PER_MEV if energy is not None and species else None,
+        "energy": energy / constants.mega if energy is not None and species else None,
     }
     first, second = attributes.get(width), attributes.get(f"{width}_ax2")
     if first is not None and second is not None and not np.isclose(first, second, rtol=1e-6):
@@ -157,9 +157,13 @@ def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
         displacement = setup.displacement(np.stack([arrays["defl_ax1"], arrays["defl_ax2"]]))
     else:
         displacement = displacement_from_potential(-setup.normalized_potential(arrays["phi"]))
-    labels = {name: attributes[name] for name in ("provenance",) if name in attributes}
-    labels["format"] = "pradformat"
-    return dataset_from_field(displacement, potential, setup, attributes=labels)
+    labels = {"format": "pradformat"}
+    dataset = dataset_from_field(displacement, potential, setup, attributes=labels)
+    provenance = Provenance.of(attributes)
+    if provenance is None:
+        return dataset
+    masks = _read_datasets(path, tuple(provenance.mask_variables))
+    return provenance.with_pixels(masks).added_to(dataset)
 
 
 def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
@@ -184,8 +188,10 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
     attributes["description"] = ": ".join(
         filter(None, [f"{method} by napari-shadowinv", verdict and str(verdict)])
     )
-    provenance = Provenance.of(dataset.attrs)
+    provenance = Provenance.of(dataset.attrs, dataset.variables)
     if provenance is not None:
+        masks = provenance.mask_variables.items()
+        datasets |= {name: mask for name, (_, mask, _) in masks if mask is not None}
         attributes["provenance"] = provenance.to_json()
         if provenance.images and provenance.image.file:
             attributes["radiograph_filename"] = provenance.image.file
@@ -213,7 +219,7 @@ def _beam_attributes(setup: Any) -> dict[str, Any]:
         "spec_name": _SYMBOLS[setup.species],
         "spec_mass": setup.particle.mass,
         "spec_charge": setup.particle.charge,
-        "spec_energy": setup.energy * _EV_PER_MEV,
+        "spec_energy": setup.energy * constants.mega,
         "file_date": datetime.now(UTC).date().isoformat(),
     }
 

@@ -255,6 +255,7 @@ def read_stack(path: Path) -> xarray.Dataset:
     # The folder's own order is arbitrary.
     columns = (column.key for column in store.columns)
     order = [*_labels(dataset, setup), "status", *columns, "setup", "report"]
+    order += sorted(map(str, complete.data_vars.keys() - {*order}))
     ordered = complete[[name for name in order if name in complete]]
     return ordered.assign(status=ordered["status"].copy(data=store.statuses()))
 

@@ -267,7 +267,7 @@ def collect_fit_inputs(
         _with_choices(shot, recorded[k], choices, names[k], unknown) for k, shot in enumerate(ready)
     ]
     complete[0] = replace(complete[0], fiducials=table)
-    return FitInputs(tuple(complete), provenance.shorten())
+    return FitInputs(tuple(complete), provenance)
 
 
 def _with_choices(
@@ -391,8 +391,7 @@ def _image_origins(
         entries["setup"] = inputs.shot.setup
         entries |= {"notes": shot.notes, "warnings": shot.warnings}
         origins.append(before.image.model_copy(update=entries))
-        indices = before.image.mask, before.image.source_mask
-        masks.append([before.mask_of(index) for index in indices])
+        masks.append(list(map(before.mask_of, (before.image.mask, before.image.source_mask))))
     return index_masks(origins, masks)
 
 

@@ -410,9 +410,8 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
         check_spacing(given.source, "the source", setup.pixel_sizes)
     usable = _mask((loaded.mask, recipe.mask), "mask", loaded.shape)
     is_array = not isinstance(given.source, Shot | str | Path)
-    if is_array and beam is not None and beam.mask is not None:  # of a masked array
-        usable = _Mask(join_masks(usable.pixels, beam.mask), None)
-    usable = _without_missing(usable, loaded, beam)
+    lit = beam.mask if is_array and beam is not None else None  # of a masked array
+    usable = _without_gaps(usable, lit, loaded, beam)
     bare = _mask((loaded.source_mask, recipe.source_mask), "source mask", loaded.shape)
     kind = recipe.source
     if kind is None:
@@ -433,8 +432,8 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
         dark=None if dark is None else _origin(dark),
         brightness=factor,
     )
-    masks = index_masks([origin], [(usable.origin, bare.origin)])
-    provenance = Provenance(kind="inversion", recipe=resolved, **masks).shorten()
+    masks = index_masks([origin], [(usable, bare)])
+    provenance = Provenance(kind="inversion", recipe=resolved, **masks)
     complete = replace(
         loaded,
         image=loaded.image if factor is None else loaded.image / factor,
@@ -442,8 +441,8 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
         source=None if beam is None else beam.image,
         setup=resolved.setup,
         warnings=(*loaded.warnings, *(() if beam is None else beam.warnings)),
-        mask=usable.pixels,
-        source_mask=bare.pixels,
+        mask=None if usable is None else usable.pixels,
+        source_mask=None if bare is None else bare.pixels,
         dark=None if dark is None else dark.image,
     )
     return Inputs(resolved, complete, provenance)
@@ -493,32 +492,23 @@ def _source_file(kind: MeasuredSource, shot: Shot) -> Path | None:
     return kind.file if kind.file is not None or kind.variable is None else shot.path
 
 
-@dataclass(frozen=True, eq=False)
-class _Mask:
-    pixels: BoolArray | None
-    file: Path | None
-
-    @property
-    def origin(self) -> MaskOrigin | None:
-        if self.pixels is None:
-            return None
-        packed = MaskOrigin.of(self.pixels)
-        if self.file is None:
-            return packed
-        file, variable = split_address(self.file)
-        file_origin = {"file": text_of(file.name), "variable": variable, "sha256": sha256(file)}
-        return packed.model_copy(update=file_origin)
-
-
-def _mask(masks: Sequence[ArrayLike | Path | None], name: str, shape: tuple[int, int]) -> _Mask:
+def _mask(
+    masks: Sequence[ArrayLike | Path | None], name: str, shape: tuple[int, int]
+) -> MaskOrigin | None:
     """Return where all masks are true, with the file if there is only one, which is a file."""
-    given = [mask for mask in masks if mask is not None]
+    given: list[Any] = [mask for mask in masks if mask is not None]
+    if not given:
+        return None
     planes = [_pixels(mask, name) for mask in given]
     for mask, pixels in zip(given, planes, strict=True):
         is_file = isinstance(mask, (str, Path))
         check_shape(f"{mask}: {name}" if is_file else name, pixels.shape, shape)
-    (file,) = given if len(given) == 1 else (None,)
-    return _Mask(join_masks(*planes), Path(file) if isinstance(file, (str, Path)) else None)
+    joined = MaskOrigin.of(join_masks(*planes))
+    if len(given) > 1 or not isinstance(given[0], (str, Path)):
+        return joined
+    path, variable = split_address(given[0])
+    from_file = {"file": text_of(path.name), "variable": variable, "sha256": sha256(path)}
+    return joined.model_copy(update=from_file)
 
 
 def _pixels(mask: Any, name: str) -> Any:
@@ -537,12 +527,17 @@ def _pixels(mask: Any, name: str) -> Any:
     return pixels
 
 
-def _without_missing(mask: _Mask, *images: Shot | None) -> _Mask:
-    """Remove the pixels without a value in the files of images from a mask."""
+def _without_gaps(
+    mask: MaskOrigin | None, lit: BoolArray | None, *images: Shot | None
+) -> MaskOrigin | None:
+    """Remove what a source's own mask hides, and pixels without a value in files, from a mask."""
+    masks = [] if lit is None else [lit]
     masked = (image for image in images if image is not None and image.mask is not None)
-    present = [~np.isnan(image.image) for image in masked]
-    pixels: Any = join_masks(mask.pixels, *present)
-    return _Mask(pixels, None if (pixels != mask.pixels).any() else mask.file) if present else mask
+    masks += [~np.isnan(image.image) for image in masked]
+    pixels = join_masks(mask and mask.pixels, *masks)
+    if pixels is None or (mask is not None and np.array_equal(pixels, mask.pixels)):
+        return mask
+    return MaskOrigin.of(pixels)
 
 
 def picture_mask(path: Path, name: str = "mask", variable: str | None = None) -> BoolArray:

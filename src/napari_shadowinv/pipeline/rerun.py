@@ -18,21 +18,20 @@ import numpy as np
 from napari_shadowinv import __version__
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.safety import as_file_errors
-from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind, to_figures
 from napari_shadowinv.fitting import Fit, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset
-from napari_shadowinv.io.files import join_address, sha256, split_address
+from napari_shadowinv.io.files import join_address, split_address
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_refinement
-from napari_shadowinv.pipeline.inversion_run import AnyShot, load_shot, picture_mask, run
+from napari_shadowinv.pipeline.inversion_run import AnyShot, load_shot, run
 from napari_shadowinv.pipeline.left_out import run_leave_one_out
 from napari_shadowinv.preprocessing import MeasuredSource, Recipe
-from napari_shadowinv.provenance import MaskOrigin, Origin, Provenance
+from napari_shadowinv.provenance import Origin, Provenance
 from napari_shadowinv.results import result_from_dataset
 from napari_shadowinv.shot import Shot
 
@@ -91,10 +90,8 @@ class RerunInputs:
         The images with source, masks and setup; empty for a film pack.
     files : tuple of Path
         All files that were read, the images first.
-    masks : tuple of MaskOrigin
-        The origins of all masks; files as they are now.
     changes : tuple of str
-        Changes of the version and of masks and tables.
+        Changes of the version.
     """
 
     dataset: xarray.Dataset
@@ -102,7 +99,6 @@ class RerunInputs:
     recipe: Recipe
     shots: tuple[Shot, ...] = ()
     files: tuple[Path, ...] = ()
-    masks: tuple[MaskOrigin, ...] = ()
     changes: tuple[str, ...] = ()
 
     @property
@@ -131,7 +127,7 @@ class RerunInputs:
         dataset = content.to_dataset()
         if left_out is not None:
             dataset = left_out.added_to(dataset)
-        after = Provenance.of(dataset.attrs)
+        after = content.provenance
         changes = [*self.changes, *([] if after is None else _image_changes(before, after))]
         difference = _difference(self.dataset, dataset)
         return Rerun(content, dataset, left_out, tuple(dict.fromkeys(changes)), difference)
@@ -146,7 +142,8 @@ class RerunInputs:
             raise error.about(shot.path) from error
         assert inversion.provenance is not None
         # The masks were passed as arrays.
-        provenance = inversion.provenance.model_copy(update={"masks": self.masks})
+        masks_before = (self.provenance.start or self.provenance).masks
+        provenance = inversion.provenance.model_copy(update={"masks": masks_before})
         return replace(inversion, provenance=provenance)
 
     def _fit(self, **callbacks: Any) -> tuple[Fit, LeaveOneOut | None]:
@@ -162,9 +159,7 @@ class RerunInputs:
             left_out = run_leave_one_out(self.recipe, self.shots, fields, **callbacks)
         assert fit.provenance is not None
         # Masks and rows were passed as arrays.
-        origins: dict[str, Any] = {"masks": self.masks}
-        if self.provenance.fiducial_rows is not None:
-            origins["fiducials"] = self.provenance.fiducials
+        origins = {"masks": self.provenance.masks, "fiducials": self.provenance.fiducials}
         return replace(fit, provenance=fit.provenance.model_copy(update=origins)), left_out
 
 
@@ -251,12 +246,12 @@ def collect_rerun(
 
 def provenance_of(dataset: xarray.Dataset) -> Provenance | None:
     """Return the provenance of a result or of one shot of a stack, None if it has none."""
-    provenance = Provenance.of(dataset.attrs)
+    provenance = Provenance.of(dataset.attrs, dataset.variables)
     if "report" not in dataset.variables or dataset["report"].ndim:
         return provenance
     report = json.loads(str(dataset["report"].values))
     if "provenance" in report:
-        return Provenance.of(report)
+        return Provenance.of(report, dataset.variables)
     if provenance is None or provenance.kind != "inversion":
         return None
     origin = {"file": str(dataset["name"].values), "sha256": report.get("sha256", "")}
@@ -312,7 +307,6 @@ class _Reader:
     source: Path | str | None
     other_folders: bool
     files: list[Path] = field(default_factory=list)
-    masks: dict[int, MaskOrigin] = field(default_factory=dict)
     changes: list[str] = field(default_factory=list)
 
     def check(self, file: Path, name: str) -> None:
@@ -348,19 +342,13 @@ class _Reader:
         path = None
         if dark is not None:
             path = join_address(self._find(dark, "the dark frame"), dark.variable)
-        fiducials: FloatArray | Path | None = None
-        if provenance.fiducial_rows is not None:
-            fiducials = np.array(provenance.fiducial_rows)
-        elif provenance.fiducials is not None:
-            fiducials = self._find_changed(provenance.fiducials, "table of fiducials")
-        shots[0] = replace(shots[0], fiducials=fiducials)
+        shots[0] = replace(shots[0], fiducials=provenance.fiducial_rows)
         return RerunInputs(
             dataset,
             provenance,
             _with_dark(provenance.recipe, path),
             tuple(shots),
             tuple(self.files if path is None else [*self.files, path]),
-            tuple(self.masks.get(k, mask) for k, mask in enumerate(origins.masks)),
             tuple(self.changes),
         )
 
@@ -403,44 +391,18 @@ class _Reader:
             (origin.source.file, origin.source.variable) != (origin.file, origin.variable)
         ):
             source = self._read(origin.source, source_name, self.source)
+        mask, source_mask = map(provenance.mask_of, (origin.mask, origin.source_mask))
         return replace(
             image,
-            # The provenance says which other contents of the file were used.
+            # The provenance has the other contents of the file that were used; the mask of a file
+            # in a stack is its own.
             setup=origin.setup or provenance.recipe.setup,
             source=image.source if source is None else source,
-            mask=self._mask(provenance, origin.mask, image.mask),
-            source_mask=self._mask(provenance, origin.source_mask, image.source_mask),
+            mask=image.mask if mask is None else mask.mask(),
+            source_mask=None if source_mask is None else source_mask.mask(),
             measured=origin.measured,
             **{name: getattr(origin, name) for name in NUMBERS},
         )
-
-    def _mask(
-        self, provenance: Provenance, index: int | None, image_mask: BoolArray | None
-    ) -> BoolArray | None:
-        """Return a mask from the result, its file or the image's file."""
-        origin = provenance.mask_of(index)
-        if index is None or origin is None:
-            return None
-        mask = origin.mask()
-        if mask is not None:
-            return mask
-        if origin.file:
-            path = self._find_changed(origin, "mask")
-            self.masks[index] = origin.model_copy(update={"sha256": sha256(path)})
-            return picture_mask(path, variable=origin.variable)
-        if image_mask is None:
-            raise InputError(
-                "a mask is too complex to be stored in the result, and was not a file: repeat the "
-                "work with a recipe and the mask"
-            )
-        return image_mask
-
-    def _find_changed(self, origin: Origin, name: str) -> Path:
-        """Return a file, and record whether it has changed."""
-        path = self._find(origin, f"the {name}")
-        self.files.append(path)
-        self.changes += _file_changes(name, origin, Origin(file=path.name, sha256=sha256(path)))
-        return path
 
 
 def _with_dark(recipe: Recipe, path: Path | None) -> Recipe:

@@ -298,5 +298,7 @@ def _lazy_dataset(stack: Stack) -> xarray.Dataset:
         if column.value is not None:
             values = of_each_shot(column.key, (), column.kind)
             variables[column.key] = (("shot",), values, column.labels)
+    if not stack.task.by_row:
+        variables |= stack.task.masks
     dataset = xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes_of(stack))
     return dataset if setups is None else with_places(dataset)

@@ -19,6 +19,7 @@ from napari_shadowinv._system.arrays import (
     check_mask,
     check_shape,
     check_spacing,
+    checksum,
     join_masks,
     unpack_array,
     unpack_mask,
@@ -39,7 +40,7 @@ from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
 from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, UniformEstimate
-from napari_shadowinv.provenance import Origin
+from napari_shadowinv.provenance import Origin, index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
     ArrayReference,
@@ -47,7 +48,6 @@ from napari_shadowinv.stack._shots import (
     Reader,
     RowsReference,
     Shots,
-    checksum,
     find_shots,
     find_source,
     first_image,
@@ -108,6 +108,8 @@ class Stack:
     def sizes(self) -> dict[str, int]:
         height, width = self.task.shape
         sizes = {"shot": len(self.shots), "y": height, "x": width, "component": 2}
+        for dims, *_ in self.task.masks.values():
+            sizes |= zip(dims[-2:], self.task.inputs.shot.shape, strict=True)
         if isinstance(self.task, FitTask):
             return sizes
         # Sites of shots with their own beams are stored only if they do not depend on the beam.
@@ -280,6 +282,9 @@ def _plan_inversion(
     options = inputs.recipe.options
     ragged = own_masks or (beam is None and (options.boundary == "free" or options.is_adaptive))
     chosen = _checked_variables(variables, inputs.recipe, ragged=ragged)
+    if rows:  # the common masks are among those of each shot
+        unmasked = index_masks(inputs.provenance.images, [(None, None)])
+        inputs = replace(inputs, provenance=inputs.provenance.model_copy(update=unmasked))
     task = InvertTask(inputs=inputs, variables=chosen, by_row=bool(rows), estimate=recipe.estimate)
     return task, beam
 

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv import __version__
+from napari_shadowinv._system.arrays import checksum
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
@@ -66,7 +67,7 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
     values_of_beam,
 )
-from napari_shadowinv.stack._shots import Reader, checksum, differences, read_shot
+from napari_shadowinv.stack._shots import Reader, differences, read_shot
 from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext, run_shots
 
 if TYPE_CHECKING:
@@ -432,6 +433,8 @@ def _variables(stack: Stack) -> dict[str, StoreArray]:
             variables[name] = StoreArray(dims, stored, labels, values)
         else:
             variables[name] = StoreArray(("shot", *dims), stored, labels, None)
+    for name, (dims, pixels, labels) in stack.task.masks.items():
+        variables[name] = StoreArray(dims, np.dtype(bool), labels, pixels)
     return variables
 
 

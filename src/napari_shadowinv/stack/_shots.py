@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import inspect
 import json
 from collections import Counter
@@ -22,7 +21,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import PLANE, join_masks, unpack_array, unpack_planes
+from napari_shadowinv._system.arrays import (
+    PLANE,
+    checksum,
+    join_masks,
+    unpack_array,
+    unpack_planes,
+)
 from napari_shadowinv._system.validation import map_paths
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.cautions import Caution
@@ -241,13 +246,6 @@ def stamp(path: Path) -> dict[str, int]:
     """Return size and time of a file, which identify its content."""
     status = path.stat()
     return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
-
-
-def checksum(array: AnyArray) -> str:
-    """Return the SHA-256 of an array's values, shape and type, in hexadecimal."""
-    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
-    digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
 
 
 def reader_text(reader: Reader) -> str:

@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import join_masks
+from napari_shadowinv._system.arrays import checksum, join_masks
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -40,8 +40,9 @@ from napari_shadowinv.pipeline import Cache, Inputs, collect_inputs, run_fit, ru
 from napari_shadowinv.pipeline.fit_run import usual_fields
 from napari_shadowinv.pipeline.inversion_run import same_array
 from napari_shadowinv.preprocessing import Estimate, Recipe, UniformEstimate
+from napari_shadowinv.provenance import MaskVariable, mask_variables
 from napari_shadowinv.shot import Shot
-from napari_shadowinv.stack._shots import ArrayReference, Exposure, checksum
+from napari_shadowinv.stack._shots import ArrayReference, Exposure
 from napari_shadowinv.transport.sites import SitePlan
 
 _REFRESH_S = 10.0  # workers come and go, but asking takes milliseconds
@@ -152,6 +153,11 @@ class Task:
         return self.moved.setup
 
     @property
+    def masks(self) -> dict[str, MaskVariable]:
+        """The masks of the images as variables of all shots."""
+        return self.inputs.provenance.mask_variables
+
+    @property
     def attributes(self) -> dict[str, str]:
         """Attributes of a dataset of the results."""
         provenance = self.inputs.provenance
@@ -185,6 +191,15 @@ class InvertTask(Task):
     def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
         """Dimensions and labels of all variables that the results can have."""
         return variable_labels(self.setup)
+
+    @property
+    def masks(self) -> dict[str, MaskVariable]:
+        """As of all tasks; each row of a table may have its own, of image and source."""
+        return mask_variables([None, None], "shot") if self.by_row else super().masks
+
+    def arrays(self, result: Any) -> dict[str, AnyArray]:
+        masks = result.provenance.mask_variables.items() if self.by_row else ()
+        return super().arrays(result) | {name: pixels for name, (_, pixels, _) in masks}
 
     @property
     def identity(self) -> dict[str, str]:
