@@ -18,7 +18,7 @@ from napari_shadowinv._system.progress import OnProgress, OnStep, ShouldStop, ru
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting._fit import collect_starts, report_steps, reweight_counts
+from napari_shadowinv.fitting._fit import report_steps, reweight_counts
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import finer, settle
@@ -38,6 +38,7 @@ from napari_shadowinv.fitting.search import (
     settle_minimum,
 )
 from napari_shadowinv.fitting.shots import Shots
+from napari_shadowinv.fitting.starts import collect_starts
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions, Instrument
 

@@ -340,13 +340,20 @@ def settle_minimum(
     )
 
 
+class Refined(NamedTuple):
+    """Where a descent in recorded pixels has ended, and whether within the allowed steps."""
+
+    scene: Scene
+    unknowns: Unknowns
+    objective: float
+    iterations: int
+    converged: bool
+
+
 def refine_minimum(
     scene: Scene, minimum: Minimum, options: FitOptions, on_step: OnStep, *, is_near: bool = False
-) -> tuple[Scene, Unknowns, float, int, bool]:
-    """Descend with the pixels as recorded, with rays as dense as the data need.
-
-    Also returns the number of steps, and whether it converged within the allowed number.
-    """
+) -> Refined:
+    """Descend with the pixels as recorded, with rays as dense as the data need."""
     unknowns, steps = _in_smaller_pixels(scene, minimum), 0
     modes = minimum.modes if minimum.bin == scene.bin else SoftModes()
     has_dense_rays = scene.imperfect.resembles_fields and not is_near
@@ -367,6 +374,6 @@ def refine_minimum(
         chi2 = scene.chi2(unknowns)
         explained = not denser or bool(chi2.max() < _EXPLAINED)
         if steps >= options.max_iterations or (ended and explained):
-            return scene, unknowns, value, steps, ended
+            return Refined(scene, unknowns, value, steps, ended)
         if not explained:
             scene = replace(scene, spacing=denser.pop(0))

@@ -1,0 +1,183 @@
+"""How far images leave a fit open: `explore`, and where its other starts end: `find_basins`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from napari_shadowinv._system.progress import OnStep
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.instrument import ASSUMED, EXACT, Imperfect
+from napari_shadowinv.fitting.measurements import FitData
+from napari_shadowinv.fitting.posterior import (
+    BeamShifts,
+    Posterior,
+    Sample,
+    compare_samples,
+    displacement_errors,
+    errors_by_part,
+    largest_share,
+    shifts_by_beam,
+)
+from napari_shadowinv.fitting.result import Basin
+from napari_shadowinv.fitting.rivals import transmission_of
+from napari_shadowinv.fitting.search import (
+    SPACING_WITH_NUMBERS,
+    Minimum,
+    in_recorded_pixels,
+    settle_minimum,
+)
+from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
+from napari_shadowinv.inversion.samples import Pairs
+from napari_shadowinv.options import FitOptions
+
+
+@dataclass(frozen=True)
+class Openness:
+    """How far the images leave the best unknowns open, and how far an instrument would move them.
+
+    `basins` are the answers of all starts, the best first; `posterior` is that of counts; `pairs`
+    compares samples with those that are solved in full; `errors`, `by_part` and `by_beam` are those
+    of the displacement, `sensitivities` shares of it. `assumed` are the likely changes by a
+    detector of which nothing was stated.
+    """
+
+    basins: tuple[Basin, ...]
+    posterior: Posterior | None
+    samples: list[Sample]
+    pairs: Pairs | None
+    errors: FloatArray | None
+    by_part: dict[str, FloatArray]
+    by_beam: BeamShifts | None
+    assumed: dict[str, Unknowns]
+    sensitivities: dict[str, float]
+
+    def amplified(self, factor: float) -> Openness:
+        """Return the same with larger errors by noise, as correlated noise makes them."""
+        if self.errors is None:
+            return self
+        by_part = {**self.by_part, "noise": factor * self.by_part["noise"]}
+        more = (factor**2 - 1) * self.by_part["noise"] ** 2
+        return replace(self, errors=np.sqrt(self.errors**2 + more), by_part=by_part)
+
+
+def find_basins(
+    scene: Scene, best: Minimum, others: Sequence[Minimum], on_step: OnStep
+) -> tuple[Basin, ...]:
+    """Return the best answer and others, with the same λ and without blur.
+
+    Smoother fields have decided which is best: the present λ favours what follows the
+    noise.
+    """
+    ends = [best]
+    for minimum in others[:2]:
+        rival = minimum if minimum.bin == best.bin else in_recorded_pixels(scene, minimum)
+        unknowns = rival.unknowns._replace(
+            common=best.unknowns.common, separate=best.unknowns.separate
+        )
+        rival = replace(rival, unknowns=unknowns)
+        ends.append(settle_minimum(scene, rival, on_step, "other starts"))
+    middle = best.coarsen(scene)
+    chi2 = [float(middle.chi2(end.unknowns).mean()) for end in ends]
+    return tuple(
+        Basin(end.start, end.value, each, best.distance(end), end.displacement)
+        for end, each in zip(ends, chi2, strict=True)
+    )
+
+
+def explore(
+    data: FitData,
+    scene: Scene,
+    best: Minimum,
+    basins: tuple[Basin, ...],
+    rng: np.random.Generator,
+    options: FitOptions,
+    on_step: OnStep,
+    *,
+    spacing: float = 1 / 3,
+    checked: int = 2,
+    least_of_beams: int = 24,
+) -> Openness:
+    """Draw samples around the best unknowns, and respond to a detector that nobody stated.
+
+    Rays are `spacing` px apart. Of samples of an instrument, so many are solved, too, to be
+    `checked`. Where each image has a beam of its own, a few directions hold most of the error, so
+    that there are at least `least_of_beams` samples.
+    """
+
+    def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:
+        # What rays that are far apart add would tell fields from what resembles them.
+        is_dense = scene.imperfect.resembles_fields
+        middle = best.coarsen(scene, SPACING_WITH_NUMBERS if is_dense else spacing)
+        return Posterior(middle, start.unknowns, rng, lambda: on_step("samples", best.value), modes)
+
+    posterior = posterior_with(scene, best, None if data.single else copy(best.modes))
+    count = options.samples if options.samples > 1 else 0
+    if count and "beam_between" in scene.imperfect.keys:
+        count = max(count, least_of_beams)
+    samples = posterior.draw_samples(count)
+    if options.sampling == "resolve":
+        linear, solved = samples, posterior.solve(samples)
+    else:
+        linear = samples[: checked if scene.imperfect.of_response else 0]
+        solved = posterior.solve(linear, steps=1)
+    pairs = compare_samples(posterior.scene, linear, solved) if solved else None
+    samples = solved if options.sampling == "resolve" else samples
+    changes = [sample.change for sample in samples]
+    errors = displacement_errors(scene, changes, data.size) if changes else None
+    by_part = errors_by_part(scene, posterior, samples, data.size)
+    if errors is not None and not by_part:
+        by_part = {"noise": errors}
+    by_beam = shifts_by_beam(data, scene, posterior, samples, options)
+    responses: dict[str, tuple[Unknowns, float]] = {}
+    sensitivities: dict[str, float] = {}
+    if samples:
+        tested = replace(scene, imperfect=_tested_instrument(data, best))
+        response = posterior_with(tested, adapt(best, tested.imperfect, EXACT))
+        exact = None if scene.imperfect.parts else posterior
+        responses = response.responses(np.random.default_rng(options.seed), exact)
+        moves = response.scene.displacement
+        of_best = moves(best.unknowns)
+        sensitivities = {
+            key: largest_share(moves(change), of_best) for key, (change, _) in responses.items()
+        }
+    # Counts are those of a detector that is linear and has no dark level.
+    is_linear = data.counted or data.instrument.has_numbers
+    return Openness(
+        basins,
+        posterior if data.counted else None,  # its Jacobians are large
+        samples,
+        pairs,
+        errors=errors,
+        by_part=by_part,
+        by_beam=by_beam,
+        assumed={
+            key: change.like(size * change.flat())
+            for key, (change, size) in responses.items()
+            if key in ASSUMED and not is_linear
+        },
+        sensitivities=sensitivities,
+    )
+
+
+def _tested_instrument(data: FitData, minimum: Minimum) -> Imperfect:
+    """Return the imperfections to which each fit states its sensitivity."""
+    sizes = {each.key: each.tested for each in IMPERFECTIONS if each.tested}
+    shapes = transmission_of(data, minimum, sizes.pop("absorption"))
+    return Imperfect(
+        gamma=sizes["gamma"],
+        blur=sizes["blur"] ** 2,
+        background=sizes["background"],
+        shapes=(shapes,),
+    )
+
+
+def adapt(minimum: Minimum, imperfect: Imperfect, before: Imperfect) -> Minimum:
+    """Return a minimum with the numbers of other imperfections than before."""
+    return replace(minimum, unknowns=imperfect.adapt(minimum.unknowns, before))

@@ -1,0 +1,86 @@
+"""Where the search of a fit begins: `collect_starts`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from napari_shadowinv._system.progress import OnStep, ShouldStop
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.fitting.measurements import FitData
+from napari_shadowinv.fitting.search import Start
+from napari_shadowinv.inversion import invert
+from napari_shadowinv.options import InversionOptions
+
+# Widths of the pixels, and of the smoothing, of each stage of the search.
+_FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
+_FROM_NEAR = ((4, 2.0), (2, 2.0), (2, 1.0))
+_FROM_FIELD = ((4, 1.0), (2, 1.0))
+
+
+def collect_starts(
+    data: FitData,
+    on_step: OnStep,
+    should_stop: ShouldStop | None,
+    *,
+    shares: Sequence[float] = (1.0, 1.4, 1.9, 2.4),
+    rounded: float = 8.0,
+) -> list[Start]:
+    """Return the starting points: no field, a field that is known, and inversions by transport.
+
+    Past caustics transport is too weak, so one image starts from several `shares` of its
+    potential, which is blurred by `rounded` px.
+    """
+    # A beam that is about uniform comes after the field.
+    scene, held = data.scene, data.assumed
+    candidates = []
+    if data.near is not None:
+        return [Start("near field", ((2, 1.0),), data.start)]
+    if data.start is not None:
+        candidates.append(Start("given", ((2, 1.0),), data.start, held))
+    if not data.single:
+        candidates.append(Start("from far", _FROM_FAR, beam_held=held))
+    candidates.append(Start("from near", _FROM_NEAR, beam_held=held))
+    if data.unknown and not data.single:
+        candidates.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
+    if scene.strengths.shape[1] > 1 or data.unknown:
+        return candidates
+    sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
+    weakest = int(np.argmin(np.where(sizes > 0, sizes, np.inf)))
+    on_step("transport", float("nan"))
+    transported = _transport_potential(data, weakest, should_stop)
+    if transported is None:
+        return candidates
+    potential = gaussian_filter(transported, rounded) / scene.strengths[weakest, 0]
+    if not data.single:
+        return [*candidates, Start("transport", ((2, 2.0), (2, 1.0)), potential, held)]
+    return candidates + [
+        Start(f"{share:g} × transport", _FROM_FIELD, share * potential) for share in shares
+    ]
+
+
+def _transport_potential(
+    data: FitData, number: int, should_stop: ShouldStop | None, most_sites: int = 10_000
+) -> FloatArray | None:
+    """Return the potential that transport makes of an image; None if it makes none of it."""
+    height, width = data.size
+    scene = data.scene
+    image = scene.images[number, :height, :width]
+    used = scene.weights[number, :height, :width] > 0
+    pad = scene.pad
+    beam = scene.beams[number, pad : pad + height, pad : pad + width]
+    options = InversionOptions(
+        n_sites=min(most_sites, height * width),
+        negative="clip",
+        threads=scene.threads,
+        tolerance=0.05,
+    )
+    try:
+        return invert(
+            image, source=beam, mask=used, options=options, should_stop=should_stop
+        ).potential
+    except InputError:
+        return None

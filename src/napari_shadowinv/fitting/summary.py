@@ -1,0 +1,264 @@
+"""The answer of a fit.
+
+- in recorded pixels, with its verdict: `summarise`
+- its errors: `field_errors`; what it tells of itself: `report_of`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.facts import Verdict
+from napari_shadowinv.fitting.conjugate_gradients import product
+from napari_shadowinv.fitting.exploration import Openness
+from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.instrument import Imperfect, numbers_in_units
+from napari_shadowinv.fitting.measurements import FitData
+from napari_shadowinv.fitting.pattern import Pattern
+from napari_shadowinv.fitting.posterior import (
+    BeamError,
+    BeamShifts,
+    Sample,
+    displacement_errors,
+    largest_share,
+    potentials_of,
+    sampled_potentials,
+)
+from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
+from napari_shadowinv.fitting.search import Refined
+from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
+from napari_shadowinv.options import FitOptions
+from napari_shadowinv.physics.edge import edge_changes, edge_sides
+from napari_shadowinv.physics.forward import jacobian_determinant
+
+
+@dataclass(frozen=True)
+class FieldErrors:
+    """Errors of displacements, (M, 2, H, W) px: in all, if there are any, and by each part.
+
+    With samples of potentials, (M, n, H, W), and the sides beyond which an object may lie.
+    """
+
+    in_all: FloatArray | None
+    by_part: dict[str, FloatArray]
+    samples: FloatArray | None
+    sides: tuple[str, ...] = ()
+
+    def with_part(self, key: str, errors: FloatArray) -> FieldErrors:
+        """Return the same with another part."""
+        in_all = None if self.in_all is None else np.hypot(self.in_all, errors)
+        return replace(self, in_all=in_all, by_part={**self.by_part, key: errors})
+
+
+def field_errors(
+    data: FitData, scene: Scene, openness: Openness, amplification: float, seed: int
+) -> FieldErrors:
+    """Return the errors by noise, numbers, beam and an assumed detector, and samples of fields."""
+    amplified = openness.amplified(amplification)
+    errors = FieldErrors(amplified.errors, amplified.by_part, None)
+    if openness.errors is None or amplified.errors is None:
+        return errors
+    by_beam = openness.by_beam
+    of_beam = () if by_beam is None else by_beam.changes
+    shifts = [*of_beam, *openness.assumed.values()]
+    samples = sampled_potentials(scene, openness.samples, shifts, data.size, seed)
+    before, after = openness.errors.ravel(), amplified.errors.ravel()
+    samples *= np.float32(np.sqrt(product(after, after) / product(before, before)))
+    errors = replace(errors, samples=samples)
+    if by_beam is not None:
+        errors = errors.with_part("beam", by_beam.errors)
+    for key, change in openness.assumed.items():
+        errors = errors.with_part(key, displacement_errors(scene, [change], data.size))
+    return errors
+
+
+def with_edge(
+    errors: FieldErrors, potentials: FloatArray, displacements: FloatArray, seed: int
+) -> FieldErrors:
+    """Return errors with that by what lies beyond the edge, as far as it exceeds them."""
+    if errors.in_all is None or errors.samples is None:
+        return errors
+    changes = _changes_by_edge(potentials, displacements, errors.in_all)
+    by_edge = np.sqrt((changes[:, :, 1:] ** 2).sum(axis=1))
+    if by_edge.any():
+        samples = _beyond_edge(errors.samples, changes[:, :, 0], seed)
+        errors = replace(errors.with_part("edge", by_edge), samples=samples)
+    return replace(errors, sides=edge_sides((by_edge**2).sum(axis=(0, 1))))
+
+
+def summarise(
+    data: FitData,
+    names: Sequence[str],
+    options: FitOptions,
+    refined: Refined,
+    basins: tuple[Basin, ...],
+    errors: FieldErrors,
+    report: FitReport,
+    pattern: Pattern,
+) -> Fit:
+    """Return the answer of a fit in recorded pixels, with its verdict."""
+    scene, unknowns = refined.scene, refined.unknowns
+    height, width = data.size
+    counts = scene.ray_counts(unknowns)
+    units = data.units[:, None, None]
+    used = scene.weights[:, :height, :width] > 0
+    images = scene.images[:, :height, :width] * units
+    model = scene.model(unknowns, counts)[:, :height, :width] * units
+    brightness = np.exp(unknowns.brightness)
+    beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
+    displacements = scene.displacement(unknowns)[..., :height, :width].copy()
+    potentials = potentials_of(scene, unknowns, data.size)
+    errors = with_edge(errors, potentials, displacements, options.seed)
+    jacobian = _most_folded(scene, displacements)
+    unassessed = Fit(
+        images=images,
+        mask=used,
+        strengths=scene.strengths,
+        fields=tuple(
+            FittedField(
+                name,
+                potentials[m],
+                displacements[m],
+                None if errors.in_all is None else errors.in_all[m],
+                (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1])),
+                None if errors.samples is None else errors.samples[m],
+            )
+            for m, name in enumerate(names)
+        ),
+        source=beams,
+        brightness=brightness * data.brightness,
+        frames=unknowns.frames,
+        reprojection=model,
+        residual=np.where(used, images - model, 0.0),
+        chi2=data.noise.relative_chi2(scene.chi2(unknowns, counts)),
+        basins=basins,
+        folded=float((jacobian < 0).mean()),
+        verdict=Verdict.UNCERTAIN,
+        explanation="",
+        report=_with_shares(report, errors, displacements),
+        options=options,
+        instrument=data.instrument,
+        setups=data.setups or (),
+        noise=data.noise_of(scene.weights),
+    )
+    verdict, explanation = assess_verdict(
+        unassessed,
+        pattern,
+        jacobian,
+        single=data.single,
+        beam_unknown=data.unknown,
+        hidden=hidden_contrast(model / np.maximum(beams, 1e-3 * units) - 1, used),
+        searched=data.near is None,
+        noise=data.noise,
+    )
+    return replace(unassessed, verdict=verdict, explanation=explanation)
+
+
+def report_of(
+    data: FitData,
+    instrument: Imperfect,
+    refined: Refined,
+    openness: Openness,
+    pattern: Pattern,
+    amplification: float,
+    options: FitOptions,
+) -> FitReport:
+    """Return what a fit tells of itself; its errors follow."""
+    unknowns, pairs = refined.unknowns, openness.pairs
+    displacements = refined.scene.displacement(unknowns)[..., : data.size[0], : data.size[1]]
+    by_beam = openness.by_beam
+    return FitReport(
+        objective=refined.objective,
+        iterations=refined.iterations,
+        converged=refined.converged,
+        seconds={},
+        total=float("nan"),
+        pattern=pattern.largest,
+        noise_correlation=pattern.correlation,
+        added=_added_light(data, refined, openness.samples, amplification),
+        numbers=numbers_in_units(
+            instrument,
+            instrument.adapt(unknowns, refined.scene.imperfect),
+            [sample.change for sample in openness.samples],
+        ),
+        sensitivities=openness.sensitivities,
+        sampling=options.sampling,
+        nonlinearity=float("nan") if pairs is None else pairs.nonlinearity,
+        spread_ratio=float("nan") if pairs is None else pairs.spread_ratio,
+        beam=None if by_beam is None else _beam_error(data, by_beam, displacements),
+        beam_rms=data.beam.rms,
+        recorded=not data.assumed,
+    )
+
+
+def _with_shares(report: FitReport, errors: FieldErrors, displacements: FloatArray) -> FitReport:
+    shares = {key: largest_share(each, displacements) for key, each in errors.by_part.items()}
+    in_all = errors.in_all
+    return replace(
+        report,
+        total=float("nan") if in_all is None else largest_share(in_all, displacements),
+        parts=dict(sorted(shares.items(), key=lambda part: -part[1])),
+        sides=errors.sides,
+    )
+
+
+def _most_folded(scene: Scene, displacements: FloatArray) -> FloatArray:
+    """Return the Jacobian of the image in which most of it is negative."""
+    jacobians = [
+        jacobian_determinant(moved)
+        for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)
+    ]
+    return max(jacobians, key=lambda each: int((each < 0).sum()))
+
+
+def _added_light(
+    data: FitData, refined: Refined, samples: Sequence[Sample], amplification: float
+) -> dict[str, list[list[list[float]]]]:
+    """Return coefficients of light that adds to each image, in its unit, with their σ."""
+    scene, unknowns = refined.scene, refined.unknowns
+    units = (data.units * np.exp(unknowns.brightness))[:, None]
+    light = {}
+    for number, block in enumerate(scene.added):
+        values = units * unknowns.added[number]
+        changes = [sample.change.added[number] for sample in samples]
+        spreads = np.full_like(values, np.nan)
+        if changes:
+            spreads = units * amplification * np.sqrt(np.mean(np.square(changes), axis=0))
+        light[block.title] = np.stack([values, spreads], axis=-1).tolist()
+    return light
+
+
+def _changes_by_edge(
+    potentials: FloatArray, displacements: FloatArray, errors: FloatArray
+) -> FloatArray:
+    """Return each field's `edge_changes`, (M, k, 3, H, W), as far as they exceed other errors.
+
+    Other errors, (M, 2, H, W), move the fields at the edge, too.
+    """
+    changes = np.array(list(map(edge_changes, potentials, displacements)))
+    squares = (changes[:, :, 1:] ** 2).sum(axis=1).mean(axis=(1, 2, 3))
+    explained = (errors**2).mean(axis=(1, 2, 3))
+    excess = np.maximum(1 - explained / np.maximum(squares, 1e-300), 0.0)
+    return np.asarray(np.sqrt(excess)[:, None, None, None, None] * changes)
+
+
+def _beyond_edge(samples: FloatArray, changes: FloatArray, seed: int) -> FloatArray:
+    """Add what lies beyond the edge, (M, k, H, W), to samples of potentials, (M, n, H, W)."""
+    rng = np.random.default_rng([seed, *b"edge"])
+    draws = rng.normal(size=(samples.shape[1], changes.shape[1]))
+    beyond = np.einsum("sk,mkyx->msyx", draws, changes).astype(np.float32)
+    return np.asarray(samples + beyond)
+
+
+def _beam_error(data: FitData, by_beam: BeamShifts, displacements: FloatArray) -> BeamError:
+    return BeamError(
+        sensitivity=largest_share(by_beam.by_percent, displacements),
+        variation=data.beam.rms,
+        share=largest_share(by_beam.errors, displacements),
+        scale=data.beam.length,
+        assumed=data.assumed or (data.beam.rms > 0 and data.instrument.beam_rms is None),
+    )
