@@ -77,12 +77,6 @@ _OTHER_UNITS = 3.0  # an image's mean brightness over its source's
 _FREE_SHARE = 0.1  # of the shorter side
 _FREE_TIE = 0.3
 
-_ALIGNED = {
-    "none": np.zeros(6, bool),
-    "shift": np.array([True, False, False] * 2),
-    "affine": np.ones(6, bool),
-}
-
 
 @dataclass(frozen=True)
 class FitData:
@@ -145,98 +139,62 @@ def collect_data(
     """Check the inputs of a fit; see `fit` for their forms."""
     instrument = as_model(Instrument, instrument, "instrument")
     shots = list_shots(shots)
-    count, names = len(shots), names_of(shots)
+    names = names_of(shots)
     data, recorded, used = _checked_planes(shots, names)
-    height, width = data.shape[1:]
+    shape: tuple[int, int] = data.shape[1:]
     unknown = shots[0].beam_unknown
     is_uniform = recorded is None and not unknown
     is_assumed = is_uniform or not all(shot.measured for shot in shots)
-    setups, strengths = values_of(shots, "setup"), values_of(shots, "strength")
-    if strengths is None:
-        matrix = strengths_of(setups, fields, count, names)
-    else:
-        matrix, setups = _checked_strengths(strengths), None
-    matrix = _relative_strengths(matrix)
-    if count == 1 and unknown and not options.ambiguous:
-        raise InputError(
-            "received one image and an unknown source: one image cannot tell the beam from the "
-            "object; give the source or an image of another energy, or allow an ambiguous fit, "
-            "one of many",
-            option="ambiguous",
-        )
-    free_brightness, factors = _checked_brightness(values_of(shots, "brightness"), count)
-    if recorded is None:
-        recorded = np.ones(data.shape) * _means(data, used)[:, None, None]
-    if free_brightness:
-        factors = _means(data, used) / _means(recorded, used)
-    recorded = factors[:, None, None] * recorded
-    _refuse_other_units(_means(data, used) / _means(recorded, used), names)
+    _refuse_ambiguous(shots, options)
+    matrix, setups = _displacements(shots, names, fields)
+    recorded, factors, free_brightness = _bright_sources(shots, data, recorded, used)
     _refuse_what_is_given_twice(data, recorded, used, matrix, names)
     noise = _common_noise(values_of(shots, "noise"))
     beams, deviations, match, remaining = _relative_noise(
         data, recorded, used, noise, instrument, names
     )
-    shapes = [beam / beam.mean() for beam in beams]
     units = _means(beams, used)
-    scaled = np.where(used, data / units[:, None, None], 0.0)
-    weights = np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0)
-
-    free = options.boundary == "free"
-    usual = max(16, 8 * round(_FREE_SHARE * min(height, width) / 8)) if free else 16
-    pad = options.margin or usual
-    fill = [(0, 0), *((0, _fill(side, pad)) for side in (height, width))]
-    size = height + fill[1][1], width + fill[2][1]
-    around = (pad, pad + fill[1][1]), (pad, pad + fill[2][1])
-    is_common = all(np.allclose(beam, shapes[0], rtol=_SAME, atol=0) for beam in shapes[1:])
-    spread = np.linalg.norm(matrix, axis=1)
-    single = count == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
-    prior = instrument.beam_of(measured=not is_assumed, source=shapes[0])
-    if unknown and not instrument.beam_rms:
-        prior = prior.model_copy(update={"rms": UNKNOWN_BEAM_RMS})
-    # Displacement by an electric field that is equal to the field in image 1.
-    has_other = setups is not None and tuple(fields) == ("B",)
-    other_strengths = strengths_of(setups, ("E",), count) if has_other else matrix
+    in_units = beams / units[:, None, None]
+    around, pad = _strips(shape, options)
+    fill = [(0, 0), *((0, after - pad) for _, after in around)]
+    is_common = _are_proportional(beams)
+    single = _is_single(matrix)
+    prior = _beam_prior(instrument, beams[0], is_assumed=is_assumed, unknown=unknown)
     imperfect = imperfect_instrument(
         instrument,
         prior if unknown or not single or instrument.has_numbers else BeamPrior(),
-        beams / units[:, None, None],
+        in_units,
         np.asarray(used.any(axis=0)),
         around,
         is_common=is_common,
-        other_strengths=other_strengths,
+        other_strengths=_other_strengths(setups, fields, matrix),
     )
-    # Of a detector that is not linear, an assumed source does not have the image's mean.
-    is_dimmed = is_uniform and instrument.gamma > 0
-    # A beam of another shape, or behind an object that absorbs, does not have its source's.
-    is_dimmed |= not single and (bool(imperfect.shapes) or instrument.absorption > 0)
-    shift = instrument.registration or 0.0
-    align = "affine" if options.align == "none" and shift else options.align
-    start = value_of_first(shots, "start")
-    near = start if isinstance(start, NearField) else None
-    smoothness = (options.smoothness or 0.0, 0.0) if near is None else near.smoothness
+    # Of a detector that is not linear, an assumed source does not have the image's mean. A beam of
+    # another shape, or behind an object that absorbs, does not have its source's.
+    absorbs = bool(imperfect.shapes) or instrument.absorption > 0
+    is_dimmed = (is_uniform and instrument.gamma > 0) or (not single and absorbs)
+    start, near = _start_of(shots, shape)
+    given = (options.smoothness or 0.0, 0.0) if near is None else near.smoothness
     scene = Scene(
-        images=np.pad(scaled, fill),
-        weights=np.pad(weights, fill),
+        images=np.pad(np.where(used, data / units[:, None, None], 0.0), fill),
+        weights=np.pad(np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0), fill),
         strengths=matrix,
-        beams=np.pad(beams / units[:, None, None], ((0, 0), *around), mode="edge"),
-        psf=[_checked_point_spread(shot.psf, size) for shot in shots],
-        smoothness=np.tile(smoothness, (matrix.shape[1], 1)),
+        beams=np.pad(in_units, ((0, 0), *around), mode="edge"),
+        psf=[_checked_point_spread(shot.psf, shape) for shot in shots],
+        smoothness=np.tile(given, (matrix.shape[1], 1)),
         pad=pad,
-        tie=_FREE_TIE if free else 30.0,
-        decay=(options.decay_length or pad) if free else np.inf,
+        tie=_FREE_TIE if options.boundary == "free" else 30.0,
+        decay=(options.decay_length or pad) if options.boundary == "free" else np.inf,
         free_brightness=free_brightness or unknown or is_dimmed,
-        free_frames=_ALIGNED[align],
-        shift_spread=options.align_spread
-        if align == options.align
-        else instrument.registration or 0.0,
-        fiducials=_checked_fiducials(value_of_first(shots, "fiducials"), (height, width)),
+        **_alignment(instrument, options),
+        fiducials=_checked_fiducials(value_of_first(shots, "fiducials"), shape),
         threads=options.threads,
         added=additive_blocks(options),
         imperfect=imperfect,
     )
     return FitData(
         scene=scene,
-        size=(height, width),
+        size=shape,
         around=around,
         units=units,
         brightness=factors,
@@ -249,11 +207,93 @@ def collect_data(
         beam=prior,
         setups=setups,
         names=names if any(shot.name for shot in shots) else None,
-        start=_checked_start(near.potential if near else start, (height, width)),
+        start=start,
         near=near,
         noise=match,
         reference_noise=remaining,
     )
+
+
+def _displacements(
+    shots: Sequence[Shot], names: Sequence[str], fields: Sequence[str]
+) -> tuple[FloatArray, tuple[Setup, ...] | None]:
+    """Return strengths relative to the first image, and the setups from which they follow."""
+    setups, strengths = values_of(shots, "setup"), values_of(shots, "strength")
+    if strengths is None:
+        return _relative_strengths(strengths_of(setups, fields, len(shots), names)), setups
+    return _relative_strengths(_checked_strengths(strengths)), None
+
+
+def _other_strengths(
+    setups: tuple[Setup, ...] | None, fields: Sequence[str], strengths: FloatArray
+) -> FloatArray:
+    """Return displacements by an electric field that is equal to a magnetic one in image 1."""
+    if setups is None or tuple(fields) != ("B",):
+        return strengths
+    return strengths_of(setups, ("E",), len(setups))
+
+
+def _refuse_ambiguous(shots: Sequence[Shot], options: FitOptions) -> None:
+    if len(shots) == 1 and shots[0].beam_unknown and not options.ambiguous:
+        raise InputError(
+            "received one image and an unknown source: one image cannot tell the beam from the "
+            "object; give the source or an image of another energy, or allow an ambiguous fit, "
+            "one of many",
+            option="ambiguous",
+        )
+
+
+def _bright_sources(
+    shots: Sequence[Shot], data: FloatArray, recorded: FloatArray | None, used: BoolArray
+) -> tuple[FloatArray, FloatArray, bool]:
+    """Return sources as bright as their images, by which factors, and whether these are fitted."""
+    means = _means(data, used)
+    is_free, factors = _checked_brightness(values_of(shots, "brightness"), len(shots))
+    if recorded is None:
+        recorded = np.ones(data.shape) * means[:, None, None]
+    if is_free:
+        factors = means / _means(recorded, used)
+    recorded = factors[:, None, None] * recorded
+    _refuse_other_units(means / _means(recorded, used), names_of(shots))
+    return recorded, factors, is_free
+
+
+def _beam_prior(
+    instrument: Instrument, beam: FloatArray, *, is_assumed: bool, unknown: bool
+) -> BeamPrior:
+    prior = instrument.beam_of(measured=not is_assumed, source=beam / beam.mean())
+    if unknown and not instrument.beam_rms:
+        prior = prior.model_copy(update={"rms": UNKNOWN_BEAM_RMS})
+    return prior
+
+
+def _strips(shape: tuple[int, int], options: FitOptions, usual: int = 16) -> tuple[Around, int]:
+    """Return the strips before and after images along y and x, and the width before them."""
+    if options.boundary == "free":
+        usual = max(usual, 8 * round(_FREE_SHARE * min(shape) / 8))
+    pad = options.margin or usual
+    height, width = shape
+    return ((pad, pad + _fill(height, pad)), (pad, pad + _fill(width, pad))), pad
+
+
+def _is_single(strengths: FloatArray) -> bool:
+    """Return whether there is one image, or several with the same information."""
+    spread = np.linalg.norm(strengths, axis=1)
+    return len(spread) == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
+
+
+def _are_proportional(beams: FloatArray) -> bool:
+    shapes = [beam / beam.mean() for beam in beams]
+    return all(np.allclose(beam, shapes[0], rtol=_SAME, atol=0) for beam in shapes[1:])
+
+
+def _alignment(instrument: Instrument, options: FitOptions) -> dict[str, Any]:
+    """Return which of a frame's six numbers are free, and the spread of its shift in px."""
+    shift = instrument.registration or 0.0
+    if options.align == "none" and shift:
+        return {"free_frames": np.ones(6, bool), "shift_spread": shift}
+    free = {"none": [False] * 6, "shift": [True, False, False] * 2, "affine": [True] * 6}
+    return {"free_frames": np.array(free[options.align]), "shift_spread": options.align_spread}
 
 
 def _relative_noise(
@@ -679,16 +719,22 @@ def _smoothed(image: FloatArray, used: BoolArray) -> FloatArray:
     return np.asarray(np.maximum(means, _DARKEST * image[used].mean()))
 
 
-def _checked_start(start: ArrayLike | None, size: tuple[int, int]) -> FloatArray | None:
+def _start_of(
+    shots: Sequence[Shot], size: tuple[int, int]
+) -> tuple[FloatArray | None, NearField | None]:
+    """Return the potential to start from, and the field that is the only start, if there is one."""
+    start = value_of_first(shots, "start")
+    near = start if isinstance(start, NearField) else None
+    start = near.potential if near else start
     if start is None:
-        return None
+        return None, None
     potential = as_numbers("start", plain_array(start, "start", unit=SQUARE_PIXELS))
     if potential.shape != size or not np.isfinite(potential).all():
         raise InputError(
             f"start has shape {potential.shape}: expected a finite potential in px² of the "
             f"images' shape {size}"
         )
-    return potential
+    return potential, near
 
 
 def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fiducials | None:
