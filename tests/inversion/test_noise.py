@@ -96,3 +96,11 @@ def test_structure_without_calm_parts_is_not_called_white_noise() -> None:
     found = measure(1 + 0.3 * np.sin(y / 2) * np.sin(x / 2))
     assert found.is_bound
     assert found.white_variance**0.5 > 0.3
+
+
+def test_an_image_without_a_whole_block_has_no_correlation_to_measure() -> None:
+    rng = np.random.default_rng(4)
+    excess = rng.normal(0, 0.1, (96, 96))
+    noise = measure_correlation(excess, 1 + excess, rng.random((96, 96)) > 0.4, None)
+    assert noise.variance == 0
+    assert not noise.is_bound

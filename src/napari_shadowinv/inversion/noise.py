@@ -428,7 +428,7 @@ class _CalmDifferences:
     def variance(self, lag: int, share: float) -> float:
         """Return V at a lag over the brightness, in calm blocks; NaN in few or dark pixels."""
         blocks = self.blocks[: max(math.ceil(share * len(self.blocks)), 1)]
-        blocks = blocks[:: -(-len(blocks) // _MAX_BLOCKS)]
+        blocks = blocks[:: max(-(-len(blocks) // _MAX_BLOCKS), 1)]
         inside = np.indices((_BLOCK_PX, _BLOCK_PX)).reshape(2, -1)
         places = (_BLOCK_PX * blocks.T[:, :, None] + inside[:, None]).reshape(2, -1)
         limits = np.array(self.mask.shape)[:, None] - lag
