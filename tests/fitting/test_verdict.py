@@ -13,7 +13,7 @@ from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
-from napari_shadowinv.fitting.verdict import assess_verdict
+from napari_shadowinv.fitting.verdict import Evidence, assess_verdict
 from napari_shadowinv.options import FitOptions, Instrument
 
 
@@ -100,7 +100,7 @@ def assess(
         options=options,
         instrument=instrument,
     )
-    return assess_verdict(fit, **facts)
+    return assess_verdict(Evidence(fit, **facts))
 
 
 ALONE = {

@@ -30,7 +30,7 @@ from napari_shadowinv.fitting.posterior import (
 )
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import Refined
-from napari_shadowinv.fitting.verdict import assess_verdict, hidden_contrast
+from napari_shadowinv.fitting.verdict import Evidence, assess_verdict, hidden_contrast
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.edge import edge_changes, edge_sides
 from napari_shadowinv.physics.forward import jacobian_determinant
@@ -145,7 +145,7 @@ def summarise(
         setups=data.setups or (),
         noise=data.noise_of(scene.weights),
     )
-    verdict, explanation = assess_verdict(
+    evidence = Evidence(
         unassessed,
         pattern,
         jacobian,
@@ -155,6 +155,7 @@ def summarise(
         searched=data.near is None,
         noise=data.noise,
     )
+    verdict, explanation = assess_verdict(evidence)
     return replace(unassessed, verdict=verdict, explanation=explanation)
 
 

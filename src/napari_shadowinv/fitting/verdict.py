@@ -8,6 +8,7 @@ as well. `hidden_contrast` finds masks that hide the structure that determines a
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -21,15 +22,17 @@ from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
 from napari_shadowinv.physics.edge import edge_doubt
 from napari_shadowinv.physics.setup import deflector_titles
-from napari_shadowinv.physics.units import shown_fields
-
-_MIN_HOLE_RADIUS_PX = 6.0
-_RIM_PX = 4
-_SMOOTHED_PX = 1.0
-_STRONGEST = 0.99  # quantile of the contrast, over the image
+from napari_shadowinv.physics.units import Condition, shown_fields
 
 
-def hidden_contrast(contrast: FloatArray, used: BoolArray) -> float:
+def hidden_contrast(
+    contrast: FloatArray,
+    used: BoolArray,
+    *,
+    radius: float = 6.0,
+    rim_width: int = 4,
+    smoothing: float = 1.0,
+) -> float:
     """Return the contrast around the holes of a mask, as a share of the strongest.
 
     Parameters
@@ -37,8 +40,11 @@ def hidden_contrast(contrast: FloatArray, used: BoolArray) -> float:
     contrast : ndarray, shape (L, H, W)
         Model images over their beams, minus 1.
     used : ndarray of bool, shape (L, H, W)
-        The pixels that were fitted. A hole is where no image has any; smaller ones than 12 px are
-        bridged by their surroundings.
+        The pixels that were fitted. A hole is where no image has any.
+    radius : float, default 6
+        Smaller holes are bridged by their surroundings, px.
+    rim_width, smoothing : float, default 4 and 1
+        Width of what is around a hole, and standard deviation of a blur of the contrast, px.
 
     Returns
     -------
@@ -49,15 +55,15 @@ def hidden_contrast(contrast: FloatArray, used: BoolArray) -> float:
     # Holes begin where pixels are missing inside the image, not at its edge.
     depth = ndimage.distance_transform_edt(np.pad(~used_anywhere, 1))[1:-1, 1:-1]
     labels, _ = ndimage.label(~used_anywhere)
-    wide = np.unique(labels[depth >= _MIN_HOLE_RADIUS_PX])
+    wide = np.unique(labels[depth >= radius])
     hole = np.isin(labels, wide[wide > 0])
     if not hole.any():
         return 0.0
-    rim = ndimage.binary_dilation(hole, iterations=_RIM_PX) & used_anywhere
+    rim = ndimage.binary_dilation(hole, iterations=rim_width) & used_anywhere
     shares = []
     for image in contrast:
-        strength = np.abs(ndimage.gaussian_filter(image, _SMOOTHED_PX))
-        strongest = float(np.quantile(strength[used_anywhere], _STRONGEST))
+        strength = np.abs(ndimage.gaussian_filter(image, smoothing))
+        strongest = float(np.quantile(strength[used_anywhere], 0.99))
         around = float(np.quantile(strength[rim], 0.9)) if rim.any() else 0.0
         shares.append(around / max(strongest, 1e-12))
     return max(shares)
@@ -65,22 +71,7 @@ def hidden_contrast(contrast: FloatArray, used: BoolArray) -> float:
 
 MISFIT_CHI2 = 1.3
 """χ² of an image beyond which the model does not explain it."""
-# Of rings that fold 14 % of one image, the found field was 20 % wrong with 7 to 10 % folded and χ²
-# 0.93: where rays meet or cross, one image can be explained by fields of other folds.
-_MEETING, _FEW = 0.2, 0.02  # Jacobian, and share of the object
-_OBJECT = 0.1  # of the largest displacement
-_NEARLY = 5.0  # χ² of a misfit by an edge alone
-_TOO_QUIET = 0.4  # χ²; an estimated noise may be too large by a third
-_AS_GOOD = 0.03  # of the objective
-_OTHER_FIELD, _WITHIN_TOTALS = 0.05, 2.0  # of the displacement, r.m.s., and of its stated error
-_OPEN = 0.05  # of the displacement, r.m.s.
-_LOST = 0.01  # of the rays
-# Of 60 fits on 96 px, the r.m.s. ratio of error to total was 1.0, with a transmission 1.3; of 60 on
-# 64 px the largest was 3.9, of one on 200 px with a blur 3.0.
-# Of 14 with an unknown beam it was up to 3.2 where momenta are close; of beams that differ between
-# energies the r.m.s. ratio was 1.2, of weak rings 1.4.
 _UNDERESTIMATED = {"blur", "gamma", "absorption"}
-_SAFETY = 2.0
 _MEASURE = "measure the {}, or add an image at another energy, which shows more of it"
 _ADVICE = {
     "noise": "average shots, or take images at energies that differ more",
@@ -88,26 +79,41 @@ _ADVICE = {
     "registration": "align the images by marks on each of them",
     "edge": "record a larger field of view",
 }
-_HIDDEN_STRUCTURE = 0.5  # of the strongest contrast
 
 
-def assess_verdict(
-    fit: Fit,
-    pattern: Pattern,
-    jacobian: FloatArray,
-    *,
-    single: bool,
-    beam_unknown: bool,
-    hidden: float,
-    searched: bool = True,
-    noise: NoiseMatch | None = None,
-) -> tuple[Verdict, str]:
-    """Return the verdict on a fit, and a sentence that says why.
+@dataclass(frozen=True)
+class VerdictLimits:
+    """Limits of the rules, as benchmarks/trust.py shows them to be needed.
 
-    Parameters
+    Of rings that fold 14 % of one image, the found field was 20 % wrong with 7 to 10 % folded and
+    χ² 0.93: where rays meet or cross, one image can be explained by fields of other folds.
+
+    Of 60 fits with a fitted instrument on 96 px, the r.m.s. ratio of error to total was 1.0, with a
+    transmission 1.3; of 60 on 64 px the largest was 3.9, of one on 200 px with a blur 3.0. Of 14
+    with an unknown beam it was up to 3.2 where momenta are close; of beams that differ between
+    energies the r.m.s. ratio was 1.2, of weak rings 1.4: hence the safety.
+    """
+
+    chi2_at_edge: float = 5.0  # of a misfit by an edge alone
+    quiet_chi2: float = 0.4  # an estimated noise may be too large by a third
+    as_good: float = 0.03  # of the objective
+    other_field: float = 0.05  # of the displacement, r.m.s.
+    within_totals: float = 2.0  # of other fields, in stated errors
+    missing_counts: float = 0.05
+    lost_rays: float = 0.01
+    meeting: float = 0.2  # Jacobian
+    few: float = 0.02  # share of the object in which rays meet
+    hidden: float = 0.5  # of the strongest contrast
+    safety: float = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the verdict on a fit follows from; its own verdict does not matter.
+
+    Attributes
     ----------
     fit : Fit
-        All else about it; its own verdict does not matter.
     pattern : Pattern
         Structure in the residuals.
     jacobian : ndarray, shape (H, W)
@@ -123,135 +129,267 @@ def assess_verdict(
     noise : NoiseMatch, optional
         The noise of the images against the one that is given or estimated.
     """
-    report, chi2, used = fit.report, fit.chi2, fit.used
-    total, parts = report.total, report.parts
-    max_error = fit.options.max_error
-    displacement = np.sum([field.displacement for field in fit.fields], axis=0)
-    names = [f"image {k + 1}" for k in range(len(chi2))]
-    if fit.setups:
-        pairs = zip(names, fit.setups, strict=True)
-        names = [f"{name} ({setup.probe})" for name, setup in pairs]
-    by_edge = parts.get("edge", 0.0)
-    others = float(np.sqrt(max(report.total**2 - by_edge**2, 0.0)))
-    at_edge = edge_doubt(by_edge, others, max_error, report.sides)
-    if worst := _those(names, chi2, chi2 > MISFIT_CHI2):
-        causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
-        if len(chi2) > 1:
-            causes = f"the object may have changed between images, or energies, {causes}"
-        causes = _cause_text(pattern) or causes
-        # An object that the edge cuts is explained by nothing within it, but nearly.
-        is_near = chi2.max() < _NEARLY and not pattern.cause
-        verdict = Verdict.EDGE if at_edge and is_near else Verdict.MISFIT
-        misfit = f"the forward model does not explain {worst}, where 1 is expected"
-        return verdict, f"{misfit}: {causes if verdict is Verdict.MISFIT else at_edge}"
-    if single and beam_unknown:
-        return Verdict.AMBIGUOUS, (
-            "one image cannot tell the beam from the object: many pairs of them explain it; take "
-            "another energy, or an image of the beam"
-        )
-    if pattern.cause and not pattern.is_certain:
-        return Verdict.MISFIT, f"the images do not look like the model: likely {pattern.cause}"
-    if single and (lost := _share_lost(displacement)) > _LOST:
-        return Verdict.AMBIGUOUS, (
-            f"the object sends {lost:.0%} of the rays past the image, and one image does not show "
-            "which; record a larger field of view, or take another energy"
-        )
-    if single and (meeting := _share_squeezed(jacobian, displacement, _MEETING)) > _FEW:
-        return Verdict.AMBIGUOUS, (
-            f"rays meet or cross over {meeting:.0%} of the object, and one image does not show "
-            "which came from where: the same bright lines come from fields with other folds; take "
-            "another energy"
-        )
-    if pattern.is_certain:
-        # An object that the edge cuts leaves a pattern, too.
-        verdict = Verdict.EDGE if at_edge else Verdict.MISFIT
-        return verdict, "; ".join(filter(None, [at_edge, _pattern_text(pattern, names)]))
-    if pattern.lacks_counts and pattern.missing_counts > _OPEN:
-        share = f"{pattern.missing_counts:.0%}"
-        return Verdict.UNCERTAIN, (
-            f"the noise is {share} smaller than that of as many counts: a dark level of about "
-            f"{share} seems to be left in the images, or the detector's response is not linear, "
-            "and either weakens the field; subtract the dark level from images and source, "
-            "linearise the images, or, if the counts were averaged, scaled or "
-            "smoothed, give their noise"
-        )
-    if at_edge:
-        return Verdict.EDGE, at_edge
-    best, *alternatives = fit.basins
+
+    fit: Fit
+    pattern: Pattern
+    jacobian: FloatArray
+    single: bool
+    beam_unknown: bool
+    hidden: float
+    searched: bool = True
+    noise: NoiseMatch | None = None
+    limits: VerdictLimits = VerdictLimits()
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the images in sentences."""
+        names = [f"image {k + 1}" for k in range(len(self.fit.chi2))]
+        if not self.fit.setups:
+            return names
+        pairs = zip(names, self.fit.setups, strict=True)
+        return [f"{name} ({setup.probe})" for name, setup in pairs]
+
+    @property
+    def displacement(self) -> FloatArray:
+        """Displacement by all fields."""
+        return np.asarray(np.sum([field.displacement for field in self.fit.fields], axis=0))
+
+    @property
+    def at_edge(self) -> str:
+        """Why an object beyond the edge may matter; "" if it does not."""
+        report = self.fit.report
+        by_edge = report.parts.get("edge", 0.0)
+        others = float(np.sqrt(max(report.total**2 - by_edge**2, 0.0)))
+        return edge_doubt(by_edge, others, self.fit.options.max_error, report.sides)
+
+    @property
+    def is_small(self) -> bool:
+        """Whether errors of numbers come out too small for want of pixels."""
+        return bool(min(self.fit.used.shape) < SMALL_PX)
+
+    @property
+    def safety(self) -> float:
+        """How many times as large as stated the errors can be."""
+        fit, parts, limit = self.fit, self.fit.report.parts, self.limits.safety
+        if self.beam_unknown or (fit.instrument.beam_between and not self.single):
+            return limit
+        # That of one image, or of a recorded source, is a linear response.
+        numbers = {key for key, share in parts.items() if share} - {"noise", "edge"}
+        numbers -= {each.key for each, _ in fit.report.assumed}
+        is_fitted = fit.instrument.has_numbers or fit.report.beam is None
+        if not (numbers and is_fitted and (self.is_small or _UNDERESTIMATED & numbers)):
+            return 1.0
+        fitted = sum(parts[key] ** 2 for key in numbers) / fit.report.total**2
+        return float(np.sqrt(1 + (limit**2 - 1) * min(fitted, 1.0)))
+
+    @property
+    def condition(self) -> Condition | None:
+        """On what the errors depend, if they are small otherwise."""
+        max_error = self.fit.options.max_error / self.safety
+        return self.fit.condition(max_error, beam_unknown=self.beam_unknown)
+
+    @property
+    def is_too_uncertain(self) -> bool:
+        """Whether the errors may be larger than what is allowed."""
+        return self.safety * self.fit.report.total > self.fit.options.max_error
+
+
+Answer = tuple[Verdict, str] | None
+
+
+def assess_verdict(evidence: Evidence) -> tuple[Verdict, str]:
+    """Return the verdict on a fit, and a sentence that says why, by the first rule that applies."""
+    answers = (rule(evidence) for rule in _RULES)
+    return next(filter(None, answers), (Verdict.DETERMINED, _why_determined(evidence)))
+
+
+def _not_explained(case: Evidence) -> Answer:
+    chi2, pattern = case.fit.chi2, case.pattern
+    worst = _those(case.names, chi2, chi2 > MISFIT_CHI2)
+    if not worst:
+        return None
+    causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
+    if len(chi2) > 1:
+        causes = f"the object may have changed between images, or energies, {causes}"
+    causes = _cause_text(pattern) or causes
+    # An object that the edge cuts is explained by nothing within it, but nearly.
+    is_near = chi2.max() < case.limits.chi2_at_edge and not pattern.cause
+    verdict = Verdict.EDGE if case.at_edge and is_near else Verdict.MISFIT
+    misfit = f"the forward model does not explain {worst}, where 1 is expected"
+    return verdict, f"{misfit}: {causes if verdict is Verdict.MISFIT else case.at_edge}"
+
+
+def _beam_or_object(case: Evidence) -> Answer:
+    if not (case.single and case.beam_unknown):
+        return None
+    return Verdict.AMBIGUOUS, (
+        "one image cannot tell the beam from the object: many pairs of them explain it; take "
+        "another energy, or an image of the beam"
+    )
+
+
+def _likely_cause(case: Evidence) -> Answer:
+    if not case.pattern.cause or case.pattern.is_certain:
+        return None
+    return Verdict.MISFIT, f"the images do not look like the model: likely {case.pattern.cause}"
+
+
+def _rays_lost(case: Evidence) -> Answer:
+    if not case.single or (lost := _share_lost(case.displacement)) <= case.limits.lost_rays:
+        return None
+    return Verdict.AMBIGUOUS, (
+        f"the object sends {lost:.0%} of the rays past the image, and one image does not show "
+        "which; record a larger field of view, or take another energy"
+    )
+
+
+def _rays_meet(case: Evidence) -> Answer:
+    if not case.single:
+        return None
+    meeting = _share_squeezed(case.jacobian, case.displacement, case.limits.meeting)
+    if meeting <= case.limits.few:
+        return None
+    return Verdict.AMBIGUOUS, (
+        f"rays meet or cross over {meeting:.0%} of the object, and one image does not show "
+        "which came from where: the same bright lines come from fields with other folds; take "
+        "another energy"
+    )
+
+
+def _pattern_left(case: Evidence) -> Answer:
+    if not case.pattern.is_certain:
+        return None
+    # An object that the edge cuts leaves a pattern, too.
+    verdict = Verdict.EDGE if case.at_edge else Verdict.MISFIT
+    texts = [case.at_edge, _pattern_text(case.pattern, case.names)]
+    return verdict, "; ".join(filter(None, texts))
+
+
+def _counts_missing(case: Evidence) -> Answer:
+    pattern = case.pattern
+    if not pattern.lacks_counts or pattern.missing_counts <= case.limits.missing_counts:
+        return None
+    share = f"{pattern.missing_counts:.0%}"
+    return Verdict.UNCERTAIN, (
+        f"the noise is {share} smaller than that of as many counts: a dark level of about "
+        f"{share} seems to be left in the images, or the detector's response is not linear, "
+        "and either weakens the field; subtract the dark level from images and source, "
+        "linearise the images, or, if the counts were averaged, scaled or "
+        "smoothed, give their noise"
+    )
+
+
+def _beyond_edge(case: Evidence) -> Answer:
+    return (Verdict.EDGE, case.at_edge) if case.at_edge else None
+
+
+def _other_answers(case: Evidence) -> Answer:
+    (best, *alternatives), limits = case.fit.basins, case.limits
+    least = max(limits.other_field, limits.within_totals * case.fit.report.total)
     rivals = [
         basin.distance
         for basin in alternatives
-        if basin.objective / best.objective - 1 < _AS_GOOD
-        and basin.distance > max(_OTHER_FIELD, _WITHIN_TOTALS * total)
+        if basin.objective / best.objective - 1 < limits.as_good and basin.distance > least
     ]
-    if rivals:
-        return Verdict.SEVERAL, (
-            f"{len(rivals) + 1} different fields explain the data about as well; they differ by "
-            f"up to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is "
-            "known"
-        )
-    is_small = min(used.shape) < SMALL_PX
-    # That of one image, or of a recorded source, is a linear response.
-    numbers = {key for key, share in parts.items() if share} - {"noise", "edge"}
-    numbers -= {each.key for each, _ in report.assumed}
-    is_fitted = fit.instrument.has_numbers or report.beam is None
-    is_unsure = bool(numbers) and is_fitted and (is_small or _UNDERESTIMATED & numbers)
-    safety = 1.0
-    if beam_unknown or (fit.instrument.beam_between and not single):
-        safety = _SAFETY
-    elif is_unsure:
-        fitted = sum(parts[key] ** 2 for key in numbers) / total**2
-        safety = float(np.sqrt(1 + (_SAFETY**2 - 1) * min(fitted, 1.0)))
-    condition = fit.condition(max_error / safety, beam_unknown=beam_unknown)
-    if not condition and safety * total > max_error:
-        ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
-        text = f"errors of {total:.1%} of the displacement (r.m.s.): {ranking}; "
-        if total <= max_error:
-            small = f"with fewer than {SMALL_PX} px along a side"
-            where = small if is_small else "where these are fitted"
-            text += f"{where}, errors can be {safety:.2g} times as large; "
-        return Verdict.UNCERTAIN, (
-            f"{text}{_ADVICE.get(next(iter(parts)), _MEASURE).format(TITLES[next(iter(parts))])}"
-        )
-    if single and noise is not None and noise.is_hidden:
-        return Verdict.UNCERTAIN, (
-            "the noise was not measured: structure fills the image, and noise that is correlated "
-            "over a few pixels looks like it; give the noise, and its correlation if the image was "
-            "smoothed or resampled"
-        )
-    if not report.converged:
-        return Verdict.UNCERTAIN, (
-            "the search reached its maximum number of iterations before it ended: allow more"
-        )
-    if hidden > _HIDDEN_STRUCTURE:
-        return Verdict.UNCERTAIN, (
-            f"the mask hides part of the object where its image has {hidden:.0%} of its strongest "
-            "contrast: folds beneath were not seen, the field there is the smoothest that the "
-            "surroundings allow, and the error bars do not include that; unmask what is sound, or "
-            "add an image in which it is seen"
-        )
-    if condition and safety * total > max_error:
-        setup, field = fit.setup, fit.fields[0]
-        deflector = deflector_titles()[field.name]
-        (shown,) = shown_fields([field.displacement], setup, deflector, mask=used)
-        is_detector = condition.subject == "detector"
-        verdict = Verdict.DETECTOR if is_detector else Verdict.CONDITIONAL
-        return verdict, shown.conditional_text(condition)
-    unchecked = "" if np.isfinite(total) else "; error bars were not worked out"
+    if not rivals:
+        return None
+    return Verdict.SEVERAL, (
+        f"{len(rivals) + 1} different fields explain the data about as well; they differ by "
+        f"up to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is "
+        "known"
+    )
+
+
+def _errors_large(case: Evidence) -> Answer:
+    if case.condition or not case.is_too_uncertain:
+        return None
+    total, parts = case.fit.report.total, case.fit.report.parts
+    ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
+    text = f"errors of {total:.1%} of the displacement (r.m.s.): {ranking}; "
+    if total <= case.fit.options.max_error:
+        small = f"with fewer than {SMALL_PX} px along a side"
+        where = small if case.is_small else "where these are fitted"
+        text += f"{where}, errors can be {case.safety:.2g} times as large; "
+    largest = next(iter(parts))
+    return Verdict.UNCERTAIN, text + _ADVICE.get(largest, _MEASURE).format(TITLES[largest])
+
+
+def _noise_unmeasured(case: Evidence) -> Answer:
+    if not (case.single and case.noise is not None and case.noise.is_hidden):
+        return None
+    return Verdict.UNCERTAIN, (
+        "the noise was not measured: structure fills the image, and noise that is correlated "
+        "over a few pixels looks like it; give the noise, and its correlation if the image was "
+        "smoothed or resampled"
+    )
+
+
+def _search_unfinished(case: Evidence) -> Answer:
+    if case.fit.report.converged:
+        return None
+    return Verdict.UNCERTAIN, (
+        "the search reached its maximum number of iterations before it ended: allow more"
+    )
+
+
+def _object_masked(case: Evidence) -> Answer:
+    if case.hidden <= case.limits.hidden:
+        return None
+    return Verdict.UNCERTAIN, (
+        f"the mask hides part of the object where its image has {case.hidden:.0%} of its strongest "
+        "contrast: folds beneath were not seen, the field there is the smoothest that the "
+        "surroundings allow, and the error bars do not include that; unmask what is sound, or "
+        "add an image in which it is seen"
+    )
+
+
+def _conditional(case: Evidence) -> Answer:
+    condition, fit = case.condition, case.fit
+    if not condition or not case.is_too_uncertain:
+        return None
+    field = fit.fields[0]
+    deflector = deflector_titles()[field.name]
+    (shown,) = shown_fields([field.displacement], fit.setup, deflector, mask=fit.used)
+    is_detector = condition.subject == "detector"
+    verdict = Verdict.DETECTOR if is_detector else Verdict.CONDITIONAL
+    return verdict, shown.conditional_text(condition)
+
+
+_RULES = (
+    _not_explained,
+    _beam_or_object,
+    _likely_cause,
+    _rays_lost,
+    _rays_meet,
+    _pattern_left,
+    _counts_missing,
+    _beyond_edge,
+    _other_answers,
+    _errors_large,
+    _noise_unmeasured,
+    _search_unfinished,
+    _object_masked,
+    _conditional,
+)
+
+
+def _why_determined(case: Evidence) -> str:
+    fit, pattern, noise, chi2 = case.fit, case.pattern, case.noise, case.fit.chi2
+    unchecked = "" if np.isfinite(fit.report.total) else "; error bars were not worked out"
     if pattern.correlation > 0:
         unchecked += (
             f"; the noise is correlated over {pattern.correlation:.1f} px, which makes the error "
             f"bars {noise_amplification(pattern.correlation):.1f} times as large as for white noise"
         )
-    if quiet := _those(names, chi2, chi2 < _TOO_QUIET):
+    if quiet := _those(case.names, chi2, chi2 < case.limits.quiet_chi2):
         unchecked += f"; the noise is stated too large ({quiet}), and so are the error bars"
     elif noise is not None and noise.stated_times > 1:
         unchecked += f"; the noise was stated {noise.stated_times:.1f} times too large"
         unchecked += ", so the measured one was used"
-    several = "one image" if single else f"{len(chi2)} images"
-    starts = "all starts lead to" if searched else "the given start leads to"
-    unchecked += "" if searched else "; alternative solutions were not looked for"
-    return Verdict.DETERMINED, (
+    several = "one image" if case.single else f"{len(chi2)} images"
+    starts = "all starts lead to" if case.searched else "the given start leads to"
+    unchecked += "" if case.searched else "; alternative solutions were not looked for"
+    return (
         f"{starts} one field, which explains {several} to the noise (χ² "
         f"{np.min(chi2):.2f} to {np.max(chi2):.2f}){unchecked}"
     )
@@ -281,10 +419,12 @@ def _cause_text(pattern: Pattern) -> str:
     return pattern.tried and f"not explained by {pattern.tried}"
 
 
-def _share_squeezed(jacobian: FloatArray, displacement: FloatArray, least: float) -> float:
-    """The share of an object, where it displaces rays, with less of a Jacobian."""
+def _share_squeezed(
+    jacobian: FloatArray, displacement: FloatArray, least: float, part: float = 0.1
+) -> float:
+    """The share of an object, `part` of the largest displacement, with less of a Jacobian."""
     size = np.hypot(*displacement)
-    return float((jacobian < least).sum() / max((size > _OBJECT * size.max()).sum(), 1))
+    return float((jacobian < least).sum() / max((size > part * size.max()).sum(), 1))
 
 
 def _share_lost(displacement: FloatArray) -> float:
