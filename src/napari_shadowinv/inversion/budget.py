@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 
@@ -86,6 +87,36 @@ def discretisation_share(times: float, rate: float = _USUAL_RATE) -> float:
 def _power_of(rate: float) -> float:
     """Return the power of the number of sites with which changes fall."""
     return -math.log(rate) / math.log(RATIO)
+
+
+@dataclass(frozen=True, eq=False)
+class _Estimator:
+    """Errors in all and at the peak, of movements at the places of a linear response."""
+
+    shares: FloatArray  # of each place in the total
+    near: FloatArray  # weights of the places near the peak
+    along: FloatArray  # direction of the displacement there
+
+    @classmethod
+    def of(
+        cls, response: LinearResponse, lit: BoolArray, peak: FloatArray, along: FloatArray
+    ) -> _Estimator:
+        # No ray starts behind an obstacle: the field there is in no total.
+        places = (
+            np.clip(np.rint(p), 0, n - 1) for p, n in zip(response.places.T, lit.shape, strict=True)
+        )
+        shares = response.shares * lit[tuple(place.astype(np.int64) for place in places)]
+        near = _near(peak, response.places, response.spacing)
+        return cls(shares / shares.sum(), near, along)
+
+    def __call__(self, moves: FloatArray, finer: FloatArray | None = None) -> ErrorEstimate:
+        """Return the root mean squares, with mean squares of what is finer than the sites."""
+        close = np.flatnonzero(self.near)
+        finer = np.zeros(len(self.near)) if finer is None else finer
+        squares = _with_finer(_mean_square(moves), finer)
+        at_peak = ((moves[close] @ self.along) ** 2).mean(axis=1)
+        at_peak = _with_finer(at_peak, finer[close] / 2)
+        return root_of((squares * self.shares).sum(), (at_peak * self.near[close]).sum())
 
 
 class Budget:
@@ -173,22 +204,7 @@ class Budget:
         along = displacement[:, row, column] / max(length[row, column], 1e-300)
         response = self._response(solved)
         self._look_ahead()
-        # No ray starts behind an obstacle: the field there is in no total.
-        places = (
-            np.clip(np.rint(p), 0, n - 1) for p, n in zip(response.places.T, lit.shape, strict=True)
-        )
-        shares = response.shares * lit[tuple(place.astype(np.int64) for place in places)]
-        shares /= shares.sum()
-        near = _near(peak, response.places, response.spacing)
-        close = np.flatnonzero(near)
-        nothing_finer = np.zeros(len(near))
-
-        def estimate(moves: FloatArray, finer: FloatArray = nothing_finer) -> ErrorEstimate:
-            squares = _with_finer(_mean_square(moves), finer)
-            at_peak = ((moves[close] @ along) ** 2).mean(axis=1)
-            at_peak = _with_finer(at_peak, finer[close] / 2)
-            return root_of((squares * shares).sum(), (at_peak * near[close]).sum())
-
+        estimate = _Estimator.of(response, lit, peak, along)
         discretisation = ErrorEstimate(math.nan, math.nan)
         if len(solved) > 1:
             squares, _ = self._change(solved)
@@ -196,27 +212,9 @@ class Budget:
             weights = _near(peak, self._places.T, spacing)
             discretisation = root_of(squares.mean(), (squares * weights).sum() / 2)
         lengths = ErrorEstimate(float(np.sqrt(np.mean(length[lit] ** 2))), float(length.max()))
-        shot = SolvedShot(self._prepared.in_units(), displacement, response, self.options.seed)
-        effects: dict[str, ErrorEstimate] = {}
-        sensitivities: dict[str, ErrorEstimate] = {}
-        sizes: dict[str, float] = {}
-        assumed = ""
-        tests: list[tuple[dict[str, ErrorEstimate], str, FloatArray]] = []
-        for imperfection in IMPERFECTIONS:
-            stated = imperfection.stated(self.instrument)
-            for size, errors in ((imperfection.tested, sensitivities), (stated, effects)):
-                if size:
-                    pattern = imperfection.pattern(shot, size)
-                    tests.append((errors, imperfection.name(size), pattern))
-            if stated:
-                sizes[imperfection.name(stated)] = stated
-                if imperfection.key == "registration" and self._is_shift_assumed:
-                    assumed = imperfection.name(stated)
-        # All at once, because the solver needs as long for one as for several.
-        moves = response.to(np.concatenate([pattern for *_, pattern in tests]))
-        ends = np.cumsum([len(pattern) for *_, pattern in tests])
-        for (errors, name, _), part in zip(tests, np.split(moves, ends[:-1], axis=1), strict=True):
-            errors[name] = estimate(part)
+        effects, sensitivities, sizes, assumed = self._by_imperfections(
+            response, displacement, estimate
+        )
         if not lit.all():
             beside = _beside_dark(length, lit, solved[-1].level.spacing)
             effects["edges of dark areas"] = ErrorEstimate(
@@ -256,6 +254,36 @@ class Budget:
             noise_is_bound=self._noise().is_bound,
             assumed=assumed,
         )
+
+    def _by_imperfections(
+        self, response: LinearResponse, displacement: FloatArray, estimate: _Estimator
+    ) -> tuple[dict[str, ErrorEstimate], dict[str, ErrorEstimate], dict[str, float], str]:
+        """Return effects of what is stated, sensitivities, sizes, and the name of what is assumed.
+
+        Effects, sensitivities and sizes are by the names of the imperfections.
+        """
+        shot = SolvedShot(self._prepared.in_units(), displacement, response, self.options.seed)
+        effects: dict[str, ErrorEstimate] = {}
+        sensitivities: dict[str, ErrorEstimate] = {}
+        sizes: dict[str, float] = {}
+        assumed = ""
+        tests: list[tuple[dict[str, ErrorEstimate], str, FloatArray]] = []
+        for imperfection in IMPERFECTIONS:
+            stated = imperfection.stated(self.instrument)
+            for size, errors in ((imperfection.tested, sensitivities), (stated, effects)):
+                if size:
+                    pattern = imperfection.pattern(shot, size)
+                    tests.append((errors, imperfection.name(size), pattern))
+            if stated:
+                sizes[imperfection.name(stated)] = stated
+                if imperfection.key == "registration" and self._is_shift_assumed:
+                    assumed = imperfection.name(stated)
+        # All at once, because the solver needs as long for one as for several.
+        moves = response.to(np.concatenate([pattern for *_, pattern in tests]))
+        ends = np.cumsum([len(pattern) for *_, pattern in tests])
+        for (errors, name, _), part in zip(tests, np.split(moves, ends[:-1], axis=1), strict=True):
+            errors[name] = estimate(part)
+        return effects, sensitivities, sizes, assumed
 
     @cached_property
     def beam_difference(self) -> float:
