@@ -25,13 +25,13 @@ import json
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial, reduce
 from itertools import chain, islice
 from operator import add
 from statistics import NormalDist
 from threading import Event
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -418,16 +418,10 @@ def uncertainty(
     draw_noise, noise_text = noise_of(
         image, noise, options.units_per_quantum, mask if plan is None else plan.mask
     )
+    callbacks: Any = {"on_progress": on_progress, "should_stop": should_stop}
     if plan is None:
-        beam = prepare(image, source, options, mask).source
-        plan = plan_sites(
-            beam,
-            options,
-            mask=mask,
-            measured=source is not None,
-            on_progress=on_progress,
-            should_stop=should_stop,
-        )
+        beam, measured = prepare(image, source, options, mask).source, source is not None
+        plan = plan_sites(beam, options, mask=mask, measured=measured, **callbacks)
         source = mask = None
     inversion = invert(
         image,
@@ -436,133 +430,216 @@ def uncertainty(
         options=options,
         instrument=instrument,
         plan=plan,
-        on_progress=on_progress,
-        should_stop=should_stop,
+        **callbacks,
     )
     if not np.array_equal(inversion.source, plan.source):  # it was moved
         plan = plan_sites(inversion.source, options, mask=plan.mask)
+    correlation = _correlation_of(inversion, noise)
+    if correlation and not isinstance(noise, str):
+        noise_text += f", correlated over {to_figures(correlation)} px"
     seeds = np.random.SeedSequence(options.seed).spawn(int(n))
+    draws = None if instrument is None else _draws(image, inversion, plan)
+    resampling = _resampling(
+        inversion, plan, lambda rng: draw_noise(rng, correlation), options, draws, seeds
+    )
+    sampler = _Sampler(
+        resampling,
+        np.stack([inversion.potential, *inversion.displacement]),
+        _changes_by_edge(inversion),
+        _workers(options, len(inversion.sites), inversion.image.size),
+        options,
+        choose if quantities else None,
+    )
+    report = Reporter(on_progress, should_stop)
+    if method == "resolve":
+        samples = sampler.resolve(seeds, report)
+    else:
+        clean = prepare(image, plan.source, resampling.options, plan.mask).floored_image
+        samples = sampler.respond(seeds, clean, report, Reporter(None, should_stop))
+    return _summarised(inversion, samples, sampler, noise_text, method)
+
+
+def _correlation_of(inversion: Inversion, noise: Any) -> float:
+    """Return the width over which noise is drawn correlated, px."""
+    errors = inversion.errors
+    # Structure that hides the noise does not correlate noise that is stated.
+    is_known = errors is not None and not (errors.noise_is_bound and np.ndim(noise) == 0)
+    return errors.noise_correlation if errors is not None and is_known else 0.0
+
+
+def _resampling(
+    inversion: Inversion,
+    plan: SitePlan,
+    draw_noise: Callable[[np.random.Generator], FloatArray],
+    options: InversionOptions,
+    draws: InstrumentDraws | None,
+    seeds: list[Seed],
+) -> FullResampling:
+    """Return what solves a sample with its draw of noise and instrument."""
     workers = _workers(options, len(inversion.sites), inversion.image.size)
     # The threads are shared out among the samples; what noise drives below zero is clipped.
     threads = max(1, available_threads(options.threads) // workers)
     clipping = options.model_copy(update={"threads": threads, "negative": "clip"})
     plan = replace(plan, levels=plan.levels.up_to(len(inversion.weights)))
-    errors = inversion.errors
-    # Structure that hides the noise does not correlate noise that is stated.
-    is_known = errors is not None and not (errors.noise_is_bound and np.ndim(noise) == 0)
-    correlation = errors.noise_correlation if errors is not None and is_known else 0.0
-    if correlation and not isinstance(noise, str):
-        noise_text += f", correlated over {to_figures(correlation)} px"
-    resampling = FullResampling(
-        plan, inversion.weights, lambda rng: draw_noise(rng, correlation), clipping
-    ).to_tolerance_of_noise(seeds[0])
-    draws = None if instrument is None else _draws(image, inversion, plan)
-    if draws is not None:
-        rng = np.random.default_rng([options.seed, *b"instrument"])
-        numbers = stratified_numbers(rng, int(n), draws.count)
-        resampling = replace(resampling, instrument=draws, numbers=numbers)
-    report = Reporter(on_progress, should_stop)
-    image_fields = np.stack([inversion.potential, *inversion.displacement])
-    functions: dict[str, QuantityOf] = {}
-    by_edge = _changes_by_edge(inversion)
+    resampling = FullResampling(plan, inversion.weights, draw_noise, clipping)
+    resampling = resampling.to_tolerance_of_noise(seeds[0])
+    if draws is None:
+        return resampling
+    rng = np.random.default_rng([options.seed, *b"instrument"])
+    numbers = stratified_numbers(rng, len(seeds), draws.count)
+    return replace(resampling, instrument=draws, numbers=numbers)
 
-    def measure(change: FloatArray, seed: Seed) -> dict[str, FloatArray]:
-        rng = np.random.default_rng([options.seed, *b"edge", *seed.spawn_key])
-        beyond = np.tensordot(rng.normal(size=len(by_edge)), by_edge, 1)
-        return _measure(functions, image_fields, change + beyond)
 
-    asked = measure if quantities else None
-    # Without imperfections that it may have, the image shows where the truth may be.
-    sign = 1 if draws is None else -1
-    outcomes: list[tuple[int, float, bool]] = []
+class _Samples(NamedTuple):
+    """The scatter of samples, and linear ones beside those that were solved."""
 
-    def solve_samples(seeds: list[Seed], report: Reporter) -> Iterator[FloatArray]:
+    scatter: Scatter
+    pairs: Pairs | None
+    of_solved: list[dict[str, FloatArray]]
+    solutions: list[tuple[int, float, bool]]  # iterations, residual, converged
+
+
+@dataclass
+class _Sampler:
+    """Draws samples, and measures the quantities, which are chosen by the first of them."""
+
+    resampling: FullResampling
+    fields: FloatArray  # potential and displacement of the inversion, (3, H, W)
+    by_edge: FloatArray  # (k, 3, H, W)
+    workers: int
+    options: InversionOptions
+    choose: Callable[[FloatArray], Mapping[str, QuantityOf]] | None
+    functions: Mapping[str, QuantityOf] = field(default_factory=dict)
+
+    def measure(self, change: FloatArray, seed: Seed) -> dict[str, FloatArray]:
+        """Return the quantities of a sample, with what may lie beyond the edge."""
+        rng = np.random.default_rng([self.options.seed, *b"edge", *seed.spawn_key])
+        beyond = np.tensordot(rng.normal(size=len(self.by_edge)), self.by_edge, 1)
+        return _measure(self.functions, self.fields, change + beyond)
+
+    @property
+    def asked(self) -> Callable[[FloatArray, Seed], dict[str, FloatArray]] | None:
+        """What measures the quantities; None if none was asked for."""
+        return None if self.choose is None else self.measure
+
+    def _choose(self, changes: FloatArray) -> None:
+        if self.choose is not None and not self.functions:
+            self.functions = dict(self.choose(changes))
+
+    def _solve(
+        self, seeds: list[Seed], report: Reporter, solutions: list[tuple[int, float, bool]]
+    ) -> Iterator[FloatArray]:
+        # Without imperfections that it may have, the image shows where the truth may be.
+        sign = 1 if self.resampling.instrument is None else -1
         blocks = [[seed] for seed in seeds]
-        for fields, solution in _in_order(resampling.sample, blocks, workers, report):
-            outcomes.append((solution.iterations, solution.residual, solution.converged))
-            yield sign * (fields - image_fields)
+        for fields, solution in _in_order(self.resampling.sample, blocks, self.workers, report):
+            solutions.append((solution.iterations, solution.residual, solution.converged))
+            yield sign * (fields - self.fields)
 
-    pairs, of_solved = None, []
-    if method == "resolve":
-        head = list(solve_samples(seeds[:_CHECKED], report))
-        functions.update(choose(np.array([change[0] for change in head])))
-        changes = chain(head, solve_samples(seeds[_CHECKED:], report))
-        scatter = reduce(
-            add,
-            (
-                Scatter.of(change, asked and asked(change, seed))
-                for change, seed in zip(changes, seeds, strict=True)
-            ),
+    def resolve(self, seeds: list[Seed], report: Reporter) -> _Samples:
+        """Solve all samples."""
+        solutions: list[tuple[int, float, bool]] = []
+        head = list(self._solve(seeds[:_CHECKED], report, solutions))
+        self._choose(np.array([change[0] for change in head]))
+        changes = chain(head, self._solve(seeds[_CHECKED:], report, solutions))
+        asked = self.asked
+        parts = (
+            Scatter.of(change, asked and asked(change, seed))
+            for change, seed in zip(changes, seeds, strict=True)
         )
-    else:
-        quietly = Reporter(None, should_stop)
-        clean = prepare(image, plan.source, clipping, plan.mask).floored_image
+        return _Samples(reduce(add, parts), None, [], solutions)
+
+    def respond(
+        self, seeds: list[Seed], clean: FloatArray, report: Reporter, quietly: Reporter
+    ) -> _Samples:
+        """Take the linear response of all samples, and solve the first for comparison."""
+        is_noise_alone = self.resampling.instrument is None
         response = _in_thread(
-            lambda: LinearResampling(resampling, clean, options.threads, asked), quietly
+            lambda: LinearResampling(self.resampling, clean, self.options.threads, self.asked),
+            quietly,
         )
-        checked = seeds[: _CHECKED if draws is None else _SOLVED]
-        solved = solve_samples(checked, quietly if draws is None else report)
+        checked = seeds[: _CHECKED if is_noise_alone else _SOLVED]
+        solutions: list[tuple[int, float, bool]] = []
+        solved = self._solve(checked, quietly if is_noise_alone else report, solutions)
+        pairs, of_solved = None, []
         for block in _blocks(checked):
             linear = _in_thread(partial(response.changes, block), quietly)
-            if not functions:
-                functions.update(choose(linear[:, 0]))
+            self._choose(linear[:, 0])
             for seed, pair in zip(
                 block, map(Pairs.of, linear, islice(solved, len(block))), strict=True
             ):
                 pairs = pair if pairs is None else pairs + pair
-                if asked is not None and draws is not None:
-                    of_solved.append(asked(pair.solved, seed))
-        scatter = reduce(add, _in_order(response.scatter, _blocks(seeds), workers, report))
+                if self.asked is not None and not is_noise_alone:
+                    of_solved.append(self.measure(pair.solved, seed))
+        parts = _in_order(response.scatter, _blocks(seeds), self.workers, report)
+        return _Samples(reduce(add, parts), pairs, of_solved, solutions)
+
+
+def _summarised(
+    inversion: Inversion,
+    samples: _Samples,
+    sampler: _Sampler,
+    noise_text: str,
+    method: Literal["linear", "resolve"],
+) -> Uncertainty:
+    """Return the answer of samples; linear ones of an instrument are corrected by those solved."""
+    scatter, pairs, draws = samples.scatter, samples.pairs, sampler.resampling.instrument
     mean, std, of_samples = scatter.mean, scatter.std, _joined(scatter.quantities)
     check = {"nonlinearity": 0.0, "spread_ratio": 1.0, "mean_shift": 0.0}
     if pairs is not None:
         check = {name: getattr(pairs.part(np.s_[1:]), name) for name in check}
     if draws is not None and pairs is not None:
         mean, std = mean + pairs.shift, std * pairs.factor
-        for name, exact in _joined(of_solved).items():
+        for name, exact in _joined(samples.of_solved).items():
             of_samples[name] = correct(of_samples[name], exact.astype(np.float64))
-    mean = image_fields + mean
-    std = np.sqrt(std**2 + (by_edge**2).sum(axis=0))
-    warnings = inversion.report.warnings
-    # With an instrument, samples are corrected for what is not linear, as far as that is small.
-    limit = _LINEAR_ENOUGH if draws is None else _CORRECTABLE
-    if check["nonlinearity"] > limit:
-        cause = "noise" if draws is None else "noise and instrument"
-        text = (
-            f"the response to {cause} is not linear: samples that were solved differ by "
-            f"{check['nonlinearity']:.0%} of what these change; use the method 'resolve'"
-        )
-        warnings = (Caution("samples", text), *warnings)
-    iterations, residuals, converged = zip(*outcomes, strict=True)
-    if failed := converged.count(False):
-        text = (
-            f"{failed} of {len(converged)} samples that were solved did not converge: the "
-            "deviations are unreliable where the samples scatter most"
-        )
-        warnings = (Caution("samples", text), *warnings)
-    values = _measure(functions, image_fields, np.zeros_like(image_fields))
-    names = (*(() if draws is None else draws.names), *("edge",) * bool(len(by_edge)))
+    mean = sampler.fields + mean
+    std = np.sqrt(std**2 + (sampler.by_edge**2).sum(axis=0))
+    values = _measure(sampler.functions, sampler.fields, np.zeros_like(sampler.fields))
+    edge = ("edge",) * bool(len(sampler.by_edge))
+    names = (*(() if draws is None else draws.names), *edge)
+    iterations, residuals, converged = zip(*samples.solutions, strict=True)
     return Uncertainty(
         inversion=replace(inversion, pixel_errors=PixelErrors(std[1:], ("noise", *names))),
         potential_mean=mean[0],
         potential_std=std[0],
         displacement_mean=mean[1:],
         displacement_std=std[1:],
-        n=int(n),
+        n=scatter.count,
         noise=noise_text,
         method=method,
         **check,
         imperfections=names,
         quantities={
-            name: Quantity(value, of_samples[name], isinstance(functions[name], Maximum))
+            name: Quantity(value, of_samples[name], isinstance(sampler.functions[name], Maximum))
             for name, value in values.items()
         },
-        tolerance=resampling.options.tolerance,
+        tolerance=sampler.resampling.options.tolerance,
         iterations=iterations,
         residuals=residuals,
         converged=converged,
-        warnings=warnings,
+        warnings=_doubts(inversion, check["nonlinearity"], converged, draws is not None),
     )
+
+
+def _doubts(
+    inversion: Inversion, nonlinearity: float, converged: Sequence[bool], has_instrument: bool
+) -> tuple[Caution, ...]:
+    warnings = inversion.report.warnings
+    # With an instrument, samples are corrected for what is not linear, as far as that is small.
+    if nonlinearity > (_CORRECTABLE if has_instrument else _LINEAR_ENOUGH):
+        cause = "noise and instrument" if has_instrument else "noise"
+        text = (
+            f"the response to {cause} is not linear: samples that were solved differ by "
+            f"{nonlinearity:.0%} of what these change; use the method 'resolve'"
+        )
+        warnings = (Caution("samples", text), *warnings)
+    if failed := converged.count(False):
+        text = (
+            f"{failed} of {len(converged)} samples that were solved did not converge: the "
+            "deviations are unreliable where the samples scatter most"
+        )
+        warnings = (Caution("samples", text), *warnings)
+    return warnings
 
 
 def _quantity_choice(
