@@ -7,12 +7,12 @@
 - several images of one object, folds, an unknown beam: `fit`, with `FitOptions`; the answer is a
   `Fit` with a verdict
 - deflections in SI units: `ProtonSetup`, `OpticalSetup`
-- everything that is done to a shot, as one model: `Recipe`; apply it: `run`; to many shots, with
+- all steps from an image to its field, as one model: `Recipe`; apply it: `run`; to many shots, with
   dask: `run_stack`, `invert_stack`
 - repeat a result from its provenance: `rerun`
 - predict an image: `synthetic_image`; in another experiment: `predict_image`; invert it linearly:
   `poisson_invert`; trace particles through a 3-D field: `trace`
-- find out what an experiment would tell: `plan_experiment`
+- plan an experiment by simulated shots: `plan_experiment`
 - read and write files: `read`, `write`
 - show a result in a napari viewer: `add_to_viewer`
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,8 +14,10 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Summarised
-from napari_shadowinv.options import Noise
-from napari_shadowinv.physics.setup import Setup, bin_setup
+
+if TYPE_CHECKING:
+    from napari_shadowinv.options import Noise
+    from napari_shadowinv.physics.setup import Setup
 
 # Attributes that come from the user, and precede those of the image's file.
 _KNOWN = (
@@ -39,7 +41,7 @@ _KNOWN = (
 class Shot(Summarised):
     """An image and all that is known of it.
 
-    What is None follows from the recipe, or from the image's file.
+    Attributes of None follow from the recipe, or from the image's file.
 
     Attributes
     ----------
@@ -152,8 +154,8 @@ class Shot(Summarised):
     def completed_by(self, recorded: Shot) -> Shot:
         """Return the shot as read from its file, with all that is known beside the file."""
         values = {name: getattr(self, name) for name in _KNOWN}
-        known = {name: value for name, value in values.items() if value is not None}
-        return replace(recorded, **known)
+        changes = {name: value for name, value in values.items() if value is not None}
+        return replace(recorded, **changes)
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -189,6 +191,8 @@ class Shot(Summarised):
         >>> Shot(np.ones((5, 6))).bin_pixels(2).image
         array([[4., 4., 4.], [4., 4., 4.]])
         """
+        from napari_shadowinv.physics.setup import bin_setup
+
         height, width = self.image.shape
         if min(height, width) < 2:
             raise InputError(
@@ -215,13 +219,13 @@ class Shot(Summarised):
         return binned.add_notes(f"binned {factor} × {factor}{cut}")
 
 
-def shots_of(images: Any, **known: Any) -> list[Shot]:
+def shots_of(images: Any, **values: Any) -> list[Shot]:
     """Return shots of one object.
 
     Parameters
     ----------
     images : sequence of array_like, or ndarray of shape (L, H, W) or (H, W)
-    **known
+    **values
         Attributes of the shots: a list, a tuple or an array of one or three dimensions has a value
         for each, anything else is that of all.
 
@@ -237,14 +241,14 @@ def shots_of(images: Any, **known: Any) -> list[Shot]:
     """
     planes = [images] if isinstance(images, np.ndarray) and images.ndim == 2 else list(images)
     of_each: list[dict[str, Any]] = [{} for _ in planes]
-    for name, value in known.items():
+    for name, value in values.items():
         is_each = isinstance(value, (list, tuple)) or np.ndim(value) in (1, 3)
-        values: Sequence[Any] = value if is_each else [value] * len(planes)
-        if len(values) != len(planes):
+        entries: Sequence[Any] = value if is_each else [value] * len(planes)
+        if len(entries) != len(planes):
             raise InputError(
-                f"received {len(planes)} images and {len(values)} values of {name}: expected one "
+                f"received {len(planes)} images and {len(entries)} values of {name}: expected one "
                 "for each"
             )
-        for entries, each in zip(of_each, values, strict=True):
-            entries[name] = each
-    return [Shot(plane, **entries) for plane, entries in zip(planes, of_each, strict=True)]
+        for attributes, entry in zip(of_each, entries, strict=True):
+            attributes[name] = entry
+    return [Shot(plane, **attributes) for plane, attributes in zip(planes, of_each, strict=True)]

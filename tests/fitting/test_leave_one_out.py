@@ -50,8 +50,8 @@ def levels(count: int) -> FloatArray:
 
 def checked(images: FloatArray, **keywords: Any) -> LeaveOneOut:
     options = keywords.pop("options", FitOptions(spacing=0.2))
-    known = {"setup": SETUPS, "noise": NOISE} | keywords
-    return leave_one_out(shots_of(images, **known), options=options)
+    attributes = {"setup": SETUPS, "noise": NOISE} | keywords
+    return leave_one_out(shots_of(images, **attributes), options=options)
 
 
 def assert_follows_noise_a_little(found: LeaveOneOut) -> None:

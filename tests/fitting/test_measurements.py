@@ -62,7 +62,7 @@ def nearly_all_masked() -> FloatArray:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"images": ["a.tif", "b.tif"]}, "received the file a.tif: read it first"),
+        ({"images": ["a.tif", "b.tif"]}, "image 1 is the file a.tif, expected an array"),
         ({"images": [np.ones(40)] * 2}, r"image 1 has shape \(40,\), expected two dimensions"),
         ({"images": np.ones((2, 40, 20))}, r"shape \(40, 20\), expected at least 32 × 32 pixels"),
         ({"images": with_pixel(np.nan)}, "1 pixels that are NaN or infinite.*: mask them"),
@@ -443,6 +443,6 @@ def test_images_that_are_known_differently_are_refused(
 
 def test_a_file_is_not_read() -> None:
     with pytest.raises(
-        InputError, match=r"received the file a\.tif: read it first, or use run_fit"
+        InputError, match=r"image 1 is the file a\.tif, expected an array: read it first"
     ):
         collect_data([Shot(Path("a.tif"))], options=FitOptions())

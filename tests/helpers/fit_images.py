@@ -129,5 +129,5 @@ def hessian_times(linear: Linear, change: Unknowns) -> Unknowns:
 def fit_images(images: Any, **keywords: Any) -> Fit:
     """Fit images with what is known of each, and with further keywords of a fit."""
     names = {each.name for each in fields(Shot)} & keywords.keys()
-    known = {name: keywords.pop(name) for name in names}
-    return fit(shots_of(images, **known), **keywords)
+    attributes = {name: keywords.pop(name) for name in names}
+    return fit(shots_of(images, **attributes), **keywords)

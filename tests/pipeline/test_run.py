@@ -166,7 +166,7 @@ def test_masks_of_random_pixels_are_kept_whole_beside_the_result(image: FloatArr
     mask, source_mask = np.random.default_rng(0).random((2, *image.shape)) > 0.1
     source_mask[8:12, 8:14] = False
     recipe = Recipe(source=PolynomialEstimate(degree=0), options=OPTIONS)
-    dataset = run(recipe, image, mask=mask, source_mask=source_mask).to_dataset()
+    dataset = run(recipe, Shot(image, mask=mask, source_mask=source_mask)).to_dataset()
     provenance = Provenance.of(dataset.attrs, dataset.variables)
     assert provenance is not None
     origin = provenance.image

@@ -37,8 +37,8 @@ from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.rivals import compare_rivals, transmission_of
 from napari_shadowinv.fitting.search import (
     SMALL_PX,
+    FineMinimum,
     Minimum,
-    Refined,
     estimate_smoothness,
     in_recorded_pixels,
     refine_minimum,
@@ -116,52 +116,56 @@ def fit(
     on_step = report_steps("fit", on_progress, should_stop)
     seconds: dict[str, float] = {}
     with measure_time("starts", seconds):
-        found = _search(data, on_step, should_stop)
+        minima = _search(data, on_step, should_stop)
     with measure_time("smoothness", seconds):
-        found = _with_smoothness(data, found, rng, on_step)
-    begun, threads = time.perf_counter(), available_threads(found.scene.threads)
+        minima = _with_smoothness(data, minima, rng, on_step)
+    begun, threads = time.perf_counter(), available_threads(minima.scene.threads)
     works: list[Any] = [
-        partial(_refine, data, found, options),
-        partial(_explore, data, found, rng, options),
+        partial(_refine, data, minima, options),
+        partial(_explore, data, minima, rng, options),
     ]
     (refined, seconds["full size"]), openness = run_in_parallel(works, threads, on_step)
     seconds["samples"] = max(time.perf_counter() - begun - seconds["full size"], 0.0)
     with measure_time("residual", seconds):
-        pattern = _find_misfit(data, found, refined, openness, fields, options, on_step)
+        pattern = _find_misfit(data, minima, refined, openness, fields, options, on_step)
     with measure_time("samples", seconds):
         # What the weights do not include of it.
         least = float(np.sqrt(data.noise.expected_chi2.min()))
         amplification = max(noise_amplification(pattern.correlation) * least, 1.0)
-        errors = field_errors(data, found.scene, openness, amplification, options.seed)
+        errors = field_errors(data, minima.scene, openness, amplification, options.seed)
         report = report_of(
-            data, found.instrument, refined, openness, pattern, amplification, options
+            data, minima.instrument, refined, openness, pattern, amplification, options
         )
         if options.evidence:
-            evidence = log_evidence(found.scene, found.minima[0], fields, options, on_step)
+            evidence = log_evidence(minima.scene, minima.best, fields, options, on_step)
             report = replace(report, log_evidence=evidence)
     report = replace(report, seconds=seconds)
     return summarise(data, fields, options, refined, openness.basins, errors, report, pattern)
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """Minima in a scene, the best first, and the instrument as stated.
+class _Minima:
+    """Ends of a search in a scene, the best first, and the instrument as stated.
 
     One image does not determine its instrument: the scene's is exact.
     """
 
     scene: Scene
-    minima: list[Minimum]
+    ends: list[Minimum]
     instrument: Imperfect
+
+    @property
+    def best(self) -> Minimum:
+        return self.ends[0]
 
     @property
     def unsure(self) -> Scene:
         """The scene with the instrument as stated, whose numbers are not fitted to one image."""
-        held = self.scene.held | (self.instrument.keys - self.scene.imperfect.keys)
-        return replace(self.scene, imperfect=self.instrument, held=held)
+        fixed = self.scene.held | (self.instrument.keys - self.scene.imperfect.keys)
+        return replace(self.scene, imperfect=self.instrument, held=fixed)
 
 
-def _search(data: FitData, on_step: OnStep, should_stop: ShouldStop | None) -> _Found:
+def _search(data: FitData, on_step: OnStep, should_stop: ShouldStop | None) -> _Minima:
     """Descend from all starts, while numbers that would take the field's place are held."""
     scene = data.scene
     # One image cannot tell the instrument from the object: its numbers stay at 0.
@@ -181,49 +185,49 @@ def _search(data: FitData, on_step: OnStep, should_stop: ShouldStop | None) -> _
     if scene.imperfect.of_response and min(data.size) < SMALL_PX and data.near is None:
         # In pixels of two, λ and the errors of the instrument's numbers come out too small.
         minima[0] = in_recorded_pixels(scene, minima[0])
-    return _Found(scene, minima, instrument)
+    return _Minima(scene, minima, instrument)
 
 
 def _with_smoothness(
-    data: FitData, found: _Found, rng: np.random.Generator, on_step: OnStep
-) -> _Found:
+    data: FitData, minima: _Minima, rng: np.random.Generator, on_step: OnStep
+) -> _Minima:
     """Estimate λ and κ, and the weights of counts, at the best minimum."""
     is_near = data.near is not None
-    scene, best = estimate_smoothness(found.scene, found.minima[0], rng, on_step, is_near=is_near)
+    scene, best = estimate_smoothness(minima.scene, minima.best, rng, on_step, is_near=is_near)
     if data.counted:
         scene = reweight_counts(data, scene, best)
         best = settle_minimum(scene, best, on_step)
-    return replace(found, scene=scene, minima=[best, *found.minima[1:]])
+    return replace(minima, scene=scene, ends=[best, *minima.ends[1:]])
 
 
 def _refine(
-    data: FitData, found: _Found, options: FitOptions, on_step: OnStep
-) -> tuple[Refined, float]:
+    data: FitData, minima: _Minima, options: FitOptions, on_step: OnStep
+) -> tuple[FineMinimum, float]:
     """Descend in recorded pixels; also return the seconds."""
     begun, is_near = time.perf_counter(), data.near is not None
-    refined = refine_minimum(found.scene, found.minima[0], options, on_step, is_near=is_near)
+    refined = refine_minimum(minima.scene, minima.best, options, on_step, is_near=is_near)
     return refined, time.perf_counter() - begun
 
 
 def _explore(
     data: FitData,
-    found: _Found,
+    minima: _Minima,
     rng: np.random.Generator,
     options: FitOptions,
     on_step: OnStep,
 ) -> Openness:
     """Find how far the images leave the answer open, by other starts and by samples."""
-    best, *others = found.minima
-    basins = find_basins(found.scene, best, others, on_step)
-    unsure = found.unsure if data.single else found.scene
-    there = adapt(best, unsure.imperfect, found.scene.imperfect)
+    best, *rivals = minima.ends
+    basins = find_basins(minima.scene, best, rivals, on_step)
+    unsure = minima.unsure if data.single else minima.scene
+    there = adapt(best, unsure.imperfect, minima.scene.imperfect)
     return explore(data, unsure, there, basins, rng, options, on_step)
 
 
 def _find_misfit(
     data: FitData,
-    found: _Found,
-    refined: Refined,
+    minima: _Minima,
+    refined: FineMinimum,
     openness: Openness,
     fields: Sequence[str],
     options: FitOptions,
@@ -250,13 +254,13 @@ def _find_misfit(
     if pattern.lacks_counts and openness.posterior is not None:
         posterior = openness.posterior.reporting(lambda: on_step("samples", refined.objective))
         absorbed = posterior.count_determined(np.random.default_rng(options.seed))
-        share = pattern.missing_counts - absorbed / np.count_nonzero(found.scene.weights)
+        share = pattern.missing_counts - absorbed / np.count_nonzero(minima.scene.weights)
         pattern = replace(pattern, missing_counts=share)
     is_off = pattern.is_certain or pattern.chi2 > MISFIT_CHI2
     is_blurred = data.single or pattern.blur_score > least_blur
     if (is_off or is_blurred) and pattern.chi2 < most_chi2:
-        only, best = "" if is_off else "blur", found.minima[0]
-        rivals = compare_rivals(data, found.scene, best, fields, on_step, only=only)
+        only, best = "" if is_off else "blur", minima.best
+        rivals = compare_rivals(data, minima.scene, best, fields, on_step, only=only)
         pattern = replace(pattern, cause=rivals.cause(), tried=rivals.tried)
     return pattern
 

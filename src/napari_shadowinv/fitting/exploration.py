@@ -106,9 +106,9 @@ def explore(
 ) -> Openness:
     """Draw samples around the best unknowns, and respond to a detector that nobody stated.
 
-    Rays are `spacing` px apart. Of samples of an instrument, so many are solved, too, to be
-    `checked`. Where each image has a beam of its own, a few directions hold most of the error, so
-    that there are at least `least_of_beams` samples.
+    Rays are `spacing` px apart. Of samples of an instrument, `checked` are solved, too. Where each
+    image has a beam of its own, a few directions hold most of the error, so that there are at least
+    `least_of_beams` samples.
     """
 
     def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:

@@ -177,10 +177,10 @@ class Scene(PriorTerms):
 
     def _misfit(self, unknowns: Unknowns, shot: _Shot) -> tuple[_Seen, FloatArray, FloatArray]:
         """An image as it is seen, its model, and its residual in units of the noise."""
-        seen = self._seen(unknowns, shot)
-        model = np.exp(unknowns.brightness[shot.number]) * seen.image
+        view = self._seen(unknowns, shot)
+        model = np.exp(unknowns.brightness[shot.number]) * view.image
         residual = np.sqrt(self.weights[shot.number]) * (model - self.images[shot.number])
-        return seen, model, blurred(residual, self.blur)
+        return view, model, blurred(residual, self.blur)
 
     def value_and_gradient(
         self, unknowns: Unknowns, counts: list[IntArray]
@@ -190,11 +190,11 @@ class Scene(PriorTerms):
         strengths = self.strengths_with(unknowns)
         shots = list(self._shots(unknowns, counts))
         differentiated = self._of_each(partial(self._pulls, unknowns), shots)
-        for k, (of_image, of_brightness, seen, scaled, pulls) in enumerate(differentiated):
+        for k, (of_image, of_brightness, view, scaled, pulls) in enumerate(differentiated):
             value += of_image
             slope.brightness[k] += of_brightness
             self._add_light_pulls(slope, k, scaled)
-            seen.effects.add_pulls(slope, k, scaled)
+            view.effects.add_pulls(slope, k, scaled)
             self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
             slope.frames[k] += pulls.frame
         if self._frees_light:
@@ -208,17 +208,17 @@ class Scene(PriorTerms):
     ) -> tuple[float, float, _Seen, FloatArray, Pulls]:
         """Differentiate an image's part of the objective: by log brightness, image and rays."""
         k = shot.number
-        seen, model, residual = self._misfit(unknowns, shot)
+        view, model, residual = self._misfit(unknowns, shot)
         pull = np.sqrt(self.weights[k]) * blurred(residual, self.blur)
         scaled = np.exp(unknowns.brightness[k]) * pull
         of_rays = self.rays.gradient(
             shot.traced,
-            self._spread_back(k, seen.slope * scaled, unknowns),
+            self._spread_back(k, view.slope * scaled, unknowns),
             of_beam=self._frees_light,
             of_frame=k > 0 and bool(self.free_frames.any()),
         )
         value = float(np.einsum("yx,yx", residual, residual)) / 2
-        return value, np.einsum("yx,yx", pull, model), seen, scaled, of_rays
+        return value, np.einsum("yx,yx", pull, model), view, scaled, of_rays
 
     def _of_each(self, function: Callable[[_Shot], _T], shots: Sequence[_Shot]) -> list[_T]:
         """Call a function for each image, side by side if these are small and many."""
@@ -373,8 +373,8 @@ class Scene(PriorTerms):
         """The light that enters for each image."""
         common, separate = unknowns.common, unknowns.separate
         light = [
-            self.imperfect.entering(beam, common, own)
-            for beam, own in zip(self.beams, separate, strict=True)
+            self.imperfect.entering(beam, common, numbers)
+            for beam, numbers in zip(self.beams, separate, strict=True)
         ]
         return np.stack(light) * np.exp(self.imperfect.shape_changes(common, separate))
 
@@ -431,7 +431,8 @@ class Scene(PriorTerms):
         common, changes = unknowns.common, self.imperfect.entering_changes
         planes = zip(lights, self.beams, unknowns.separate, strict=True)
         return [
-            _Entering(light, _Effects(changes(beam, common, own))) for light, beam, own in planes
+            _Entering(light, _Effects(changes(beam, common, numbers)))
+            for light, beam, numbers in planes
         ]
 
     def _add_beam_pulls(

@@ -174,14 +174,14 @@ def collect_data(
     absorbs = bool(imperfect.shapes) or instrument.absorption > 0
     is_dimmed = (is_uniform and instrument.gamma > 0) or (not single and absorbs)
     start, near = _start_of(shots, shape)
-    given = (options.smoothness or 0.0, 0.0) if near is None else near.smoothness
+    smoothness = (options.smoothness or 0.0, 0.0) if near is None else near.smoothness
     scene = Scene(
         images=np.pad(np.where(used, data / units[:, None, None], 0.0), fill),
         weights=np.pad(np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0), fill),
         strengths=matrix,
         beams=np.pad(in_units, ((0, 0), *around), mode="edge"),
         psf=[_checked_point_spread(shot.psf, shape) for shot in shots],
-        smoothness=np.tile(given, (matrix.shape[1], 1)),
+        smoothness=np.tile(smoothness, (matrix.shape[1], 1)),
         pad=pad,
         tie=_FREE_TIE if options.boundary == "free" else 30.0,
         decay=(options.decay_length or pad) if options.boundary == "free" else np.inf,
@@ -500,17 +500,17 @@ def _checked_planes(
     sources = common_values(names, [None if s.beam_unknown else s.source for s in shots], "source")
     images: list[AnyArray] = []
     masks: list[BoolArray] = []
+    needed = _BYTES_PER_PIXEL + len(shots) * _BYTES_PER_PIXEL_AND_IMAGE
     for shot, name in zip(shots, names, strict=True):
         image, exposed = unpack_array(shot.image, name)
         images.append(check_plane(image, name, _SMALLEST_SIDE))
+        check_memory(images[0].shape, needed, "a fit")
         check_shape(name, images[-1].shape, images[0].shape, names[0])
         try:
             mask = check_mask(unpack_mask(shot.mask), images[0].shape)
         except InputError as error:
             raise error.about(name) from error
         masks.append(join_masks(mask, exposed))
-    needed = _BYTES_PER_PIXEL + len(shots) * _BYTES_PER_PIXEL_AND_IMAGE
-    check_memory(images[0].shape, needed, "a fit")
     data = np.array(images, dtype=np.float64)
     beams = None
     if sources is not None:
@@ -567,7 +567,7 @@ def _checked_strengths(strengths: Sequence[tuple[float, ...]]) -> FloatArray:
 
 
 def _relative_strengths(matrix: FloatArray) -> FloatArray:
-    """Return strengths relative to those of the first image; refuse what determines no field."""
+    """Return strengths relative to the first image; refuse ones that determine no field."""
     if not matrix[0].all():
         raise InputError(
             f"strengths of the first image are {matrix[0].tolist()}: all fields must act in it"

@@ -625,7 +625,7 @@ def sampled_potentials(
 ) -> FloatArray:
     """Return random changes of each field's potential, px², that its total error allows.
 
-    Those by what is not fitted are random combinations of `shifts`.
+    Changes by unfitted numbers are random combinations of `shifts`.
 
     Parameters
     ----------

@@ -496,7 +496,7 @@ class Fit(Summarised):
         return PeakError(float(np.hypot(share, by_energy)), cause)
 
     def condition(self, share: float, *, beam_unknown: bool) -> Condition | None:
-        """Return the condition on what was assumed; None if that is not all that it takes.
+        """Return the condition on assumptions; None if these do not suffice.
 
         Parameters
         ----------
@@ -527,7 +527,7 @@ class Fit(Summarised):
         at_peak = field.error_at(*shown.peak)
         scale = at_peak / report.total
         for subject, assumed in subjects.items():
-            rest = math.sqrt(max(report.total**2 - sum(left**2 for *_, left in assumed), 0.0))
+            rest = math.sqrt(max(report.total**2 - sum(share**2 for *_, share in assumed), 0.0))
             effects = [(unit, size, effect, scale * effect) for unit, size, effect, _ in assumed]
             condition = Condition.within(share, (rest, scale * rest), effects, subject=subject)
             if condition:

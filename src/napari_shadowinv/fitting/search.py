@@ -340,7 +340,7 @@ def settle_minimum(
     )
 
 
-class Refined(NamedTuple):
+class FineMinimum(NamedTuple):
     """Where a descent in recorded pixels has ended, and whether within the allowed steps."""
 
     scene: Scene
@@ -352,7 +352,7 @@ class Refined(NamedTuple):
 
 def refine_minimum(
     scene: Scene, minimum: Minimum, options: FitOptions, on_step: OnStep, *, is_near: bool = False
-) -> Refined:
+) -> FineMinimum:
     """Descend with the pixels as recorded, with rays as dense as the data need."""
     unknowns, steps = _in_smaller_pixels(scene, minimum), 0
     modes = minimum.modes if minimum.bin == scene.bin else SoftModes()
@@ -374,6 +374,6 @@ def refine_minimum(
         chi2 = scene.chi2(unknowns)
         explained = not denser or bool(chi2.max() < _EXPLAINED)
         if steps >= options.max_iterations or (ended and explained):
-            return Refined(scene, unknowns, value, steps, ended)
+            return FineMinimum(scene, unknowns, value, steps, ended)
         if not explained:
             scene = replace(scene, spacing=denser.pop(0))

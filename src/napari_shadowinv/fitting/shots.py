@@ -1,4 +1,4 @@
-"""Shots of a fit: `list_shots`, and what they have in common.
+"""Shots of a fit: `list_shots`, and attributes that they have in common.
 
 - a field near which a fit is to end: `NearField`
 - width of the point spread in px, from the beam's source and the detector: `point_spread`
@@ -44,7 +44,7 @@ def list_shots(shots: Shots) -> list[Shot]:
     Raises
     ------
     InputError
-        If there is none, or one is a file.
+        If there is none.
     """
     images: Any = shots
     is_one = isinstance(images, (Shot, str, Path)) or np.ndim(images) == 2
@@ -54,9 +54,6 @@ def list_shots(shots: Shots) -> list[Shot]:
     ]
     if not listed:
         raise InputError("received no image: expected one or several of one object")
-    for shot in listed:
-        if isinstance(shot.image, (str, Path)):
-            raise InputError(f"received the file {shot.image}: read it first, or use run_fit")
     return listed
 
 

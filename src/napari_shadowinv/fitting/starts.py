@@ -35,15 +35,15 @@ def collect_starts(
     potential, which is blurred by `rounded` px.
     """
     # A beam that is about uniform comes after the field.
-    scene, held = data.scene, data.assumed
+    scene, is_held = data.scene, data.assumed
     candidates = []
     if data.near is not None:
         return [Start("near field", ((2, 1.0),), data.start)]
     if data.start is not None:
-        candidates.append(Start("given", ((2, 1.0),), data.start, held))
+        candidates.append(Start("given", ((2, 1.0),), data.start, is_held))
     if not data.single:
-        candidates.append(Start("from far", _FROM_FAR, beam_held=held))
-    candidates.append(Start("from near", _FROM_NEAR, beam_held=held))
+        candidates.append(Start("from far", _FROM_FAR, beam_held=is_held))
+    candidates.append(Start("from near", _FROM_NEAR, beam_held=is_held))
     if data.unknown and not data.single:
         candidates.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
     if scene.strengths.shape[1] > 1 or data.unknown:
@@ -56,7 +56,7 @@ def collect_starts(
         return candidates
     potential = gaussian_filter(transported, rounded) / scene.strengths[weakest, 0]
     if not data.single:
-        return [*candidates, Start("transport", ((2, 2.0), (2, 1.0)), potential, held)]
+        return [*candidates, Start("transport", ((2, 2.0), (2, 1.0)), potential, is_held)]
     return candidates + [
         Start(f"{share:g} × transport", _FROM_FIELD, share * potential) for share in shares
     ]

@@ -1,7 +1,7 @@
 """The answer of a fit.
 
 - in recorded pixels, with its verdict: `summarise`
-- its errors: `field_errors`; what it tells of itself: `report_of`
+- its errors: `field_errors`; its report: `report_of`
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from napari_shadowinv.fitting.posterior import (
     sampled_potentials,
 )
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
-from napari_shadowinv.fitting.search import Refined
+from napari_shadowinv.fitting.search import FineMinimum
 from napari_shadowinv.fitting.verdict import Evidence, assess_verdict, hidden_contrast
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.edge import edge_changes, edge_sides
@@ -79,7 +79,7 @@ def field_errors(
 def with_edge(
     errors: FieldErrors, potentials: FloatArray, displacements: FloatArray, seed: int
 ) -> FieldErrors:
-    """Return errors with that by what lies beyond the edge, as far as it exceeds them."""
+    """Return errors with one by objects beyond the edge, as far as it exceeds them."""
     if errors.in_all is None or errors.samples is None:
         return errors
     changes = _changes_by_edge(potentials, displacements, errors.in_all)
@@ -94,7 +94,7 @@ def summarise(
     data: FitData,
     names: Sequence[str],
     options: FitOptions,
-    refined: Refined,
+    refined: FineMinimum,
     basins: tuple[Basin, ...],
     errors: FieldErrors,
     report: FitReport,
@@ -162,13 +162,13 @@ def summarise(
 def report_of(
     data: FitData,
     instrument: Imperfect,
-    refined: Refined,
+    refined: FineMinimum,
     openness: Openness,
     pattern: Pattern,
     amplification: float,
     options: FitOptions,
 ) -> FitReport:
-    """Return what a fit tells of itself; its errors follow."""
+    """Return the report of a fit, without its errors."""
     unknowns, pairs = refined.unknowns, openness.pairs
     displacements = refined.scene.displacement(unknowns)[..., : data.size[0], : data.size[1]]
     by_beam = openness.by_beam
@@ -217,7 +217,7 @@ def _most_folded(scene: Scene, displacements: FloatArray) -> FloatArray:
 
 
 def _added_light(
-    data: FitData, refined: Refined, samples: Sequence[Sample], amplification: float
+    data: FitData, refined: FineMinimum, samples: Sequence[Sample], amplification: float
 ) -> dict[str, list[list[list[float]]]]:
     """Return coefficients of light that adds to each image, in its unit, with their σ."""
     scene, unknowns = refined.scene, refined.unknowns
@@ -248,7 +248,7 @@ def _changes_by_edge(
 
 
 def _beyond_edge(samples: FloatArray, changes: FloatArray, seed: int) -> FloatArray:
-    """Add what lies beyond the edge, (M, k, H, W), to samples of potentials, (M, n, H, W)."""
+    """Add objects beyond the edge, (M, k, H, W), to samples of potentials, (M, n, H, W)."""
     rng = np.random.default_rng([seed, *b"edge"])
     draws = rng.normal(size=(samples.shape[1], changes.shape[1]))
     beyond = np.einsum("sk,mkyx->msyx", draws, changes).astype(np.float32)

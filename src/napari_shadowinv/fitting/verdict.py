@@ -44,7 +44,7 @@ def hidden_contrast(
     radius : float, default 6
         Smaller holes are bridged by their surroundings, px.
     rim_width, smoothing : float, default 4 and 1
-        Width of what is around a hole, and standard deviation of a blur of the contrast, px.
+        Width of the rim of a hole, and standard deviation of a blur of the contrast, px.
 
     Returns
     -------
@@ -109,7 +109,7 @@ class VerdictLimits:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the verdict on a fit follows from; its own verdict does not matter.
+    """Evidence for the verdict on a fit, whose own verdict does not matter.
 
     Attributes
     ----------
@@ -184,13 +184,13 @@ class Evidence:
 
     @property
     def condition(self) -> Condition | None:
-        """On what the errors depend, if they are small otherwise."""
+        """Condition on which the errors are small, if there is one."""
         max_error = self.fit.options.max_error / self.safety
         return self.fit.condition(max_error, beam_unknown=self.beam_unknown)
 
     @property
     def is_too_uncertain(self) -> bool:
-        """Whether the errors may be larger than what is allowed."""
+        """Whether the errors may be larger than allowed."""
         return self.safety * self.fit.report.total > self.fit.options.max_error
 
 

@@ -110,7 +110,7 @@ class _Estimator:
         return cls(shares / shares.sum(), near, along)
 
     def __call__(self, moves: FloatArray, finer: FloatArray | None = None) -> ErrorEstimate:
-        """Return the root mean squares, with mean squares of what is finer than the sites."""
+        """Return the root mean squares, with mean squares of structure finer than the sites."""
         close = np.flatnonzero(self.near)
         finer = np.zeros(len(self.near)) if finer is None else finer
         squares = _with_finer(_mean_square(moves), finer)
@@ -258,7 +258,7 @@ class Budget:
     def _by_imperfections(
         self, response: LinearResponse, displacement: FloatArray, estimate: _Estimator
     ) -> tuple[dict[str, ErrorEstimate], dict[str, ErrorEstimate], dict[str, float], str]:
-        """Return effects of what is stated, sensitivities, sizes, and the name of what is assumed.
+        """Return stated effects, sensitivities, sizes, and the name of an assumed effect.
 
         Effects, sensitivities and sizes are by the names of the imperfections.
         """

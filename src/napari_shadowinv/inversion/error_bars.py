@@ -475,7 +475,7 @@ def _resampling(
     draws: InstrumentDraws | None,
     seeds: list[Seed],
 ) -> FullResampling:
-    """Return what solves a sample with its draw of noise and instrument."""
+    """Return the solver of samples with their draws of noise and instrument."""
     workers = _workers(options, len(inversion.sites), inversion.image.size)
     # The threads are shared out among the samples; what noise drives below zero is clipped.
     threads = max(1, available_threads(options.threads) // workers)
@@ -512,14 +512,14 @@ class _Sampler:
     functions: Mapping[str, QuantityOf] = field(default_factory=dict)
 
     def measure(self, change: FloatArray, seed: Seed) -> dict[str, FloatArray]:
-        """Return the quantities of a sample, with what may lie beyond the edge."""
+        """Return the quantities of a sample, with objects beyond the edge."""
         rng = np.random.default_rng([self.options.seed, *b"edge", *seed.spawn_key])
         beyond = np.tensordot(rng.normal(size=len(self.by_edge)), self.by_edge, 1)
         return _measure(self.functions, self.fields, change + beyond)
 
     @property
     def asked(self) -> Callable[[FloatArray, Seed], dict[str, FloatArray]] | None:
-        """What measures the quantities; None if none was asked for."""
+        """Function that measures the quantities; None if there are none."""
         return None if self.choose is None else self.measure
 
     def _choose(self, changes: FloatArray) -> None:

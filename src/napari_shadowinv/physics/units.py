@@ -63,7 +63,7 @@ _CONDITIONS = {
 
 
 class Condition(NamedTuple):
-    """Errors of a field that depend on what nobody measured, as shares of the field."""
+    """Errors of a field that depend on an unmeasured quantity, as shares of the field."""
 
     agreement: str  # of what was not measured, that leaves the field determined
     difference: str  # that is assumed
@@ -142,7 +142,7 @@ class ShownField:
         return f"peak {self.symbol} {with_error(self.largest, share * self.largest)} {self.unit}"
 
     def conditional_text(self, condition: Condition) -> str:
-        """Write the largest magnitude with its errors by what is exact and by what is assumed."""
+        """Write the largest magnitude with its errors without and with the assumption."""
         peak = self.short_peak_text(PeakError(condition.peak_if_exact, ""))
         exact, off, remedy = _CONDITIONS[condition.subject].split("|")
         return (

@@ -273,7 +273,7 @@ def collect_fit_inputs(
 def _with_choices(
     shot: Shot, recorded: Shot, choices: FitChoices, name: str, unknown: bool
 ) -> Shot:
-    """Return a shot after the steps with what is known of it, or else of all images."""
+    """Return a shot after the steps with its own attributes, or else those for all images."""
     psf = shot.psf
     if psf is None and (choices.source_size is not None or choices.resolution is not None):
         if shot.setup is None:
@@ -420,8 +420,8 @@ def read_row_images(
         if isinstance(source, Path):
             source = read_part(source, channel)
         numbers = {name: getattr(row, name) for name in NUMBERS}
-        known = Shot(row.file, row_setup(row, recorded, recipe), source, row.mask, **numbers)
-        images.append(known.completed_by(recorded))
+        described = Shot(row.file, row_setup(row, recorded, recipe), source, row.mask, **numbers)
+        images.append(described.completed_by(recorded))
     return tuple(images)
 
 

@@ -223,7 +223,7 @@ def run(
     recipe : Recipe
         Steps and options.
     shot : Shot, array_like of shape (H, W), or path
-        The image, and what is known of it beside the recipe. The recipe's setup and measured source
+        The image, with its attributes. The recipe's setup and measured source
         precede those of the image's file; a pixel is used where all masks are true.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.invert`.
@@ -401,15 +401,15 @@ def _remaining_source(inputs: Inputs, shot: Shot, should_stop: ShouldStop | None
 
 def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     """Collect the inputs of a recipe: read files, and fill in defaults of the shot."""
-    given = shot if isinstance(shot, Shot) else Shot(shot)
-    loaded = load_shot(given, "the image")
+    entered = shot if isinstance(shot, Shot) else Shot(shot)
+    loaded = load_shot(entered, "the image")
     setup = loaded.setup if recipe.setup is None else recipe.setup
     beam = _beam_of(recipe, loaded)
     if setup is not None:
-        check_spacing(given.image, "the image", setup.pixel_sizes)
-        check_spacing(given.source, "the source", setup.pixel_sizes)
+        check_spacing(entered.image, "the image", setup.pixel_sizes)
+        check_spacing(entered.source, "the source", setup.pixel_sizes)
     usable = _mask((loaded.mask, recipe.mask), "mask", loaded.shape)
-    is_array = not isinstance(given.source, Shot | str | Path)
+    is_array = not isinstance(entered.source, Shot | str | Path)
     lit = beam.mask if is_array and beam is not None else None  # of a masked array
     usable = _without_gaps(usable, lit, loaded, beam)
     bare = _mask((loaded.source_mask, recipe.source_mask), "source mask", loaded.shape)
@@ -449,13 +449,13 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
 
 
 def load_shot(shot: AnyShot, name: str) -> Shot:
-    """Return a shot with its image in memory, and with what its file tells beside what is known."""
-    given = shot if isinstance(shot, Shot) else Shot(shot)
-    if isinstance(given.image, (str, Path)):
-        return given.completed_by(read_radiograph(Path(given.image)))
-    values, usable = unpack_array(given.image, name)
-    mask = given.mask if usable is None else join_masks(_pixels(given.mask, "mask"), usable)
-    return replace(given, image=plane_of(values, name), mask=mask)
+    """Return a shot with its image in memory, and with the other contents of its file."""
+    entered = shot if isinstance(shot, Shot) else Shot(shot)
+    if isinstance(entered.image, (str, Path)):
+        return entered.completed_by(read_radiograph(Path(entered.image)))
+    values, usable = unpack_array(entered.image, name)
+    mask = entered.mask if usable is None else join_masks(_pixels(entered.mask, "mask"), usable)
+    return replace(entered, image=plane_of(values, name), mask=mask)
 
 
 def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
@@ -496,17 +496,17 @@ def _mask(
     masks: Sequence[ArrayLike | Path | None], name: str, shape: tuple[int, int]
 ) -> MaskOrigin | None:
     """Return where all masks are true, with the file if there is only one, which is a file."""
-    given: list[Any] = [mask for mask in masks if mask is not None]
-    if not given:
+    listed: list[Any] = [mask for mask in masks if mask is not None]
+    if not listed:
         return None
-    planes = [_pixels(mask, name) for mask in given]
-    for mask, pixels in zip(given, planes, strict=True):
+    planes = [_pixels(mask, name) for mask in listed]
+    for mask, pixels in zip(listed, planes, strict=True):
         is_file = isinstance(mask, (str, Path))
         check_shape(f"{mask}: {name}" if is_file else name, pixels.shape, shape)
     joined = MaskOrigin.of(join_masks(*planes))
-    if len(given) > 1 or not isinstance(given[0], (str, Path)):
+    if len(listed) > 1 or not isinstance(listed[0], (str, Path)):
         return joined
-    path, variable = split_address(given[0])
+    path, variable = split_address(listed[0])
     from_file = {"file": text_of(path.name), "variable": variable, "sha256": sha256(path)}
     return joined.model_copy(update=from_file)
 
@@ -530,7 +530,7 @@ def _pixels(mask: Any, name: str) -> Any:
 def _without_gaps(
     mask: MaskOrigin | None, lit: BoolArray | None, *images: Shot | None
 ) -> MaskOrigin | None:
-    """Remove what a source's own mask hides, and pixels without a value in files, from a mask."""
+    """Remove pixels that a source's mask hides, or without a value in files, from a mask."""
     masks = [] if lit is None else [lit]
     masked = (image for image in images if image is not None and image.mask is not None)
     masks += [~np.isnan(image.image) for image in masked]

@@ -306,7 +306,7 @@ def _likeliest_shifts(
     beam: BeamPrior,
     search: ShiftSearch,
 ) -> list[Step]:
-    """Return the shift by the first cells, so many each time.
+    """Return the shifts by increasing numbers of the first cells.
 
     By generalised least squares with the likeliest difference of beams. `columns` (n, 7) are three
     patterns of the source, as many of the image, and the ratio of both.

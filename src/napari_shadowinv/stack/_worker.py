@@ -280,10 +280,10 @@ class InvertTask(Task):
         # A common source is already in the beam.
         recipe_source = self.estimate if beam is None else common.recipe.source
         changes = {"source": recipe_source, "setup": row.setup}
-        own = row.source is not None and not row.has_own_source
+        has_source = row.source is not None and not row.has_own_source
         shot = replace(
             row,
-            source=row.source if own else source,
+            source=row.source if has_source else source,
             mask=row.mask if isinstance(row.mask, Path) else join_masks(common.shot.mask, row.mask),
             source_mask=common.shot.source_mask,
             warnings=(),
@@ -291,7 +291,7 @@ class InvertTask(Task):
         inputs = collect_inputs(common.recipe.model_copy(update=changes), shot)
         if beam is None:
             inputs.recipe.check(inputs.shot)
-        if own:
+        if has_source:
             return inputs
         origin = common.provenance.image.source
         return replace(inputs, provenance=inputs.provenance.with_image(source=origin))
