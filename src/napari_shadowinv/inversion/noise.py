@@ -32,21 +32,29 @@ from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing.pixels import nonnegative_fit
 
-_TILES = 8  # along the shorter side
-_CELLS = 4  # along each side of a tile
-_MIN_USED_SHARE = 0.5  # of a cell's pixels
-_MIN_CELL_PX = 2
-_MAX_NOISE_RATIO = 2.0  # variance of a quiet tile about its plane, over that of noise
-_MAX_CURVATURE = 0.15  # of the spread of the tiles
-_MAX_DEVIATIONS = 4.0  # of a quiet tile from the others
-_MIN_CURVATURE = 1e-3  # of the brightness
-_MIN_QUIET_SHARE = 0.2  # of the frame's tiles
-_SIGNIFICANCE = 5.0  # standard deviations
-_MIN_DIFFERENCE = 2e-3
+
+@dataclass(frozen=True)
+class QuietTiles:
+    """Parts of the frame that show the beam alone, as benchmarks/imperfections.py needs them."""
+
+    tiles: int = 8  # along the shorter side
+    cells: int = 4  # along each side of a tile
+    used_share: float = 0.5  # of a cell's pixels
+    least_cell: int = 2  # px
+    noise_ratio: float = 2.0  # variance of a quiet tile about its plane, over that of noise
+    curvature: float = 0.15  # of the spread of the tiles
+    least_curvature: float = 1e-3  # of the brightness
+    deviations: float = 4.0  # of a quiet tile from the others
+    share: float = 0.2  # of the frame's tiles
+    significance: float = 5.0  # standard deviations
+    least_difference: float = 2e-3
 
 
 def beam_difference(
-    prepared: Prepared, noise: ImageNoise, patterns: FloatArray | None = None
+    prepared: Prepared,
+    noise: ImageNoise,
+    patterns: FloatArray | None = None,
+    tiles: QuietTiles = QuietTiles(),
 ) -> float:
     """Return the r.m.s. relative difference of image and source outside the object.
 
@@ -59,6 +67,8 @@ def beam_difference(
     patterns : ndarray, shape (k, H, W), optional
         Changes of the source by one standard deviation of each number that is known so well, as of
         its registration; what they explain does not count, either.
+    tiles : QuietTiles, optional
+        Parts of the frame that are compared.
 
     Returns
     -------
@@ -68,30 +78,30 @@ def beam_difference(
         hides the noise.
     """
     shape = prepared.mask.shape
-    cell = min(shape) // (_TILES * _CELLS)
-    if cell < _MIN_CELL_PX or noise.is_bound:
+    cell = min(shape) // (tiles.tiles * tiles.cells)
+    if cell < tiles.least_cell or noise.is_bound:
         return 0.0
-    rows, columns = (length // (cell * _CELLS) for length in shape)
-    ratio, variance = _cell_ratios(prepared, noise, cell, rows, columns)
+    rows, columns = (length // (cell * tiles.cells) for length in shape)
+    ratio, variance = _cell_ratios(prepared, noise, cell, rows, columns, tiles)
     means, by_noise = ratio.mean(axis=(2, 3)), variance.mean(axis=(2, 3))
     is_used = np.isfinite(means)
     middle = float(np.median(means[is_used])) if is_used.any() else 0.0
     if not middle > 0:
         return 0.0
     means, by_noise = means / middle, by_noise / middle**2
-    quiet = ~is_used | _is_quiet(ratio / middle, means, by_noise)
+    quiet = ~is_used | _is_quiet(ratio / middle, means, by_noise, tiles)
     # An object fades into neighbouring tiles that seem quiet.
     quiet = ndimage.binary_erosion(quiet, np.ones((3, 3)), border_value=1) & is_used
     quiet[1:-1, 1:-1] = False
     count = int(quiet.sum())
-    if count < _MIN_QUIET_SHARE * 2 * (rows + columns - 2):
+    if count < tiles.share * 2 * (rows + columns - 2):
         return 0.0
     deviation = means[quiet] - means[quiet].mean()
-    by_noise = by_noise[quiet] / _CELLS**2
+    by_noise = by_noise[quiet] / tiles.cells**2
     free = count - 1.0
     if patterns is not None:
-        source = _tile_sums(prepared.source, cell, rows, columns)
-        columns_of = [_tile_sums(each, cell, rows, columns)[quiet] for each in patterns]
+        source = _tile_sums(prepared.source, cell, rows, columns, tiles)
+        columns_of = [_tile_sums(each, cell, rows, columns, tiles)[quiet] for each in patterns]
         explained = np.stack(columns_of, axis=1) / source[quiet][:, None]
         explained -= explained.mean(axis=0)
         # The likeliest numbers, which are known to be about 0 ± 1: what exceeds that is not known.
@@ -101,82 +111,99 @@ def beam_difference(
         numbers /= max(1.0, float(np.sqrt((numbers**2).mean())))
         deviation = deviation - explained @ numbers
         free = max(free - float(np.trace(explained @ answer)), 1.0)
-    limit = free + _SIGNIFICANCE * np.sqrt(2.0 * count)
+    limit = free + tiles.significance * np.sqrt(2.0 * count)
     if (deviation**2).sum() < limit * by_noise.mean():
         return 0.0
     square = (deviation**2).sum() / free - by_noise.mean()
     difference = float(np.sqrt(max(square, 0.0)))
-    return difference if difference > _MIN_DIFFERENCE else 0.0
+    return difference if difference > tiles.least_difference else 0.0
 
 
-def _cell_sums(values: FloatArray | BoolArray, cell: int, rows: int, columns: int) -> FloatArray:
+def _cell_sums(
+    values: FloatArray | BoolArray, cell: int, rows: int, columns: int, tiles: QuietTiles
+) -> FloatArray:
     """Return sums over the cells of each tile, shape (rows, columns, 4, 4)."""
-    side = cell * _CELLS
-    inner = values[: rows * side, : columns * side]
-    cells = inner.reshape(rows, _CELLS, cell, columns, _CELLS, cell).sum(axis=(2, 5))
+    count = tiles.cells
+    inner = values[: rows * cell * count, : columns * cell * count]
+    cells = inner.reshape(rows, count, cell, columns, count, cell).sum(axis=(2, 5))
     return np.asarray(np.moveaxis(cells, 2, 1), dtype=np.float64)
 
 
-def _tile_sums(values: FloatArray, cell: int, rows: int, columns: int) -> FloatArray:
-    return np.asarray(_cell_sums(values, cell, rows, columns).sum(axis=(2, 3)))
+def _tile_sums(
+    values: FloatArray, cell: int, rows: int, columns: int, tiles: QuietTiles
+) -> FloatArray:
+    return np.asarray(_cell_sums(values, cell, rows, columns, tiles).sum(axis=(2, 3)))
 
 
 def _cell_ratios(
-    prepared: Prepared, noise: ImageNoise, cell: int, rows: int, columns: int
+    prepared: Prepared, noise: ImageNoise, cell: int, rows: int, columns: int, tiles: QuietTiles
 ) -> tuple[FloatArray, FloatArray]:
     """Return image over source and its variance by noise, shape (rows, columns, 4, 4)."""
     image, source, count = (
-        _cell_sums(values, cell, rows, columns)
+        _cell_sums(values, cell, rows, columns, tiles)
         for values in (prepared.image, prepared.source, prepared.mask)
     )
     mean = prepared.source[prepared.mask].mean()
-    is_known = (count >= _MIN_USED_SHARE * cell**2) & (source > 0)
+    is_known = (count >= tiles.used_share * cell**2) & (source > 0)
     source = np.where(is_known, source, np.nan)
     count = np.maximum(count, 1)
     variance = noise.variance(image / count / mean) * noise.clumping * mean**2 * count
     return image / source, variance / source**2
 
 
-def _is_quiet(ratio: FloatArray, means: FloatArray, variance: FloatArray) -> BoolArray:
+def _is_quiet(
+    ratio: FloatArray, means: FloatArray, variance: FloatArray, tiles: QuietTiles
+) -> BoolArray:
     """Return which tiles contain only a plane and noise."""
     residual = ratio - means[..., None, None]
-    for slope in np.indices((_CELLS, _CELLS)) - (_CELLS - 1) / 2:
+    for slope in np.indices((tiles.cells, tiles.cells)) - (tiles.cells - 1) / 2:
         share = (residual * slope).sum(axis=(2, 3), keepdims=True) / (slope**2).sum()
         residual = residual - share * slope
-    square = (residual**2).sum(axis=(2, 3)) / (_CELLS**2 - 3)
+    square = (residual**2).sum(axis=(2, 3)) / (tiles.cells**2 - 3)
     spread = NORMAL_MAD * float(np.nanmedian(np.abs(means - 1)))
-    allowed = max(_MAX_CURVATURE * spread, _MIN_CURVATURE) ** 2
-    quiet = square <= _MAX_NOISE_RATIO * variance + allowed
+    allowed = max(tiles.curvature * spread, tiles.least_curvature) ** 2
+    quiet = square <= tiles.noise_ratio * variance + allowed
     if not quiet.any():
         return np.asarray(quiet)
     # A flank may look like a plane, but stands out from the beam's slow differences.
     away = np.abs(means - np.median(means[quiet]))
     spread = NORMAL_MAD * float(np.median(away[quiet]))
-    return np.asarray(quiet & (away <= _MAX_DEVIATIONS * spread))
+    return np.asarray(quiet & (away <= tiles.deviations * spread))
 
 
 _CLIPPED_AT = 4.0  # in standard deviations of normal noise
 _DEVIATIONS = 5.0
 _BINS, _SAMPLES = 24, 20_000  # of brightness, and the pixels that are looked at
 
-_LAGS_PX = (1, 2, 3, 4, 6, 8)
-_FAR_LAG_PX = 12
-_BLOCK_PX, _MAX_BLOCKS = 4, 2000
-_CALM_SHARE, _LESS_CALM_SHARE = 0.15, 0.5  # of the blocks
 _DARK = 0.2  # of the mean brightness
-_MIN_PIXELS = 40
-_FLAT = slice(1, 4)  # lags at which white noise has V(1)
-_MIN_RISE, _RISE_DEVIATIONS = 1.2, 20.0  # of V over V(1): least, and in 1/√(pixels)
-_WIDTHS_PX = np.geomspace(0.3, 4.0, 24)
-_FIT_PX = 6  # lags up to which differences are compared with those of a blur
-_SCATTER = 0.25  # of V
-_MAX_MISFIT = 8.0  # χ², of noise that stands out of structure
-_MAX_FAR_EXCESS = 2.0  # of V at the largest lag, over that of noise that stands out of structure
-_MAX_STATED = 2.5  # variance, over the measured one
-_MAX_WHITE = 1.0  # variance before the blur: of one quantum a pixel
-_CLIP_DEVIATIONS, _CLIPPED_VARIANCE = 2.5, 0.973
-_MIN_DEVIATION = 1e-4  # of the brightness; below are the smooth flanks of noiseless images
-_MIN_FAR_RISE, _MAX_FAR_UNEVENNESS = 1.8, 1.5
+
+
+@dataclass(frozen=True)
+class CorrelationLimits:
+    """How correlated noise is told from structure, as benchmarks/trust.py (noise) needs it."""
+
+    lags: tuple[int, ...] = (1, 2, 3, 4, 6, 8)  # px
+    flat: tuple[int, int] = (1, 4)  # lags at which white noise has V(1)
+    block: int = 4  # px
+    most_blocks: int = 2000
+    calm_share: float = 0.15  # of the blocks
+    less_calm_share: float = 0.5
+    least_pixels: int = 40
+    rise: float = 1.2  # of V over V(1), at least
+    rise_deviations: float = 20.0  # the same, in 1/√(pixels)
+    widths: tuple[float, float, int] = (0.3, 4.0, 24)  # px, from, to, and how many
+    fitted: int = 6  # px, lags up to which differences are compared with those of a blur
+    scatter: float = 0.25  # of V
+    misfit: float = 8.0  # χ², of noise that stands out of structure
+    far_excess: float = 2.0  # of V at the largest lag, over that of such noise
+    most_white: float = 1.0  # variance before the blur: of one quantum a pixel
+    clipped_at: float = 2.5  # deviations
+    clipped_variance: float = 0.973
+    least_deviation: float = 1e-4  # of the brightness; below are flanks of noiseless images
+    far_lag: int = 12  # px
+    far_rise: float = 1.8
+    far_unevenness: float = 1.5
+
 
 # White noise on pixels has waves up to 3.51 rad/px, averaged over directions of its logarithm;
 # a Gaussian blur of standard deviation b ends them at exp(-γ/2) / b.
@@ -186,7 +213,8 @@ _GRAIN_PER_BLUR = 3.51 / math.exp(-0.5772 / 2)
 class ImageNoise:
     """Noise of an image, and of its source, as shares of the source's mean.
 
-    It is correlated as by a Gaussian blur of a stated width, px, or as measured.
+    It is correlated as by a Gaussian blur of a stated width, px, or as measured. A stated variance
+    of more than `most_stated` times the measured one is not used.
 
     Attributes
     ----------
@@ -211,6 +239,7 @@ class ImageNoise:
         prepared: Prepared,
         options: InversionOptions | None = None,
         correlation: float | None = None,
+        most_stated: float = 2.5,
     ) -> None:
         image, mask = prepared.image, prepared.mask  # in units of `prepared.unit`
         self.shape = mask.shape[0], mask.shape[1]
@@ -234,7 +263,7 @@ class ImageNoise:
         if level is not None:
             self.variance_terms[0] = (level / quantum) ** 2
             # A smooth image may have been smoothed, or has less noise than that.
-            if measured.is_bound or self.variance_terms[0] > _MAX_STATED * measured.variance:
+            if measured.is_bound or self.variance_terms[0] > most_stated * measured.variance:
                 self.clumping, self.is_bound = 1.0, False
         elif counts is not None:
             self.variance_terms[1] = counts / quantum
@@ -336,7 +365,11 @@ class CorrelatedNoise:
 
 
 def measure_correlation(
-    excess: FloatArray, brightness: FloatArray, mask: BoolArray, width: float | None = None
+    excess: FloatArray,
+    brightness: FloatArray,
+    mask: BoolArray,
+    width: float | None = None,
+    limits: CorrelationLimits = CorrelationLimits(),
 ) -> CorrelatedNoise:
     """Return the noise of the calm parts of an image, or the most that structure there allows.
 
@@ -353,21 +386,25 @@ def measure_correlation(
         The pixels to use.
     width : float, optional
         Standard deviation of the blur, px, if it is known.
+    limits : CorrelationLimits, optional
     """
-    differences = _CalmDifferences.of(excess, brightness, mask)
-    lags, variances = differences.curve(_CALM_SHARE)
-    if len(lags) < 3 or variances[-1] < _MIN_DEVIATION**2:
+    differences = _CalmDifferences.of(excess, brightness, mask, limits)
+    lags, variances = differences.curve(limits.calm_share)
+    if len(lags) < 3 or variances[-1] < limits.least_deviation**2:
         return CorrelatedNoise(0.0)
     variances = np.maximum(variances, 1e-9 * variances.max())
     white = float(variances[0])
-    widths = _WIDTHS_PX if width is None else np.array([width])
+    widths = np.geomspace(*limits.widths) if width is None else np.array([width])
     if width is None:
-        least = max(_MIN_RISE, 1 + _RISE_DEVIATIONS / math.sqrt(differences.count(_CALM_SHARE)))
-        if variances[_FLAT].max() < least * white:
+        least = max(
+            limits.rise,
+            1 + limits.rise_deviations / math.sqrt(differences.count(limits.calm_share)),
+        )
+        if variances[slice(*limits.flat)].max() < least * white:
             return CorrelatedNoise(white, is_far=differences.rise_evenly())
     elif 4 * math.pi * width**2 <= 1:
         return CorrelatedNoise(white)
-    near = lags <= _FIT_PX
+    near = lags <= limits.fitted
     answers = []
     for blur in widths.tolist():
         shares = _blurred_shares(lags, blur)
@@ -375,16 +412,18 @@ def measure_correlation(
         fitted, _ = nonnegative_fit((columns / variances[:, None])[near], np.ones(near.sum()))
         white = min(float(fitted[0]), float(variances.min()))
         blurred = min(float(fitted[1]), float(((variances - white) / shares).min()))
-        most = max(_MAX_WHITE - white, 0.0) / max(4 * math.pi * blur**2, 1.0)
+        most = max(limits.most_white - white, 0.0) / max(4 * math.pi * blur**2, 1.0)
         noise = CorrelatedNoise(white, min(blurred, most), blur, blurred >= most)
         rest = 1 - columns @ [white, noise.blurred] / variances
-        answers.append((float((rest[near] ** 2).sum()) / _SCATTER**2, noise))
+        answers.append((float((rest[near] ** 2).sum()) / limits.scatter**2, noise))
     least = min(misfit for misfit, _ in answers)
     alike = [noise for misfit, noise in answers if misfit <= least + 1]
     noise = max(alike, key=lambda noise: noise.white_variance)
     # Beyond its width V of blurred noise is constant, and that of structure still rises.
     far = noise.white + noise.blurred * float(_blurred_shares(lags[-1:], noise.width)[0])
-    is_bound = noise.is_bound or least > _MAX_MISFIT or float(variances[-1]) > _MAX_FAR_EXCESS * far
+    is_bound = (
+        noise.is_bound or least > limits.misfit or float(variances[-1]) > limits.far_excess * far
+    )
     return replace(noise, is_bound=is_bound)
 
 
@@ -402,35 +441,42 @@ class _CalmDifferences:
     brightness: FloatArray
     mask: BoolArray
     blocks: IntArray  # rows and columns, the calmest first
+    limits: CorrelationLimits
 
     @classmethod
-    def of(cls, excess: FloatArray, brightness: FloatArray, mask: BoolArray) -> _CalmDifferences:
-        used = complete_block_means(mask, _BLOCK_PX) == 1
-        level = complete_block_means(brightness, _BLOCK_PX)
+    def of(
+        cls,
+        excess: FloatArray,
+        brightness: FloatArray,
+        mask: BoolArray,
+        limits: CorrelationLimits,
+    ) -> _CalmDifferences:
+        used = complete_block_means(mask, limits.block) == 1
+        level = complete_block_means(brightness, limits.block)
         if not used.any():
-            return cls(excess, brightness, mask, np.zeros((0, 2), np.int64))
+            return cls(excess, brightness, mask, np.zeros((0, 2), np.int64), limits)
         mean = level[used].mean()
         smooth, level = (
             ndimage.gaussian_filter(np.where(used, values, fill), 1.0, mode="nearest")
-            for values, fill in ((complete_block_means(excess, _BLOCK_PX), 0.0), (level, mean))
+            for values, fill in ((complete_block_means(excess, limits.block), 0.0), (level, mean))
         )
         slopes = np.gradient(smooth) if min(smooth.shape) > 1 else [smooth]
         slope = np.hypot(*slopes) if len(slopes) > 1 else slopes[0]
         slope = ndimage.gaussian_filter(slope / np.sqrt(np.maximum(level, 0.05 * mean)), 1.0)
         blocks = np.argwhere(used & (level > _DARK * mean))
         order = np.argsort(slope[tuple(blocks.T)], kind="stable")
-        return cls(excess, brightness, mask, blocks[order])
+        return cls(excess, brightness, mask, blocks[order], limits)
 
     def count(self, share: float) -> int:
         """Return the number of pixels in the calmest blocks."""
-        return max(math.ceil(share * len(self.blocks)), 1) * _BLOCK_PX**2
+        return max(math.ceil(share * len(self.blocks)), 1) * self.limits.block**2
 
     def variance(self, lag: int, share: float) -> float:
         """Return V at a lag over the brightness, in calm blocks; NaN in few or dark pixels."""
         blocks = self.blocks[: max(math.ceil(share * len(self.blocks)), 1)]
-        blocks = blocks[:: max(-(-len(blocks) // _MAX_BLOCKS), 1)]
-        inside = np.indices((_BLOCK_PX, _BLOCK_PX)).reshape(2, -1)
-        places = (_BLOCK_PX * blocks.T[:, :, None] + inside[:, None]).reshape(2, -1)
+        blocks = blocks[:: max(-(-len(blocks) // self.limits.most_blocks), 1)]
+        inside = np.indices((self.limits.block, self.limits.block)).reshape(2, -1)
+        places = (self.limits.block * blocks.T[:, :, None] + inside[:, None]).reshape(2, -1)
         limits = np.array(self.mask.shape)[:, None] - lag
         rows, columns = places[:, ((places >= lag) & (places < limits)).all(axis=0)]
         total, is_used = np.zeros(len(rows)), np.ones(len(rows), bool)
@@ -441,23 +487,23 @@ class _CalmDifferences:
             is_used &= self.mask.take(at)
         squares = (total[is_used] / 6) ** 2
         brightness = self.brightness[rows, columns][is_used]
-        if len(squares) < _MIN_PIXELS or not brightness.any():
+        if len(squares) < self.limits.least_pixels or not brightness.any():
             return math.nan
-        limit = (_CLIP_DEVIATIONS * NORMAL_MAD) ** 2 * float(np.median(squares))
+        limit = (self.limits.clipped_at * NORMAL_MAD) ** 2 * float(np.median(squares))
         clipped = float(np.minimum(squares, limit).mean())
-        return clipped / (_CLIPPED_VARIANCE * float(brightness.mean()))
+        return clipped / (self.limits.clipped_variance * float(brightness.mean()))
 
     def curve(self, share: float) -> tuple[FloatArray, FloatArray]:
         """Return the lags at which V can be measured, and V."""
-        variances = np.array([self.variance(lag, share) for lag in _LAGS_PX])
+        variances = np.array([self.variance(lag, share) for lag in self.limits.lags])
         known = np.isfinite(variances)
-        return np.array(_LAGS_PX, dtype=np.float64)[known], variances[known]
+        return np.array(self.limits.lags, dtype=np.float64)[known], variances[known]
 
     def rise_evenly(self) -> bool:
         """Whether V rises at a large lag, and not more where the image is less calm."""
-        near, far = (self.variance(lag, _CALM_SHARE) for lag in (1, _FAR_LAG_PX))
-        uneven = self.variance(_FAR_LAG_PX, _LESS_CALM_SHARE)
-        return far > _MIN_FAR_RISE * near and uneven < _MAX_FAR_UNEVENNESS * far
+        near, far = (self.variance(lag, self.limits.calm_share) for lag in (1, self.limits.far_lag))
+        uneven = self.variance(self.limits.far_lag, self.limits.less_calm_share)
+        return far > self.limits.far_rise * near and uneven < self.limits.far_unevenness * far
 
 
 def _terms(bright: FloatArray, differences: FloatArray) -> FloatArray:

@@ -39,6 +39,7 @@ them (200 × 200 px and the reference images):
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
 
@@ -56,24 +57,32 @@ from napari_shadowinv.options import InversionOptions
 
 _BRIGHT = 3.0  # times the source: a bright line, too fine for the pixels
 _LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 4), (4, 0))
-_PATTERN = 0.5
-_NOTABLE_RESIDUAL = 0.05
-# More sites would follow the image better where its residual is larger than the noise by this:
-_ABOVE_NOISE = 1.5**2  # mean square in a square of the image, of noise and invisible residual
-_INVISIBLE, _LEAST_VARIANCE = 0.04, 1e-12  # of the brightness; so that nothing divides by zero
-_SQUARE_PX = 16
-_MIN_SHARE_OF_SQUARE = 0.5  # of its pixels that count
-_PIXELS_PER_THREAD = 1 << 16  # fewer are not worth a thread
-_SQUARES_BELOW = 0.98  # share of the squares
-
 _ROUNDING = 1e-6  # px, where image and source are the same
 
-_CAUSTIC = 0.2  # Jacobian; independent of the user's option
-# Two Jacobians, and the largest shares below the first: of all strips, and where one is widest.
-_STRIPS = ((0.4, 0.7, 0.72, 0.84), (0.6, 0.85, 0.8, 0.87))
-_LEAST_STRIP = 0.003  # of the pixels
-_LEAST_CAUSTIC = 0.01  # of a strip
-_ENOUGH_PIXELS = 300  # of a side, to resolve the width of a strip
+
+@dataclass(frozen=True)
+class CoarseCheck:
+    """Where more sites would follow the image better; limits as measured above."""
+
+    above_noise: float = 1.5**2  # mean square in a square, of noise and invisible residual
+    invisible: float = 0.04  # of the brightness
+    square: int = 16  # px
+    share_of_square: float = 0.5  # of its pixels that count
+    squares_below: float = 0.98  # share of the squares
+    pixels_per_thread: int = 1 << 16  # fewer are not worth a thread
+
+
+@dataclass(frozen=True)
+class FoldCheck:
+    """When folds are deep; limits as measured above."""
+
+    caustic: float = 0.2  # Jacobian; independent of the user's option
+    # Two Jacobians, and the largest shares below the first: of all strips, and where one is widest.
+    strips: tuple[tuple[float, ...], ...] = ((0.4, 0.7, 0.72, 0.84), (0.6, 0.85, 0.8, 0.87))
+    least_strip: float = 0.003  # of the pixels
+    least_caustic: float = 0.01  # of a strip
+    enough_pixels: int = 300  # of a side, to resolve the width of a strip
+
 
 DECISIVE = {
     "misfit": Verdict.MISFIT,
@@ -85,9 +94,6 @@ DECISIVE = {
     "correlated-noise": Verdict.UNCERTAIN,
 }
 """Cautions that decide the verdict, the gravest first."""
-
-_MIN_HOLE_PX = 3  # side of the smallest masked square that matters
-_NEAR_MASK = 0.02  # of the shorter side
 
 
 def image_residual(image: FloatArray, reprojection: FloatArray, mask: BoolArray) -> float:
@@ -147,24 +153,28 @@ class _Planes(NamedTuple):
 
 
 def is_coarse(
-    prepared: Prepared, reprojection: FloatArray, noise: ImageNoise, threads: int | None = None
+    prepared: Prepared,
+    reprojection: FloatArray,
+    noise: ImageNoise,
+    threads: int | None = None,
+    check: CoarseCheck = CoarseCheck(),
 ) -> bool:
     """Return whether the re-projection misses structures that noise does not hide.
 
     That is the case if the residual exceeds the noise in some squares away from bright lines.
     """
     shape = prepared.mask.shape
-    side = min(_SQUARE_PX, *shape)
+    side = min(check.square, *shape)
     excess, share = np.empty((2, shape[0] // side, shape[1] // side))
-    hidden = noise.variance_terms + np.array([_LEAST_VARIANCE, 0.0, _INVISIBLE**2])
+    hidden = noise.variance_terms + np.array([1e-12, 0.0, check.invisible**2])
     sums = _Planes.of(prepared, reprojection), side, hidden, excess, share
-    smallest = max(1, _PIXELS_PER_THREAD // (side * shape[1]))
+    smallest = max(1, check.pixels_per_thread // (side * shape[1]))
     in_ranges(_average_squares, len(excess), available_threads(threads), *sums, smallest=smallest)
-    is_measured = share > _MIN_SHARE_OF_SQUARE
+    is_measured = share > check.share_of_square
     if not is_measured.any():
         return False
-    ratio = np.quantile(excess[is_measured] / share[is_measured], _SQUARES_BELOW)
-    return bool(ratio > _ABOVE_NOISE)
+    ratio = np.quantile(excess[is_measured] / share[is_measured], check.squares_below)
+    return bool(ratio > check.above_noise)
 
 
 @kernel
@@ -222,17 +232,27 @@ def _subtract_off_lines(planes: _Planes, residual: FloatArray) -> int:
     return count
 
 
-def _misfit(prepared: Prepared, reprojection: FloatArray, n_sites: int) -> str:
-    """Describe a pattern in the image that the re-projection misses."""
+def _misfit(
+    prepared: Prepared,
+    reprojection: FloatArray,
+    n_sites: int,
+    *,
+    notable: float = 0.05,
+    pattern: float = 0.5,
+) -> str:
+    """Describe a pattern in the image that the re-projection misses.
+
+    Its residual is `notable`, and pixels up to four apart are correlated by `pattern`.
+    """
     mask, planes = prepared.mask, _Planes.of(prepared, reprojection)
     mean, residual = planes.mean, np.empty(mask.shape)
     count = _subtract_off_lines(planes, residual)
     share = float(np.sqrt(np.einsum("yx,yx->", residual, residual) / max(count, 1)) / mean)
-    if share < _NOTABLE_RESIDUAL:
+    if share < notable:
         return ""
     # A few hot pixels are no pattern.
     np.clip(residual, -5 * share * mean, 5 * share * mean, out=residual)
-    if max(abs(_correlation(residual, *lag)) for lag in _LAGS) < _PATTERN:
+    if max(abs(_correlation(residual, *lag)) for lag in _LAGS) < pattern:
         return ""
     advice = "use more sites"
     if n_sites >= mask.sum():
@@ -314,18 +334,18 @@ def mark_caustics(
     return marked
 
 
-def _deep_folds(jacobian: FloatArray, mask: BoolArray) -> str:
+def _deep_folds(jacobian: FloatArray, mask: BoolArray, check: FoldCheck = FoldCheck()) -> str:
     """Describe caustics far beyond their onset, by the rim of the strip between them."""
-    if not (jacobian < _CAUSTIC)[mask].any():
+    if not (jacobian < check.caustic)[mask].any():
         return ""
-    step = max(1, min(mask.shape) // _ENOUGH_PIXELS)
+    step = max(1, min(mask.shape) // check.enough_pixels)
     used = mask[::step, ::step]
     jacobian = np.where(used, jacobian[::step, ::step], np.inf)
-    least = _LEAST_STRIP * float(used.sum())
+    strips_below = partial(_strips, jacobian, check.least_strip * float(used.sum()), check)
     if not any(
-        _share_of_strips(jacobian, inner, outer, least) > of_all
-        or _share_where_widest(jacobian, inner, outer, least) > of_widest
-        for inner, outer, of_all, of_widest in _STRIPS
+        _share_of_strips(jacobian, inner, *strips_below(outer)) > of_all
+        or _share_where_widest(jacobian, inner, outer, *strips_below(inner)) > of_widest
+        for inner, outer, of_all, of_widest in check.strips
     ):
         return ""
     return (
@@ -335,24 +355,28 @@ def _deep_folds(jacobian: FloatArray, mask: BoolArray) -> str:
     )
 
 
-def _strips(jacobian: FloatArray, outer: float, least: float) -> tuple[AnyArray, AnyArray]:
+def _strips(
+    jacobian: FloatArray, least: float, check: FoldCheck, outer: float
+) -> tuple[AnyArray, AnyArray]:
     """Label regions with the Jacobian below `outer`; return also the labels with caustics."""
     labels, count = ndimage.label(jacobian < outer)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
-    caustics = np.bincount(labels[jacobian < _CAUSTIC], minlength=count + 1)
-    return labels, np.flatnonzero((sizes >= least) & (caustics >= _LEAST_CAUSTIC * sizes))
+    caustics = np.bincount(labels[jacobian < check.caustic], minlength=count + 1)
+    return labels, np.flatnonzero((sizes >= least) & (caustics >= check.least_caustic * sizes))
 
 
-def _share_of_strips(jacobian: FloatArray, inner: float, outer: float, least: float) -> float:
-    """Return the share of pixels below `inner` in all strips below `outer`."""
-    labels, strip_labels = _strips(jacobian, outer, least)
+def _share_of_strips(
+    jacobian: FloatArray, inner: float, labels: AnyArray, strip_labels: AnyArray
+) -> float:
+    """Return the share of pixels below `inner` in all strips."""
     strips = jacobian[np.isin(labels, strip_labels)]
     return float((strips < inner).sum() / max(strips.size, 1))
 
 
-def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least: float) -> float:
+def _share_where_widest(
+    jacobian: FloatArray, inner: float, outer: float, labels: AnyArray, strip_labels: AnyArray
+) -> float:
     """Return the share around the widest place of a strip: the tips of a crescent are shallow."""
-    labels, strip_labels = _strips(jacobian, inner, least)
     boxes = ndimage.find_objects(labels)
     largest = 0.0
     for label in strip_labels:
@@ -366,17 +390,22 @@ def _share_where_widest(jacobian: FloatArray, inner: float, outer: float, least:
     return largest
 
 
-def _peak_at_mask(displacement: FloatArray, mask: BoolArray) -> str:
-    """Describe a peak of the field next to masked pixels or under them."""
+def _peak_at_mask(
+    displacement: FloatArray, mask: BoolArray, *, hole: int = 3, reach: float = 0.02
+) -> str:
+    """Describe a peak of the field next to masked pixels or under them.
+
+    Masked squares of `hole` px matter, and pixels within `reach` of the shorter side.
+    """
     if mask.all():
         return ""
-    holes = ndimage.binary_opening(~mask, np.ones((_MIN_HOLE_PX, _MIN_HOLE_PX)))
+    holes = ndimage.binary_opening(~mask, np.ones((hole, hole)))
     length = np.hypot(*displacement)
     peak = float(length[mask].max())
     if not holes.any() or not peak > _ROUNDING:
         return ""
-    reach = max(2, round(_NEAR_MASK * min(mask.shape)))
-    near = ndimage.binary_dilation(holes, iterations=reach)
+    pixels = max(2, round(reach * min(mask.shape)))
+    near = ndimage.binary_dilation(holes, iterations=pixels)
     under = float(length[holes].max())
     if under <= peak and not (near & mask & (length >= peak)).any():
         return ""
