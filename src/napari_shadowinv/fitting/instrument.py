@@ -21,7 +21,7 @@ from napari_shadowinv.facts import percent, with_error
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
     BeamExcess,
-    Scene,
+    LitObject,
     SmoothField,
     motions,
 )
@@ -490,7 +490,7 @@ def absorption_shapes(
     rms: float, displacement: FloatArray, used: BoolArray, around: Around
 ) -> Shapes:
     """Return the transmission of an object with a displacement in px, (2, H, W)."""
-    scene = Scene(displacement, used.astype(np.float64), used)
+    scene = LitObject(displacement, used.astype(np.float64), used)
     envelope, radius = scene.object_region
     smooth = SmoothField(radius, scene.source, _FITTED_VARIANCE)
     products = ProductShapes.of_field(smooth, rms, around, envelope)

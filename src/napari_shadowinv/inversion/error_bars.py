@@ -48,7 +48,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Summarised, to_figures
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.inversion._invert import invert, plan_sites
-from napari_shadowinv.inversion.imperfections import InstrumentDraws, RecordedShot, Scene
+from napari_shadowinv.inversion.imperfections import InstrumentDraws, LitObject, RecordedShot
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, prepare
 from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.inversion.samples import (
@@ -688,7 +688,7 @@ def _draws(image: ArrayLike, inversion: Inversion, plan: SitePlan) -> Instrument
     shot = RecordedShot(
         image=np.where(mask, unpack_array(image, "image")[0], 0.0),
         source=inversion.source,
-        scene=Scene(inversion.displacement, inversion.source, mask),
+        scene=LitObject(inversion.displacement, inversion.source, mask),
     )
     draws = InstrumentDraws(shot, instrument, beam)
     return draws if draws.names else None

@@ -134,7 +134,7 @@ def _line_modes(size: int, length: float, share: float) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Scene:
+class LitObject:
     """The retrieved object of a shot."""
 
     displacement: FloatArray  # (2, H, W): of the ray through each pixel, px
@@ -159,7 +159,7 @@ class RecordedShot:
 
     image: FloatArray
     source: FloatArray
-    scene: Scene
+    scene: LitObject
 
     def mean(self, values: FloatArray) -> float:
         """Return the mean of image or source over the used pixels."""
@@ -183,7 +183,7 @@ class Imperfection:
     tested: float  # standard deviation whose effect every budget states; 0 if it takes too long
     pattern: Pattern
     change: Change
-    count: Callable[[Scene], int] = lambda scene: 1  # of the numbers that a change takes
+    count: Callable[[LitObject], int] = lambda scene: 1  # of the numbers that a change takes
     is_even: bool = False  # whether the imperfection grows with the square of its number
 
     def name(self, size: float) -> str:

@@ -80,7 +80,7 @@ class Film:
         return f"film {self.number}"
 
 
-class _Fiducial(CheckedModel):
+class _FilmFiducial(CheckedModel):
     """A mark through the pack, in px of a film's scan."""
 
     film: int
@@ -155,10 +155,10 @@ def _check_rectangle(number: int, corners: FloatArray, pixel_size: float | None)
         )
 
 
-def read_fiducials(table: Path, n_layers: int) -> dict[int, list[_Fiducial]]:
+def read_fiducials(table: Path, n_layers: int) -> dict[int, list[_FilmFiducial]]:
     """Read the marks through a pack, by the number of the film."""
-    marks: dict[int, list[_Fiducial]] = {}
-    for line, row in read_rows(table, _Fiducial).items():
+    marks: dict[int, list[_FilmFiducial]] = {}
+    for line, row in read_rows(table, _FilmFiducial).items():
         if not 1 <= row.film <= n_layers:
             raise InputError(
                 f"{table}, line {line} has a mark on film {row.film}: expected numbers of layers, "
@@ -173,7 +173,7 @@ def read_fiducials(table: Path, n_layers: int) -> dict[int, list[_Fiducial]]:
     return marks
 
 
-def _check_on_scan(marks: Sequence[_Fiducial], scan: Scan, table: Path | None) -> None:
+def _check_on_scan(marks: Sequence[_FilmFiducial], scan: Scan, table: Path | None) -> None:
     height, width = scan.pixels.shape[:2]
     for mark in marks:
         if not (-0.5 <= mark.y <= height - 0.5 and -0.5 <= mark.x <= width - 0.5):

@@ -70,14 +70,14 @@ class Beam:
 
 
 @dataclass
-class _Entry:
+class _SharedPlan:
     """A plan, complete or in preparation."""
 
     lock: threading.Lock = field(default_factory=threading.Lock)
     plan: SitePlan | None = None
 
 
-_entries: OrderedDict[str, _Entry] = OrderedDict()
+_entries: OrderedDict[str, _SharedPlan] = OrderedDict()
 _entries_lock = threading.Lock()
 
 
@@ -91,7 +91,7 @@ def shared_plan(
     """Return the sites for a beam; the first call in this process computes them."""
     key = f"{beam.key}{options.site_key()}{measured}"
     with _entries_lock:
-        entry = _entries.setdefault(key, _Entry())
+        entry = _entries.setdefault(key, _SharedPlan())
         _entries.move_to_end(key)
         while len(_entries) > _MAX_PLANS:
             _entries.popitem(last=False)
