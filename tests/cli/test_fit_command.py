@@ -4,7 +4,7 @@ import dataclasses
 import os
 import re
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.plotting import fit_figure
 from napari_shadowinv.preprocessing import Bin, Recipe, polynomial_source
 from napari_shadowinv.provenance import Origin, Provenance
+from napari_shadowinv.shot import Shot
 
 SHAPE = (48, 56)
 TRUTH = gaussian_blob(SHAPE, 25.0, 7.0, (22, 30)).displacement
@@ -62,9 +63,9 @@ def fit_arguments(monkeypatch: pytest.MonkeyPatch, make_fit: Callable[..., Fit])
     """Record the arguments that the command passes to `fit`, which then does no work."""
     recorded: dict[str, Any] = {}
 
-    def fit(**arguments: Any) -> Fit:
-        recorded.update(arguments)
-        strengths = (1.0, 1.7, 2.0, 3.0)[: len(arguments["images"])]
+    def fit(shots: Sequence[Shot], **arguments: Any) -> Fit:
+        recorded.update(arguments, shots=shots)
+        strengths = (1.0, 1.7, 2.0, 3.0)[: len(shots)]
         return make_fit(strengths=strengths)
 
     monkeypatch.setattr("napari_shadowinv.pipeline.fit_run.fit", fit)
@@ -175,15 +176,16 @@ def test_images_setups_and_choices_reach_the_fit(fit_arguments: dict[str, Any]) 
         "--align", "shift", "--seed", 3,
     )  # fmt: skip
     assert result.exit_code == 0, result.output
-    images = fit_arguments["images"]
-    np.testing.assert_array_equal(images[1].image, tifffile.imread("b.tif"))
-    assert of_each(images, "setup") == [FIRST, SECOND]
-    assert of_each(images, "strength") == of_each(images, "mask") == [None, None]
+    shots = fit_arguments["shots"]
+    np.testing.assert_array_equal(shots[1].image, tifffile.imread("b.tif"))
+    assert of_each(shots, "setup") == [FIRST, SECOND]
+    assert of_each(shots, "strength") == of_each(shots, "mask") == [None, None]
     assert fit_arguments["fields"] == ("B", "E")
-    assert (fit_arguments["noise"], fit_arguments["brightness"]) == ("poisson", "free")
-    assert of_each(images, "psf") == [1.5, 1.5]
+    assert of_each(shots, "noise") == ["poisson", "poisson"]
+    assert of_each(shots, "brightness") == ["free", "free"]
+    assert of_each(shots, "psf") == [1.5, 1.5]
     assert fit_arguments["options"] == FitOptions(align="shift", seed=3)
-    assert of_each(images, "source") == of_each(images, "fiducials") == [None, None]
+    assert of_each(shots, "source") == of_each(shots, "fiducials") == [None, None]
 
 
 def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any]) -> None:
@@ -204,15 +206,15 @@ def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any
     )
     result = shadowinv("fit", "night/shots.csv", "--psf", 2, "--noise", 30)
     assert result.exit_code == 0, result.output
-    images = fit_arguments["images"]
-    assert of_each(images, "setup") == [FIRST, SECOND]
+    shots = fit_arguments["shots"]
+    assert of_each(shots, "setup") == [FIRST, SECOND]
     # Flags hold where a cell is empty.
-    assert of_each(images, "psf") == [2.0, 0.5]
-    assert (of_each(images, "noise"), fit_arguments["noise"]) == ([20.0, None], 30.0)
-    assert of_each(images, "brightness") == [1.0, 1.2]
-    np.testing.assert_array_equal(of_each(images, "source"), np.full((2, *SHAPE), 900))
-    np.testing.assert_array_equal(images[0].mask, mask > 0)
-    assert images[1].mask is None
+    assert of_each(shots, "psf") == [2.0, 0.5]
+    assert of_each(shots, "noise") == [20.0, 30.0]
+    assert of_each(shots, "brightness") == [1.0, 1.2]
+    np.testing.assert_array_equal(of_each(shots, "source"), np.full((2, *SHAPE), 900))
+    np.testing.assert_array_equal(shots[0].mask, mask > 0)
+    assert shots[1].mask is None
     provenance = provenance_in("a_fit.shadowinv")
     assert [image.file for image in provenance.images] == ["a.tif", "b.tif"]
     assert provenance.images[1].sha256 == sha256(night / "b.tif")
@@ -229,7 +231,7 @@ def test_a_table_of_numbers_is_an_image(fit_arguments: dict[str, Any]) -> None:
     image = np.random.default_rng(1).uniform(1, 2, SHAPE)
     np.savetxt("numbers.csv", image, delimiter=",", fmt="%.17g")
     assert shadowinv("fit", "numbers.csv").exit_code == 0
-    np.testing.assert_array_equal(of_each(fit_arguments["images"], "image"), image[None])
+    np.testing.assert_array_equal(of_each(fit_arguments["shots"], "image"), image[None])
 
 
 def test_binning_sums_pixels_and_enlarges_the_pixel_size(
@@ -240,19 +242,19 @@ def test_binning_sums_pixels_and_enlarges_the_pixel_size(
     result = shadowinv(*PAIR, "--bin", 2, "--source", "beam.tif", *sizes)
     assert result.exit_code == 0, result.output
     blocks = tifffile.imread("a.tif").astype(float).reshape(24, 2, 28, 2).sum(axis=(1, 3))
-    np.testing.assert_allclose(fit_arguments["images"][0].image, blocks)
-    beams = of_each(fit_arguments["images"], "source")
+    np.testing.assert_allclose(fit_arguments["shots"][0].image, blocks)
+    beams = of_each(fit_arguments["shots"], "source")
     np.testing.assert_array_equal(beams, np.full((2, 24, 28), 40))
     first = FIRST.model_copy(update={"pixel_size": 2e-5})
-    assert fit_arguments["images"][0].setup == first
-    assert fit_arguments["images"][0].psf == pytest.approx(point_spread(first, 1e-5, 4e-4))
+    assert fit_arguments["shots"][0].setup == first
+    assert fit_arguments["shots"][0].psf == pytest.approx(point_spread(first, 1e-5, 4e-4))
 
 
 def test_strengths_replace_energies_and_keep_units(
     fit_arguments: dict[str, Any],
 ) -> None:
     assert shadowinv(*PAIR, "--strengths", "1 1,1.7 2.9", "--fields", "B,E").exit_code == 0
-    assert of_each(fit_arguments["images"], "strength") == [(1.0, 1.0), (1.7, 2.9)]
+    assert of_each(fit_arguments["shots"], "strength") == [(1.0, 1.0), (1.7, 2.9)]
     assert fit_in("a_fit.shadowinv")[0].setups == (FIRST, SECOND)
 
 
@@ -260,7 +262,7 @@ def test_known_displacements_come_from_a_table(fit_arguments: dict[str, Any]) ->
     Path("mesh.csv").write_text("x;y;dx;dy;sigma\n20;10;0.5;-0.25;0.1\n30;12;0.4;0;0.2\n")
     assert shadowinv("fit", "a.tif", "--fiducials", "mesh.csv").exit_code == 0
     rows = ((10, 20, -0.25, 0.5, 0.1), (12, 30, 0, 0.4, 0.2))
-    np.testing.assert_array_equal(fit_arguments["images"][0].fiducials, rows)
+    np.testing.assert_array_equal(fit_arguments["shots"][0].fiducials, rows)
     provenance = provenance_in("a_fit.shadowinv")
     assert provenance.fiducials == Origin(file="mesh.csv", sha256=sha256("mesh.csv"))
     assert provenance.fiducial_rows == rows
@@ -309,9 +311,15 @@ TABLES = {
     "file,noise\na.tif,loud\n": ("line 2", "'noise' is 'loud': expected 'poisson'"),
     "file,strength\na.tif,1\nb.tif,\n": ("b.tif has no strength, other images have",),
     "file,source\na.tif,unknown\nb.tif,\n": ("b.tif has no unknown source",),
-    "file,noise\na.tif,poisson\nb.tif,3\n": ("'poisson' in some images and a number in others",),
-    "file,noise\na.tif,poisson\nb.tif,proportional\n": ("and 'proportional' in others",),
-    "file,strength\na.tif,1 2\nb.tif,2\n": ("strengths have 2, 1 numbers",),
+    "file,strength,noise\na.tif,1,poisson\nb.tif,2,3\n": (
+        "'poisson' in some images and a number in others",
+    ),
+    "file,strength,noise\na.tif,1,poisson\nb.tif,2,proportional\n": (
+        "and 'proportional' in others",
+    ),
+    "file,strength\na.tif,1 2\nb.tif,2\n": (
+        "strengths are (1.0, 2.0), (2.0,): expected one number for each",
+    ),
 }
 
 
@@ -499,9 +507,9 @@ def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> Non
     )
     assert shadowinv(*PAIR, "--recipe", "r.toml", "--overwrite").exit_code == 0
     assert before.keys() == fit_arguments.keys()
-    for name in before.keys() - {"images", "on_progress", "should_stop"}:
+    for name in before.keys() - {"shots", "on_progress", "should_stop"}:
         assert fit_arguments[name] == before[name]
-    for new, old in zip(fit_arguments["images"], before["images"], strict=True):
+    for new, old in zip(fit_arguments["shots"], before["shots"], strict=True):
         np.testing.assert_equal(vars(new), vars(old))
 
     # Flags override the recipe.
@@ -519,10 +527,11 @@ def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> Non
     )
     changed = shadowinv(*PAIR, "--recipe", "r.toml", *overrides, "--overwrite")
     assert changed.exit_code == 0, changed.output
-    assert of_each(fit_arguments["images"], "psf") == [0.5, 0.5]
+    assert of_each(fit_arguments["shots"], "psf") == [0.5, 0.5]
     assert fit_arguments["options"] == FitOptions(samples=3)
-    assert fit_arguments["images"][1].source.shape == (SHAPE[0] // 4, SHAPE[1] // 4)
-    assert (fit_arguments["brightness"], fit_arguments["fields"]) == ("free", ("B", "E"))
+    assert fit_arguments["shots"][1].source.shape == (SHAPE[0] // 4, SHAPE[1] // 4)
+    assert of_each(fit_arguments["shots"], "brightness") == ["free", "free"]
+    assert fit_arguments["fields"] == ("B", "E")
 
 
 def test_the_setup_of_one_image_is_in_its_recipe(fit_arguments: dict[str, Any]) -> None:
@@ -530,7 +539,7 @@ def test_the_setup_of_one_image_is_in_its_recipe(fit_arguments: dict[str, Any]) 
     assert shadowinv(*alone, "--save-recipe", "r.toml").exit_code == 0
     assert read_recipe(Path("r.toml")).setup == FIRST
     assert shadowinv("fit", "b.tif", "--recipe", "r.toml", "--energies", 5).exit_code == 0
-    assert of_each(fit_arguments["images"], "setup") == [SECOND]
+    assert of_each(fit_arguments["shots"], "setup") == [SECOND]
     assert shadowinv(*PAIR, "--save-recipe", "both.toml", "--overwrite").exit_code == 0
     assert read_recipe(Path("both.toml")).setup is None
 
@@ -539,7 +548,7 @@ def test_the_source_can_be_estimated_by_the_recipe(fit_arguments: dict[str, Any]
     Path("r.toml").write_text('[source]\nmethod = "polynomial"\ndegree = 1\n')
     assert shadowinv("fit", "a.tif", "--recipe", "r.toml").exit_code == 0
     expected = polynomial_source(tifffile.imread("a.tif").astype(float), degree=1)
-    np.testing.assert_array_equal(fit_arguments["images"][0].source, expected)
+    np.testing.assert_array_equal(fit_arguments["shots"][0].source, expected)
 
 
 RECIPES = {
@@ -565,10 +574,11 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
     Path("page.toml").write_text(text, encoding="utf-8")
     result = shadowinv(*PAIR, "--recipe", "page.toml")
     assert result.exit_code == 0, result.output
-    assert (fit_arguments["noise"], fit_arguments["brightness"]) == ("poisson", "free")
+    assert of_each(fit_arguments["shots"], "noise") == ["poisson", "poisson"]
+    assert of_each(fit_arguments["shots"], "brightness") == ["free", "free"]
     assert fit_arguments["options"] == FitOptions(samples=10)
-    assert fit_arguments["images"][1].image.shape == (24, 28)
-    assert fit_arguments["images"][0].psf > 0
+    assert fit_arguments["shots"][1].image.shape == (24, 28)
+    assert fit_arguments["shots"][0].psf > 0
     keys = tomllib.loads(text)["fit"].keys()
     assert set(FitChoices.model_fields) - keys == {"psf"}
 
@@ -733,7 +743,7 @@ def test_a_doubtful_setup_is_printed_once_by_a_fit() -> None:
 
 
 def test_setup_warnings_come_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fit(**_: Any) -> Fit:
+    def fit(*_: Any, **__: Any) -> Fit:
         raise InputError("the work began")
 
     monkeypatch.setattr("napari_shadowinv.pipeline.fit_run.fit", fit)
