@@ -57,7 +57,7 @@ def block(word: str) -> str:
 
 
 @pytest.fixture
-def predict_image(night, tmp_path) -> Path:
+def project(night, tmp_path) -> Path:
     """The folder that the recipes call /project."""
     folder = tmp_path / "project"
     (folder / "shots").mkdir(parents=True)

@@ -231,9 +231,9 @@ def test_report_leaves_masked_pixels_out_of_the_peak(shot: Array) -> None:
 def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
     near = paper_setup().model_copy(update={"pixel_size": 2e-5})
 
-    def warnings(source: Estimate, image: Array = shot, **more: Any) -> str:
+    def warnings(source: Estimate, image: Shot | Array = shot, **more: Any) -> str:
         recipe = Recipe(source=source, options=FEW, setup=near)
-        return str(run(recipe, Shot(image, **more)).report.warnings)
+        return str(run(recipe, image, **more).report.warnings)
 
     assert "choose the source 'isotropic'" in warnings(UniformEstimate())
     assert "isotropic" not in warnings(IsotropicEstimate())
@@ -243,7 +243,7 @@ def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
     hidden = np.hypot(y - 24, x - 30) > 10
     cache = Cache()
     for _ in range(2):
-        text = warnings(GaussianEstimate(), beam * shot, mask=hidden, cache=cache)
+        text = warnings(GaussianEstimate(), Shot(beam * shot, mask=hidden), cache=cache)
         assert "the Gaussian beam rises to" in text
 
 

@@ -69,7 +69,7 @@ def test_series_of_a_store_is_that_of_python(form: Any, qtbot: Any, store: Path)
     region = Region(center=(15.5, 15.5), radius=10)
     times = 1e-9 * np.arange(SHOTS)
     (expected,) = analyse_shots(read_stack(store), region, times)
-    for name, quantity in expected.quantities.items():
+    for name, quantity in expected.result.quantities.items():
         np.testing.assert_allclose(measured[name].value, quantity.value, rtol=1e-12)
     rows = texts_of(form.report)
     for fact in expected.result.facts:

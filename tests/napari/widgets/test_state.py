@@ -338,14 +338,14 @@ def test_a_source_mask_hides_the_object_from_the_estimate_alone(
 ) -> None:
     shot, potential, is_object = hump
     recipe = Recipe(source=PolynomialEstimate(degree=2), options=InversionOptions(n_sites=1500))
-    inversion = run_recipe(recipe, shot, source_mask=~is_object)
+    inversion = run_recipe(recipe, Shot(shot, source_mask=~is_object))
     assert inversion.mask.all()
     assert np.ptp(inversion.potential) == pytest.approx(np.ptp(potential), rel=0.1)
     cropped = Recipe(steps=(Crop(y=(2, 62), x=(4, 70)),))
     moved = cropped.move(Shot(shot, source_mask=~is_object)).source_mask
     np.testing.assert_array_equal(moved, ~is_object[2:62, 4:70])
     with pytest.raises(InputError, match="source mask has shape"):
-        run_recipe(recipe, shot, source_mask=is_object[1:])
+        run_recipe(recipe, Shot(shot, source_mask=is_object[1:]))
 
 
 def the_masks(tool: Any) -> Any:
