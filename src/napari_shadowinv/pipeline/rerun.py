@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv import __version__
+from napari_shadowinv._system.arrays import join_masks
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -246,16 +247,23 @@ def collect_rerun(
 
 def provenance_of(dataset: xarray.Dataset) -> Provenance | None:
     """Return the provenance of a result or of one shot of a stack, None if it has none."""
-    provenance = Provenance.of(dataset.attrs, dataset.variables)
-    if "report" not in dataset.variables or dataset["report"].ndim:
+    provenance, report = Provenance.of(dataset.attrs, dataset.variables), _report_in_stack(dataset)
+    if report is None:
         return provenance
-    report = json.loads(str(dataset["report"].values))
     if "provenance" in report:
         return Provenance.of(report, dataset.variables)
     if provenance is None or provenance.kind != "inversion":
         return None
     origin = {"file": str(dataset["name"].values), "sha256": report.get("sha256", "")}
     return provenance.with_image(**origin)
+
+
+def _report_in_stack(dataset: xarray.Dataset) -> dict[str, Any] | None:
+    """Return the report of one shot of a stack, None of another result."""
+    if "report" not in dataset.variables or dataset["report"].ndim:
+        return None
+    report: dict[str, Any] = json.loads(str(dataset["report"].values))
+    return report
 
 
 def _checked_provenance(dataset: xarray.Dataset, name: str) -> Provenance:
@@ -336,6 +344,9 @@ class _Reader:
         is_fit = provenance.kind == "fit"
         names = [f"image {k + 1}" if is_fit else "the image" for k in range(count)]
         images = list(map(self._read, origins.images, names, self.images or [None] * count))
+        report = _report_in_stack(dataset)
+        if report is None or "provenance" in report:  # else it is that of all shots
+            images = [replace(image, mask=None) for image in images]
         sources = [f"the source of {name}" if is_fit else "the source" for name in names]
         shots = [self._shot(origins, k, images[k], sources[k]) for k in range(count)]
         dark = origins.image.dark
@@ -394,11 +405,10 @@ class _Reader:
         mask, source_mask = map(provenance.mask_of, (origin.mask, origin.source_mask))
         return replace(
             image,
-            # The provenance has the other contents of the file that were used; the mask of a file
-            # in a stack is its own.
+            # The provenance has the other contents of the file that were used.
             setup=origin.setup or provenance.recipe.setup,
             source=image.source if source is None else source,
-            mask=image.mask if mask is None else mask.mask(),
+            mask=join_masks(image.mask, mask and mask.mask()),
             source_mask=None if source_mask is None else source_mask.mask(),
             measured=origin.measured,
             **{name: getattr(origin, name) for name in NUMBERS},

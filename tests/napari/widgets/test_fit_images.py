@@ -972,7 +972,7 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     single.masks.layer = None
     single.source.set_kind("layer")
     single.source.layers.layer = window.layers["a source"]
-    assert single.request().source.path is None
+    assert single.request().shot.source.path is None
     single.source.set_kind("uniform")
     inversion = run_job(single.request())
     write(tmp_path / "b.shadowinv", inversion)
@@ -989,7 +989,7 @@ def test_a_stack_of_files_knows_the_file_of_each_plane(
     tool.images.stacks.layer = window.layers[0]
     tool.setup.show_setup(SETUPS[0].model_dump())
     type_in(tool, 1, BEAM, "6")
-    assert [str(shot.image.path) for shot in tool.request().shots] == paths
+    assert [str(shot.path) for shot in tool.request().shots] == paths
 
 
 def test_a_source_of_another_file_is_not_taken_for_that_file(
