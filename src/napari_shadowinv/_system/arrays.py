@@ -130,12 +130,6 @@ def unpack_planes(values: Any, name: str) -> tuple[Any, BoolArray | None]:
     return arrays, np.array(masks) if len({mask.shape for mask in masks}) == 1 else None
 
 
-def mask_of_each(mask: BoolArray | None, data: FloatArray) -> BoolArray | None:
-    """Return a mask for each image, or none where its shape is wrong."""
-    fits = mask is not None and mask.shape in (data.shape, data.shape[1:])
-    return np.broadcast_to(mask, data.shape) if mask is not None and fits else None
-
-
 def check_plane(values: Any, name: str, least: int = 1) -> AnyArray:
     """Return real numbers in two dimensions, `least` or more each way, or raise an `InputError`."""
     array = np.asarray(values)
