@@ -263,7 +263,7 @@ class FitReport:
     def causes(self) -> list[str]:
         """The parts in a few words, the largest first."""
         titles = TITLES if self.beam is None else {**TITLES, "beam": self.beam.name}
-        titles |= {each.key: f"assumed {each.name(each.tested)}" for each, _ in self.assumed}
+        titles = titles | {each.key: f"assumed {each.name(each.tested)}" for each, _ in self.assumed}
         return [titles[key] for key, part in self.parts.items() if part > 0]
 
     @property
