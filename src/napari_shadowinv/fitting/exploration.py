@@ -140,8 +140,9 @@ def explore(
     if samples:
         tested = replace(scene, imperfect=_tested_instrument(data, best))
         response = posterior_with(tested, adapt(best, tested.imperfect, EXACT))
-        exact = None if scene.imperfect.parts else posterior
-        responses = response.responses(np.random.default_rng(options.seed), exact)
+        # Without an instrument that is fitted, residuals ask for anything.
+        is_exact = not scene.imperfect.parts
+        responses = response.responses(np.random.default_rng(options.seed), asked=is_exact)
         moves = response.scene.displacement
         of_best = moves(best.unknowns)
         sensitivities = {

@@ -305,22 +305,20 @@ class Posterior:
         return {"noise": rest, **effects}
 
     def responses(
-        self, rng: np.random.Generator, exact: Posterior | None = None
+        self, rng: np.random.Generator, *, asked: bool = False
     ) -> dict[str, tuple[Unknowns, float]]:
         """Return the response to each imperfection, of smooth fields to a random one, and its size.
 
-        `exact` has the same scene and unknowns without the instrument, whose numbers are 0 here.
+        If `asked`, sizes include the numbers that residuals ask for, of a fit without them.
 
         The response is to one standard deviation, the size the r.m.s. number that prior and images
         make likely. With the notation of `effects`, images show one by s standard deviations, where
         s² = |B|² - BᵀJH⁻¹JᵀB, and ask for g / s, with g the objective's slope along it and its
         response: so its mean is g / (1 + s²), its variance 1 / (1 + s²).
         """
-        respond = exact or self._held
-        none = respond._unknowns.zeros()
-        # Without the instrument that is fitted, residuals ask for anything.
+        held, none = self._held, self._unknowns.zeros()
         scene, counts = self.scene, self._counts
-        slope = scene.value_and_gradient(self._unknowns, counts)[1] if exact else none
+        slope = scene.value_and_gradient(self._unknowns, counts)[1] if asked else none
         pulls, squares, slopes = {}, [], []
         for part in scene.imperfect.parts:
             numbers = self._unknowns.zeros()
@@ -332,9 +330,9 @@ class Posterior:
             pulls[part.key] = pull._replace(common=none.common, separate=none.separate)
             squares.append(product(pushed.ravel(), pushed.ravel()))
             of_part = part.of(slope.common, slope.separate)
-            slopes.append(float((block * of_part).sum()) if exact else 0.0)
+            slopes.append(float((block * of_part).sum()))
         slope = slope._replace(common=none.common, separate=none.separate)
-        changes = respond._changes(list(pulls.values()), _MOVED_BY_NUMBERS)
+        changes = held._changes(list(pulls.values()), _MOVED_BY_NUMBERS)
         responses = {}
         for key, change, square, along in zip(pulls, changes, squares, slopes, strict=True):
             flat = change.flat()
