@@ -174,7 +174,7 @@ class Budget:
         text = f"their discretisation error is about {share}{' of the displacement' * (rms > 0)}"
         allowed = self.options.accuracy * rms
         if error <= allowed:
-            self.reason = f"{text}, below the accuracy of {percent(self.options.accuracy)}"
+            self.reason = f"{text}, below the accuracy of {100 * self.options.accuracy:g} %"
             return 0.0
         # An estimate for a uniform beam; the exact value is needed only where this is large.
         image_noise = self._noise()

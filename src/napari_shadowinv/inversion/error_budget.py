@@ -308,7 +308,7 @@ class Errors:
             return None
         return Caution(
             "accuracy",
-            f"the accuracy of {percent(accuracy)} is not reached: {why}, the discretisation "
+            f"the accuracy of {100 * accuracy:g} % is not reached: {why}, the discretisation "
             f"error is about {share_of(error, self.rms)} of the displacement; give a larger "
             "number of sites",
         )
