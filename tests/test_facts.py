@@ -227,7 +227,8 @@ def test_each_fitted_field_has_its_significance(image):
     (fact,) = [fact for fact in result.facts if fact.key == "significance_B"]
     structures = result.structures(result.fields[0])
     assert fact.text.startswith(f"{len(structures.peaks)} structure")
-    assert f"up to {structures.peaks[0]:.3g} σ (σ by beam; noise)" in fact.text
+    causes = "beam; noise; assumed background, 5 %; assumed gamma, 0.05"
+    assert f"up to {structures.peaks[0]:.3g} σ (σ by {causes})" in fact.text
     assert dict(table_rows(result.facts))["significance B"] == fact.text
     assert dict(window_rows(result.facts))["Significance B"] == fact.text
     field = dataclasses.replace(result.fields[0], uncertainty=None)

@@ -79,6 +79,7 @@ from typing import Any
 import numpy as np
 from napari_shadowinv.fitting import compilation, fit
 from napari_shadowinv.options import FitOptions
+from napari_shadowinv.shot import shots_of
 from napari_shadowinv.inversion import compilation as of_transport
 
 compilation.is_compiled = of_transport.is_compiled = lambda: False
