@@ -263,7 +263,8 @@ class FitReport:
     def causes(self) -> list[str]:
         """The parts in a few words, the largest first."""
         titles = TITLES if self.beam is None else {**TITLES, "beam": self.beam.name}
-        titles = titles | {each.key: f"assumed {each.name(each.tested)}" for each, _ in self.assumed}
+        assumed = {each.key: f"assumed {each.name(each.tested)}" for each, _ in self.assumed}
+        titles = {**titles, **assumed}
         return [titles[key] for key, part in self.parts.items() if part > 0]
 
     @property
@@ -577,7 +578,7 @@ class Fit(Summarised):
         for solution in alternatives:
             excess = solution.objective / best.objective - 1
             text = (
-                f"{solution.start}: objective +{percent(excess)}, displacement "
+                f"{solution.start}: objective {100 * excess:+.2g} %, displacement "
                 f"{percent(solution.distance)} away"
             )
             yield Fact("alternative", "Alternative", text)
