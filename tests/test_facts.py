@@ -229,6 +229,7 @@ def test_each_fitted_field_has_its_significance(image):
     assert fact.text.startswith(f"{len(structures.peaks)} structure")
     causes = "beam; noise; assumed background, 5 %; assumed gamma, 0.05"
     assert f"up to {structures.peaks[0]:.3g} σ (σ by {causes})" in fact.text
+    assert "assumed" not in result.report.ranking, "parts keep their names"
     assert dict(table_rows(result.facts))["significance B"] == fact.text
     assert dict(window_rows(result.facts))["Significance B"] == fact.text
     field = dataclasses.replace(result.fields[0], uncertainty=None)
