@@ -13,8 +13,8 @@ from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.imperfections import (
     IMPERFECTIONS,
     InstrumentDraws,
+    LitObject,
     RecordedShot,
-    Scene,
     SmoothField,
 )
 from napari_shadowinv.options import BeamPrior
@@ -269,7 +269,7 @@ def test_linear_samples_follow_a_mask_and_a_margin(image, source, kind):
 def test_the_order_of_the_imperfections_is_that_of_light_and_detector(image, source, blob):
     """A dark level was added after the response; a blur has spread what the object absorbs."""
     mask = np.ones(SHAPE, bool)
-    shot = RecordedShot(image, source, Scene(blob.displacement, source, mask))
+    shot = RecordedShot(image, source, LitObject(blob.displacement, source, mask))
     draws = InstrumentDraws(shot, EVERYTHING, BeamPrior(rms=0.02))
     assert [name.split(",")[0] for name in draws.names] == [
         "other field",
@@ -288,7 +288,7 @@ def test_beams_vary_in_the_shapes_of_their_references(image, source, blob):
     tilt = np.linspace(-1, 1, SHAPE[1]) * np.ones(SHAPE)
     references = [source * (1 + 0.02 * z * tilt) for z in rng.normal(size=8)]
     beam = BeamPrior.from_references(references)
-    shot = RecordedShot(image, source, Scene(blob.displacement, source, np.ones(SHAPE, bool)))
+    shot = RecordedShot(image, source, LitObject(blob.displacement, source, np.ones(SHAPE, bool)))
     draws = InstrumentDraws(shot, Instrument(), beam)
     ratios = np.array(
         [source / draws.shot(rng.normal(size=draws.count)).source - 1 for _ in range(200)]

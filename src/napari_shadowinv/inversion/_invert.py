@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from typing import NamedTuple
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -241,82 +241,183 @@ def invert(
     seconds: dict[str, float] = {}
     with measure_time("prepare", seconds):
         report("prepare", 0, 1)
-        if plan is not None:
-            if source is not None or mask is not None:
-                raise InputError(
-                    "got a plan together with a source or mask, expected only one: a plan "
-                    "contains its own source and mask"
-                )
-            if not measured and plan.measured:
-                raise InputError(
-                    "got measured=False and a plan of a measured source: make the plan by "
-                    "plan_sites(source, measured=False)"
-                )
-            _check_boundary(plan, options)
-            image = _unmasked_values(image, plan.mask)
-            source, mask, measured = plan.source, plan.mask, plan.measured
-        else:
+        if plan is None:
             image, source, mask = unpack_shot(image, source, mask)
             measured = measured and source is not None
-        mask, unlit = mask_unlit(image, source if measured else None, mask)
-        is_dark = _dark_in_source(source if measured else None, mask)
-        if unlit and plan is not None:
-            plan, start = _plan(plan.source, options, mask, plan.measured), None
-        prepared = prepare(image, source, options, mask)
-        registered = RegisteredSource(prepared.source, 0.0)
-        if measured:
-            registered = register_source(prepared.image, prepared.source, prepared.mask, instrument)
-            instrument = instrument.with_registration(registered.error)
-            source, is_moved = registered.source, registered.source is not prepared.source
-            if is_moved:
-                plan = start = None
-                prepared = prepare(image, source, options, mask)
+        else:
+            _check_plan(plan, options, has_own=source is None and mask is None, measured=measured)
+            image, source, mask = _unmasked_values(image, plan.mask), plan.source, plan.mask
+            measured = plan.measured
+        inputs = _prepare(image, source, mask, options, instrument, plan, start, measured=measured)
         report("prepare", 1, 1)
     with measure_time("sites", seconds):
-        if plan is None:
-            plan = _plan(prepared.source, options, mask, measured)
+        plan = inputs.plan or _plan(inputs.prepared.source, options, inputs.mask, measured)
         levels = plan.levels.with_reporter(report)
     with measure_time("transport", seconds):
-        if plan.margin is not None and options.flux == "fit":
-            image_flux = fit_flux_factor(
-                levels, prepared.floored_image, plan.margin, options, report
-            )
-            scale = prepared.flux_scale / image_flux
-            prepared = prepare(image, source, options, mask, flux_scale=scale)
+        prepared = _with_fitted_flux(inputs, plan, levels, options, report)
+        work = _Work.begin(plan, prepared, inputs, options)
+        levels = _levels_to_solve(plan, levels, inputs.start, options)
+    solution = _solve(work, levels, inputs.start, report, seconds)
+    quality = _make_report(
+        prepared.in_units(),
+        work.noise(),
+        solution.levels,
+        solution.fields,
+        seconds,
+        work.budget,
+        inputs.is_dark,
+    )
+    with measure_time("errors", seconds):
+        errors = solution.wait_for_errors()
+    with measure_time("prepare", seconds):
+        warnings = _warnings(work, inputs, solution, quality, errors)
+    quality = replace(
+        quality,
+        warnings=warnings,
+        sites_reason=_sites_reason(levels, work.budget, solution, inputs.start),
+        errors=errors,
+    )
+    return _inversion(plan, prepared, solution, quality, inputs.instrument, options)
 
-        # They do not depend on the transport.
-        def estimate_noise() -> ImageNoise:
-            return ImageNoise(prepared.in_units(), options, instrument.noise_correlation)
 
-        def check_image() -> tuple[Caution, ...]:
-            noise()  # before the checks, because the solver waits for it
-            recorded = prepared.image * prepared.flux_scale
-            beam = _checked_source(plan) if plan.measured else None
-            return image_warnings(recorded, beam, prepared.mask)
+class _Inputs(NamedTuple):
+    """An image and its source as they are inverted, and a plan and a start that still suit them."""
 
-        @cache
-        def begin_checks() -> Callable[[], tuple[Caution, ...]]:
-            return begin(check_image, options.threads)
+    prepared: Prepared
+    image: ArrayLike
+    source: ArrayLike | None  # in register
+    mask: BoolArray | None
+    plan: SitePlan | None
+    start: Inversion | None
+    instrument: Instrument
+    registered: RegisteredSource
+    unlit: list[Caution]
+    is_dark: BoolArray | bool
 
-        def needed(solutions: Sequence[LevelSolution]) -> float:
-            factor = budget.needed(solutions)
-            finer = sum(count > len(solutions[-1].weights) for count in levels.counts)
-            if factor <= RATIO or finer == 1:
-                begin_checks()  # while the solver waits for the sites of the last level
-            return factor
 
-        noise = begin(estimate_noise, options.threads)
-        budget = Budget(
-            plan, prepared, noise, options, instrument, is_shift_assumed=registered.is_assumed
+def _prepare(
+    image: ArrayLike,
+    source: ArrayLike | None,
+    mask: Any,
+    options: InversionOptions,
+    instrument: Instrument,
+    plan: SitePlan | None,
+    start: Inversion | None,
+    *,
+    measured: bool,
+) -> _Inputs:
+    """Mask unlit pixels, check image and source, and bring a recorded source into register."""
+    recorded = source if measured else None
+    mask, unlit = mask_unlit(image, recorded, mask)
+    is_dark = _dark_in_source(recorded, mask)
+    if unlit and plan is not None:
+        plan, start = _plan(plan.source, options, mask, plan.measured), None
+    prepared = prepare(image, source, options, mask)
+    registered = RegisteredSource(prepared.source, 0.0)
+    if measured:
+        registered = register_source(prepared.image, prepared.source, prepared.mask, instrument)
+        instrument = instrument.with_registration(registered.error)
+        source, is_moved = registered.source, registered.source is not prepared.source
+        if is_moved:
+            plan = start = None
+            prepared = prepare(image, source, options, mask)
+    return _Inputs(
+        prepared, image, source, mask, plan, start, instrument, registered, unlit, is_dark
+    )
+
+
+def _with_fitted_flux(
+    inputs: _Inputs, plan: SitePlan, levels: Levels, options: InversionOptions, report: Reporter
+) -> Prepared:
+    """Return the prepared image, with its flux as fitted at a free boundary if that is chosen."""
+    prepared = inputs.prepared
+    if plan.margin is None or options.flux != "fit":
+        return prepared
+    flux = fit_flux_factor(levels, prepared.floored_image, plan.margin, options, report)
+    scale = prepared.flux_scale / flux
+    return prepare(inputs.image, inputs.source, options, inputs.mask, flux_scale=scale)
+
+
+@dataclass(frozen=True, eq=False)
+class _Work:
+    """An inversion's plan and image, its error budget, and checks in threads beside the transport.
+
+    `noise` and `checks` wait for their results; the checks begin when `checks` is first looked up.
+    """
+
+    plan: SitePlan
+    prepared: Prepared
+    options: InversionOptions
+    noise: Callable[[], ImageNoise]
+    budget: Budget
+
+    @classmethod
+    def begin(
+        cls, plan: SitePlan, prepared: Prepared, inputs: _Inputs, options: InversionOptions
+    ) -> _Work:
+        """Begin to estimate the noise, which does not depend on the transport."""
+        correlation = inputs.instrument.noise_correlation
+        noise = begin(
+            lambda: ImageNoise(prepared.in_units(), options, correlation), options.threads
         )
-        if not options.is_adaptive and not levels.is_complete:
-            levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
-        if start is not None:
-            may_differ = options.is_adaptive and not levels.is_complete
-            levels = _levels_from_start(start, levels, plan.margin_width, may_differ=may_differ)
+        assumed = inputs.registered.is_assumed
+        budget = Budget(plan, prepared, noise, options, inputs.instrument, is_shift_assumed=assumed)
+        return cls(plan, prepared, options, noise, budget)
+
+    @cached_property
+    def checks(self) -> Callable[[], tuple[Caution, ...]]:
+        """Wait for the cautions about image and source."""
+        return begin(self._check_image, self.options.threads)
+
+    def _check_image(self) -> tuple[Caution, ...]:
+        self.noise()  # before the checks, because the solver waits for it
+        recorded = self.prepared.image * self.prepared.flux_scale
+        beam = _checked_source(self.plan) if self.plan.measured else None
+        return image_warnings(recorded, beam, self.prepared.mask)
+
+    def needed(self, levels: Levels, solutions: Sequence[LevelSolution]) -> float:
+        """Return the factor by which more sites are needed; see `Budget.needed`."""
+        factor = self.budget.needed(solutions)
+        finer = sum(count > len(solutions[-1].weights) for count in levels.counts)
+        if factor <= RATIO or finer == 1:
+            _ = self.checks  # begin, while the solver waits for the sites of the last level
+        return factor
+
+
+def _levels_to_solve(
+    plan: SitePlan, levels: Levels, start: Inversion | None, options: InversionOptions
+) -> Levels:
+    if not options.is_adaptive and not levels.is_complete:
+        levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
+    if start is None:
+        return levels
+    may_differ = options.is_adaptive and not levels.is_complete
+    return _levels_from_start(start, levels, plan.margin_width, may_differ=may_differ)
+
+
+class _Solution(NamedTuple):
+    """Solutions of all levels, the fields of the last, and what is still computed about them."""
+
+    levels: list[LevelSolution]
+    fields: _Fields
+    wait_for_errors: Callable[[], Errors | None]
+    adaptive: bool  # whether the number of sites follows from the errors
+    finest: bool  # whether it is the largest
+    coarse: int  # sites with which structures of the image were missed; 0 if there were none
+
+
+def _solve(
+    work: _Work,
+    levels: Levels,
+    start: Inversion | None,
+    report: Reporter,
+    seconds: dict[str, float],
+) -> _Solution:
+    """Solve levels until errors and re-projection need no more sites, and read the fields out."""
+    plan, prepared, options, budget = work.plan, work.prepared, work.options, work.budget
     adaptive = options.is_adaptive and not levels.is_complete and start is None
     if not adaptive:
-        begin_checks()
+        _ = work.checks  # begin
     solutions: list[LevelSolution] = []
     coarse = 0
     while True:
@@ -328,7 +429,7 @@ def invert(
                 report,
                 start=None if start is None else start.weights,
                 margin=plan.margin,
-                needed=needed if adaptive else None,
+                needed=partial(work.needed, levels) if adaptive else None,
                 solved=solutions,
                 target=budget.target,
             )
@@ -337,35 +438,45 @@ def invert(
             with measure_time("errors", seconds):
                 budget.free_target(solutions)
         fields, wait_for_errors = _read_fields(plan, prepared, solutions, budget, report, seconds)
+        finest = adaptive and len(answer.weights) == levels.counts[-1]
+        more = adaptive and answer.converged and not finest
         units = prepared.in_units()
-        more = adaptive and answer.converged and len(answer.weights) < levels.counts[-1]
-        if not more or not is_coarse(units, fields.reprojection, noise(), options.threads):
-            break
+        if not more or not is_coarse(units, fields.reprojection, work.noise(), options.threads):
+            return _Solution(solutions, fields, wait_for_errors, adaptive, finest, coarse)
         wait_for_errors()  # they use the budget that the next solution changes
         coarse = len(answer.weights)
-    quality = _make_report(units, noise(), solutions, fields, seconds, budget, is_dark)
-    with measure_time("errors", seconds):
-        errors = wait_for_errors()
-    finest = adaptive and len(answer.weights) == levels.counts[-1]
+
+
+def _warnings(
+    work: _Work, inputs: _Inputs, solution: _Solution, quality: Report, errors: Errors | None
+) -> tuple[Caution, ...]:
+    """Return all reasons to doubt an inversion, the gravest first."""
+    options = work.options
     by_errors: list[Caution | None] = []
+    by_accuracy: list[Caution | None] = []
     if errors is not None:
         by_errors = [errors.beam_caution(), errors.edge_caution(options.max_error)]
-    by_accuracy: list[Caution | None] = []
-    is_asked = "accuracy" in options.model_fields_set
-    if errors is not None and errors.condition(options.max_error) is None:
-        is_asked |= errors.share > options.max_error
-    if finest and is_asked and errors is not None and quality.warnings == prepared.warnings:
-        why = "with the most sites placed unless more are given"
-        by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
-    with measure_time("prepare", seconds):
-        warnings = (
-            *by_errors,
-            registered.caution,
-            *unlit,
-            *quality.warnings,
-            *by_accuracy,
-            *begin_checks()(),
-        )
+        is_chosen = "accuracy" in options.model_fields_set
+        if errors.condition(options.max_error) is None:
+            is_chosen |= errors.share > options.max_error
+        if solution.finest and is_chosen and quality.warnings == work.prepared.warnings:
+            why = "with the most sites placed unless more are given"
+            by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
+    registered = inputs.registered.caution
+    of_image = (*inputs.unlit, *quality.warnings, *by_accuracy, *work.checks())
+    return tuple(filter(None, (*by_errors, registered, *of_image)))
+
+
+def _inversion(
+    plan: SitePlan,
+    prepared: Prepared,
+    solution: _Solution,
+    report: Report,
+    instrument: Instrument,
+    options: InversionOptions,
+) -> Inversion:
+    """Return the fields of a solution in units of the image, with its report."""
+    answer, fields = solution.levels[-1], solution.fields
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,
@@ -383,12 +494,7 @@ def invert(
             fields.jacobian, prepared.mask, len(answer.weights), options.caustic_jacobian
         ),
         mask=prepared.mask,
-        report=replace(
-            quality,
-            warnings=tuple(filter(None, warnings)),
-            sites_reason=_sites_reason(levels, budget, adaptive, start, coarse),
-            errors=errors,
-        ),
+        report=report,
         options=options,
         instrument=instrument,
     )
@@ -412,15 +518,15 @@ def _checked_source(plan: SitePlan) -> CheckedImage:
 
 
 def _sites_reason(
-    levels: Levels, budget: Budget, adaptive: bool, start: Inversion | None, coarse: int
+    levels: Levels, budget: Budget, solution: _Solution, start: Inversion | None
 ) -> str:
     """Return the reason for the number of sites."""
     if start is not None:
         return "as many as in the inversion that it started from"
-    if not adaptive:
+    if not solution.adaptive:
         return "as requested"
-    if coarse:
-        return f"with {coarse:,} the re-projection missed structures of the image"
+    if solution.coarse:
+        return f"with {solution.coarse:,} the re-projection missed structures of the image"
     if budget.reason:
         return budget.reason
     if levels.counts[-1] < MAX_DEFAULT_SITES:
@@ -442,6 +548,22 @@ def _unmasked_values(image: ArrayLike, usable: BoolArray | None) -> ArrayLike:
                 "with the image's mask (mask=~image.mask)"
             )
     return values
+
+
+def _check_plan(
+    plan: SitePlan, options: InversionOptions, *, has_own: bool, measured: bool
+) -> None:
+    if not has_own:
+        raise InputError(
+            "got a plan together with a source or mask, expected only one: a plan "
+            "contains its own source and mask"
+        )
+    if not measured and plan.measured:
+        raise InputError(
+            "got measured=False and a plan of a measured source: make the plan by "
+            "plan_sites(source, measured=False)"
+        )
+    _check_boundary(plan, options)
 
 
 def _check_boundary(plan: SitePlan, options: InversionOptions) -> None:

@@ -180,7 +180,7 @@ _DARK = 0.2  # of the mean brightness
 
 @dataclass(frozen=True)
 class CorrelationLimits:
-    """How correlated noise is told from structure, as benchmarks/trust.py (noise) needs it."""
+    """How correlated noise is separated from structure, as benchmarks/trust.py (noise) needs it."""
 
     lags: tuple[int, ...] = (1, 2, 3, 4, 6, 8)  # px
     flat: tuple[int, int] = (1, 4)  # lags at which white noise has V(1)
