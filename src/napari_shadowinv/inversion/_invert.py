@@ -255,26 +255,26 @@ def invert(
         levels = plan.levels.with_reporter(report)
     with measure_time("transport", seconds):
         prepared = _with_fitted_flux(inputs, plan, levels, options, report)
-        work = _Work.begin(plan, prepared, inputs, options)
+        problem = _Problem.begin(plan, prepared, inputs, options)
         levels = _levels_to_solve(plan, levels, inputs.start, options)
-    solution = _solve(work, levels, inputs.start, report, seconds)
+    solution = _solve(problem, levels, inputs.start, report, seconds)
     quality = _make_report(
         prepared.in_units(),
-        work.noise(),
+        problem.noise(),
         solution.levels,
         solution.fields,
         seconds,
-        work.budget,
+        problem.budget,
         inputs.is_dark,
     )
     with measure_time("errors", seconds):
         errors = solution.wait_for_errors()
     with measure_time("prepare", seconds):
-        warnings = _warnings(work, inputs, solution, quality, errors)
+        warnings = _warnings(problem, inputs, solution, quality, errors)
     quality = replace(
         quality,
         warnings=warnings,
-        sites_reason=_sites_reason(levels, work.budget, solution, inputs.start),
+        sites_reason=_sites_reason(levels, problem.budget, solution, inputs.start),
         errors=errors,
     )
     return _inversion(plan, prepared, solution, quality, inputs.instrument, options)
@@ -339,7 +339,7 @@ def _with_fitted_flux(
 
 
 @dataclass(frozen=True, eq=False)
-class _Work:
+class _Problem:
     """An inversion's plan and image, its error budget, and checks in threads beside the transport.
 
     `noise` and `checks` wait for their results; the checks begin when `checks` is first looked up.
@@ -354,7 +354,7 @@ class _Work:
     @classmethod
     def begin(
         cls, plan: SitePlan, prepared: Prepared, inputs: _Inputs, options: InversionOptions
-    ) -> _Work:
+    ) -> _Problem:
         """Begin to estimate the noise, which does not depend on the transport."""
         correlation = inputs.instrument.noise_correlation
         noise = begin(
@@ -407,17 +407,22 @@ class _Solution(NamedTuple):
 
 
 def _solve(
-    work: _Work,
+    problem: _Problem,
     levels: Levels,
     start: Inversion | None,
     report: Reporter,
     seconds: dict[str, float],
 ) -> _Solution:
     """Solve levels until errors and re-projection need no more sites, and read the fields out."""
-    plan, prepared, options, budget = work.plan, work.prepared, work.options, work.budget
+    plan, prepared, options, budget = (
+        problem.plan,
+        problem.prepared,
+        problem.options,
+        problem.budget,
+    )
     adaptive = options.is_adaptive and not levels.is_complete and start is None
     if not adaptive:
-        _ = work.checks  # begin
+        _ = problem.checks  # begin
     solutions: list[LevelSolution] = []
     coarse = 0
     while True:
@@ -429,7 +434,7 @@ def _solve(
                 report,
                 start=None if start is None else start.weights,
                 margin=plan.margin,
-                needed=partial(work.needed, levels) if adaptive else None,
+                needed=partial(problem.needed, levels) if adaptive else None,
                 solved=solutions,
                 target=budget.target,
             )
@@ -441,17 +446,17 @@ def _solve(
         finest = adaptive and len(answer.weights) == levels.counts[-1]
         more = adaptive and answer.converged and not finest
         units = prepared.in_units()
-        if not more or not is_coarse(units, fields.reprojection, work.noise(), options.threads):
+        if not more or not is_coarse(units, fields.reprojection, problem.noise(), options.threads):
             return _Solution(solutions, fields, wait_for_errors, adaptive, finest, coarse)
         wait_for_errors()  # they use the budget that the next solution changes
         coarse = len(answer.weights)
 
 
 def _warnings(
-    work: _Work, inputs: _Inputs, solution: _Solution, quality: Report, errors: Errors | None
+    problem: _Problem, inputs: _Inputs, solution: _Solution, quality: Report, errors: Errors | None
 ) -> tuple[Caution, ...]:
     """Return all reasons to doubt an inversion, the gravest first."""
-    options = work.options
+    options = problem.options
     by_errors: list[Caution | None] = []
     by_accuracy: list[Caution | None] = []
     if errors is not None:
@@ -459,11 +464,11 @@ def _warnings(
         is_chosen = "accuracy" in options.model_fields_set
         if errors.condition(options.max_error) is None:
             is_chosen |= errors.share > options.max_error
-        if solution.finest and is_chosen and quality.warnings == work.prepared.warnings:
+        if solution.finest and is_chosen and quality.warnings == problem.prepared.warnings:
             why = "with the most sites placed unless more are given"
             by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
     registered = inputs.registered.caution
-    of_image = (*inputs.unlit, *quality.warnings, *by_accuracy, *work.checks())
+    of_image = (*inputs.unlit, *quality.warnings, *by_accuracy, *problem.checks())
     return tuple(filter(None, (*by_errors, registered, *of_image)))
 
 
