@@ -367,13 +367,10 @@ class _Problem:
     @cached_property
     def checks(self) -> Callable[[], tuple[Caution, ...]]:
         """Wait for the cautions about image and source."""
-        return begin(self._check_image, self.options.threads)
-
-    def _check_image(self) -> tuple[Caution, ...]:
-        self.noise()  # before the checks, because the solver waits for it
-        recorded = self.prepared.image * self.prepared.flux_scale
-        beam = _checked_source(self.plan) if self.plan.measured else None
-        return image_warnings(recorded, beam, self.prepared.mask)
+        # Not of a method: a problem that refers to itself would keep its memory.
+        return begin(
+            partial(_check_image, self.plan, self.prepared, self.noise), self.options.threads
+        )
 
     def needed(self, levels: Levels, solutions: Sequence[LevelSolution]) -> float:
         """Return the factor by which more sites are needed; see `Budget.needed`."""
@@ -382,6 +379,16 @@ class _Problem:
         if factor <= RATIO or finer == 1:
             _ = self.checks  # begin, while the solver waits for the sites of the last level
         return factor
+
+
+def _check_image(
+    plan: SitePlan, prepared: Prepared, noise: Callable[[], ImageNoise]
+) -> tuple[Caution, ...]:
+    """Return the cautions about image and source."""
+    noise()  # before the checks, because the solver waits for it
+    recorded = prepared.image * prepared.flux_scale
+    beam = _checked_source(plan) if plan.measured else None
+    return image_warnings(recorded, beam, prepared.mask)
 
 
 def _levels_to_solve(
