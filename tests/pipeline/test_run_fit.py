@@ -225,3 +225,24 @@ def test_a_source_declared_as_an_estimate_is_one_after_a_repeat(
     assert are_fitted == {True: False, False: True}
     write(tmp_path / "fit.shadowinv", result)
     assert rerun(tmp_path / "fit.shadowinv").is_identical
+
+
+def test_free_brightness_of_shots_is_repeated(images: list[FloatArray], tmp_path: Path) -> None:
+    files = [tmp_path / f"{k}.npy" for k in range(2)]
+    shots = []
+    for file, image, setup in zip(files, images, SETUPS, strict=True):
+        np.save(file, image)
+        shots.append(Shot(file, setup, brightness="free", noise=0.02))
+    write(tmp_path / "fit.shadowinv", run_fit(Recipe(fit=FitChoices(options=HASTY)), shots))
+    assert rerun(tmp_path / "fit.shadowinv").is_identical
+    with pytest.raises(InputError, match=r"image 2 has no free brightness|1\.npy has no free"):
+        collect_fit_inputs(Recipe(), [shots[0], replace(shots[1], brightness=1.0)])
+
+
+@pytest.mark.parametrize("attribute", ["noise", "psf"])
+def test_an_array_that_no_result_can_repeat_is_refused(
+    images: list[FloatArray], attribute: str
+) -> None:
+    shot = Shot(images[0], **{attribute: np.ones(SHAPE)})
+    with pytest.raises(InputError, match=f"image 1 has an array as its {attribute}"):
+        collect_fit_inputs(Recipe(), [shot])

@@ -228,9 +228,12 @@ def collect_fit_inputs(
     recorded = [shot if isinstance(shot, Shot) else Shot(shot) for shot in shots]
     if not recorded:
         raise InputError("received no image: expected one or several of one object")
-    choices = recipe.fit or FitChoices()
     check_fit(recipe)
     names = [_shot_name(shot, k) for k, shot in enumerate(recorded)]
+    choices = _with_free_brightness(recipe.fit or FitChoices(), recorded, names)
+    recorded = [
+        replace(shot, brightness=None) if shot.brightness == "free" else shot for shot in recorded
+    ]
     by_default = choices.beam == "unknown"
     flags = [shot.beam_unknown or (by_default and shot.source is None) or None for shot in recorded]
     unknown = common_values(names, flags, "unknown source") is not None
@@ -268,6 +271,23 @@ def collect_fit_inputs(
     ]
     complete[0] = replace(complete[0], fiducials=table)
     return FitInputs(tuple(complete), provenance)
+
+
+def _with_free_brightness(
+    choices: FitChoices, shots: Sequence[Shot], names: Sequence[str]
+) -> FitChoices:
+    """Return choices with the brightness of shots, which a result can repeat; refuse arrays."""
+    for shot, name in zip(shots, names, strict=True):
+        for key in ("noise", "psf"):
+            if np.ndim(getattr(shot, key)):
+                raise InputError(
+                    f"{name} has an array as its {key}, which a result cannot repeat: give a "
+                    "number, or pass the shots to fit"
+                )
+    free = common_values(
+        names, [shot.brightness == "free" or None for shot in shots], "free brightness"
+    )
+    return choices if free is None else choices.model_copy(update={"brightness": "free"})
 
 
 def _with_choices(

@@ -223,8 +223,8 @@ def run(
     recipe : Recipe
         Steps and options.
     shot : Shot, array_like of shape (H, W), or path
-        The image, with its attributes. The recipe's setup and measured source
-        precede those of the image's file; a pixel is used where all masks are true.
+        The image, with its attributes. The recipe's setup precedes the shot's, its measured source
+        that in the image's file; a pixel is used where the masks of both are true.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.invert`.
     cache : Cache, optional
