@@ -100,7 +100,7 @@ class Shot(Summarised):
     source_mask: Any = None
     dark: FloatArray | None = None
     strength: Any = None
-    brightness: float | str | None = None
+    brightness: Any = None
     psf: Any = None
     noise: Noise | Any = None
     fiducials: Any = None
@@ -120,6 +120,13 @@ class Shot(Summarised):
                     f"strength is {self.strength}: expected a finite number, or one for each field"
                 )
             object.__setattr__(self, "strength", tuple(strengths.tolist()))
+        factor = self.brightness
+        if factor is not None and not (isinstance(factor, str) and factor == "free"):
+            number = np.nan if isinstance(factor, str) else as_numbers("brightness", factor)
+            if np.ndim(number) or not 0 < number < np.inf:
+                raise InputError(
+                    f"brightness is {factor!r}: expected a positive number, or 'free' to fit it"
+                )
 
     def _summary(self) -> list[str]:
         parts = [str(self.path)] if self.path is not None else []
@@ -127,13 +134,13 @@ class Shot(Summarised):
         parts += [f"with {name}" for name in ("source", "mask") if getattr(self, name) is not None]
         return [", ".join(parts) or "no setup", *(caution.text for caution in self.warnings)]
 
-    def _picture(self) -> FloatArray:
-        return np.asarray(self.image)
+    def _picture(self) -> FloatArray | None:
+        return None if isinstance(self.image, (str, Path)) else np.asarray(self.image)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (H, W) of the image."""
-        height, width = self.image.shape
+        height, width = np.shape(self.image)
         return height, width
 
     @property

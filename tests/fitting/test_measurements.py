@@ -78,7 +78,11 @@ def nearly_all_masked() -> FloatArray:
             "strength is nan: expected a finite number",
         ),
         ({"strength": [0, 1]}, r"strengths of the first image are \[0.0\]: all fields must act"),
-        ({"strength": [[1, 1], [0.5, 0.5]]}, "2 fields cannot be distinguished by images"),
+        ({"strength": [(1, 1), (0.5, 0.5)]}, "2 strengths each, and 1 fields are fitted: give one"),
+        (
+            {"strength": [(1, 1), (0.5, 0.5)], "fields": ("B", "E")},
+            "2 fields cannot be distinguished by images",
+        ),
         ({"strength": None}, "2 images and neither strengths nor setups: give"),
         (
             {"strength": None, "setup": [protons(3), protons(15, pixel_size=3e-6)]},
@@ -114,14 +118,14 @@ def nearly_all_masked() -> FloatArray:
         ({"noise": [0.1, [1, [2]]]}, "noise is .*: expected numbers"),
         ({"fiducials": [[1, 2, 3], [4]]}, "fiducials is .*: expected numbers"),
         ({"mask": np.ones(SIZE)}, "image 1: mask has values of type float64, expected booleans"),
-        ({"brightness": [1, "x"]}, "brightness is 1, 'x': expected a number for each image"),
+        ({"brightness": [1, "free"]}, "brightness is 1, 'free': expected a number for each image"),
         (
             {"brightness": "some"},
-            "brightness is 'some', 'some': expected a number for each image, or 'free' for all",
+            "brightness is 'some': expected a positive number, or 'free' to fit it",
         ),
         (
             {"brightness": [1, -2]},
-            r"brightness is \(1, -2\): expected a positive number for each of 2",
+            "brightness is -2: expected a positive number",
         ),
         ({"fiducials": np.ones((2, 4))}, r"fiducials have shape \(2, 4\): expected rows of y, x"),
         ({"fiducials": [[45, 5, 0, 0, 1]]}, "fiducials lie outside the image or have no positive"),
@@ -227,7 +231,7 @@ def test_sides_are_filled_to_lengths_with_fast_transforms(side: int, filled: int
 
 
 def test_strengths_are_relative_to_the_first_image() -> None:
-    data = given(strength=[[2, 4], [1, 3]])
+    data = given(strength=[[2, 4], [1, 3]], fields=("B", "E"))
     np.testing.assert_allclose(data.scene.strengths, [[1, 1], [0.5, 0.75]])
 
 

@@ -363,3 +363,14 @@ def test_provenance_says_all_that_is_needed(image: FloatArray) -> None:
     assert provenance.setup.object_pixel_size == 2 * paper_setup().object_pixel_size
     assert provenance.image.notes == ("binned 2 × 2",)
     assert_same(run(provenance.recipe, image), run(recipe, image))
+
+
+def test_a_source_that_was_not_recorded_has_the_error_of_an_estimate(image: FloatArray) -> None:
+    beams = [
+        run(Recipe(options=OPTIONS), Shot(image, source=0 * image + 1, measured=measured)).errors
+        for measured in (False, True)
+    ]
+    assert beams[0] is not None
+    assert beams[1] is not None
+    assert beams[0].beam_basis == "assumed"
+    assert beams[1].beam_basis != "assumed"

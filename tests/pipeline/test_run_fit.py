@@ -246,3 +246,19 @@ def test_an_array_that_no_result_can_repeat_is_refused(
     shot = Shot(images[0], **{attribute: np.ones(SHAPE)})
     with pytest.raises(InputError, match=f"image 1 has an array as its {attribute}"):
         collect_fit_inputs(Recipe(), [shot])
+
+
+def test_an_unknown_beam_is_not_an_assumed_one(images: list[FloatArray]) -> None:
+    """By the recipe also where a file brings its own source."""
+    for recipe, source in (
+        (Recipe(), "unknown"),
+        (Recipe(fit=FitChoices(beam="unknown")), np.ones(SHAPE)),
+    ):
+        shots = [
+            Shot(image, setup, source=source, source_in_file=source)
+            for image, setup in zip(images, SETUPS, strict=True)
+        ]
+        inputs = collect_fit_inputs(recipe, shots)
+        assert all(shot.beam_unknown and shot.measured for shot in inputs.shots)
+    with pytest.raises(InputError, match="a source and a fit with an unknown beam"):
+        collect_fit_inputs(Recipe(source=LowPassEstimate()), [Shot(images[0], source="unknown")])

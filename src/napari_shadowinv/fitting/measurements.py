@@ -1,6 +1,5 @@
 """The inputs of a fit, checked and in common units: `collect_data`.
 
-- standard deviation of an image's noise: `estimated_noise`
 - displacement by each field in each image, from the setups: `strengths_of`
 """
 
@@ -146,7 +145,7 @@ def collect_data(
     is_uniform = recorded is None and not unknown
     is_assumed = is_uniform or not all(shot.measured for shot in shots)
     _refuse_ambiguous(shots, options)
-    matrix, setups = _displacements(shots, names, fields)
+    matrix, setups = displacements_of(shots, names, fields)
     recorded, factors, free_brightness = _bright_sources(shots, data, recorded, used)
     _refuse_what_is_given_twice(data, recorded, used, matrix, names)
     noise = _common_noise(values_of(shots, "noise"))
@@ -214,14 +213,21 @@ def collect_data(
     )
 
 
-def _displacements(
+def displacements_of(
     shots: Sequence[Shot], names: Sequence[str], fields: Sequence[str]
 ) -> tuple[FloatArray, tuple[Setup, ...] | None]:
     """Return strengths relative to the first image, and the setups from which they follow."""
     setups, strengths = values_of(shots, "setup"), values_of(shots, "strength")
     if strengths is None:
         return _relative_strengths(strengths_of(setups, fields, len(shots), names)), setups
-    return _relative_strengths(_checked_strengths(strengths)), None
+    matrix = _checked_strengths(strengths)
+    check_fields(fields)
+    if matrix.shape[1] != len(fields):
+        raise InputError(
+            f"images have {matrix.shape[1]} strengths each, and {len(fields)} fields are fitted: "
+            "give one strength for each field"
+        )
+    return _relative_strengths(matrix), None
 
 
 def _other_strengths(
@@ -341,6 +347,13 @@ def _relative_noise(
     return beams, deviations, match, np.median(remaining, axis=(1, 2))
 
 
+def check_fields(fields: Sequence[str]) -> None:
+    """Raise an `InputError` if fields are unknown or there are none, or one twice."""
+    titles = deflector_titles()
+    if not fields or len(set(fields)) < len(fields) or not titles.keys() >= set(fields):
+        raise InputError(f"fields are {list(fields)}: expected some of {', '.join(titles)}")
+
+
 def strengths_of(
     setups: Sequence[Setup] | None,
     fields: Sequence[str],
@@ -365,10 +378,8 @@ def strengths_of(
     InputError
         If a field is unknown or does not bend the beam, or setups do not fit the images.
     """
+    check_fields(fields)
     titles = deflector_titles()
-    unknown = [field for field in fields if field not in titles]
-    if unknown or not fields or len(set(fields)) < len(fields):
-        raise InputError(f"fields are {list(fields)}: expected some of {', '.join(titles)}")
     if setups is None:
         if count > 1:
             raise InputError(
@@ -623,19 +634,14 @@ def _are_alike(first: FloatArray, second: FloatArray) -> bool:
 def _checked_brightness(brightness: Sequence[Any] | None, count: int) -> tuple[bool, FloatArray]:
     if brightness is None:
         return False, np.ones(count)
-    if all(isinstance(each, str) and each == "free" for each in brightness):
+    if all(isinstance(each, str) for each in brightness):
         return True, np.ones(count)
     if any(isinstance(each, str) for each in brightness):
         raise InputError(
             f"brightness is {', '.join(map(repr, brightness))}: expected a number for each image, "
             "or 'free' for all"
         )
-    factors = as_numbers("brightness", brightness)
-    if factors.shape != (count,) or not (np.isfinite(factors) & (factors > 0)).all():
-        raise InputError(
-            f"brightness is {brightness}: expected a positive number for each of {count} images"
-        )
-    return False, factors
+    return False, np.array(brightness, dtype=np.float64)
 
 
 def _means(planes: FloatArray, used: BoolArray) -> FloatArray:

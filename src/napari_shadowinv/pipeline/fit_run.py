@@ -39,6 +39,7 @@ from napari_shadowinv.provenance import Origin, Provenance, index_masks
 from napari_shadowinv.shot import Shot
 
 # Numbers of an image, in rows of a table, shots and provenances.
+_SOURCE_AND_UNKNOWN = "the recipe has a source and a fit with an unknown beam: expected one of them"
 NUMBERS = ("strength", "brightness", "psf", "noise")
 
 
@@ -235,8 +236,13 @@ def collect_fit_inputs(
         replace(shot, brightness=None) if shot.brightness == "free" else shot for shot in recorded
     ]
     by_default = choices.beam == "unknown"
-    flags = [shot.beam_unknown or (by_default and shot.source is None) or None for shot in recorded]
+    flags = [
+        shot.beam_unknown or (by_default and (shot.source is None or shot.has_own_source)) or None
+        for shot in recorded
+    ]
     unknown = common_values(names, flags, "unknown source") is not None
+    if unknown and recipe.source is not None:
+        raise InputError(_SOURCE_AND_UNKNOWN)
     collected = [
         _collect_image(recipe, shot, name, unknown=unknown)
         for shot, name in zip(recorded, names, strict=True)
@@ -269,6 +275,8 @@ def collect_fit_inputs(
     complete = [
         _with_choices(shot, recorded[k], choices, names[k], unknown) for k, shot in enumerate(ready)
     ]
+    if source is not None:  # an estimate
+        complete = [replace(shot, measured=False) for shot in complete]
     complete[0] = replace(complete[0], fiducials=table)
     return FitInputs(tuple(complete), provenance)
 
@@ -323,9 +331,7 @@ def check_fit(recipe: Recipe) -> None:
                 f"is fitted to: leave it out; expected some of {', '.join(FIT_STEPS)}"
             )
     if recipe.fit is not None and recipe.fit.beam == "unknown" and recipe.source is not None:
-        raise InputError(
-            "the recipe has a source and a fit with an unknown beam: expected one of them"
-        )
+        raise InputError(_SOURCE_AND_UNKNOWN)
 
 
 def _shot_name(shot: Shot, k: int) -> str:
@@ -366,9 +372,7 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
             recorded = inputs.shot.shape
             positioned = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))
             source = estimate_source(positioned, shot, should_stop, doubts.append)
-        measured = shot.measured and estimate is None
-        warnings = (*shot.warnings, *doubts)
-        return replace(shot, source=source, measured=measured, warnings=warnings)
+        return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
 
@@ -395,7 +399,8 @@ def usual_fields(setups: Sequence[Setup] | None) -> tuple[str, ...]:
 def _read_fiducials(fiducials: ArrayLike | Path | None) -> tuple[FloatArray | None, Origin | None]:
     if fiducials is None:
         return None, None
-    if isinstance(fiducials, Path):
+    if isinstance(fiducials, (str, Path)):
+        fiducials = Path(fiducials)
         origin = Origin(file=text_of(fiducials.name), sha256=sha256(fiducials))
         return np.array(fiducials_from(fiducials)), origin
     return np.array(fiducials, dtype=np.float64), Origin()

@@ -314,6 +314,7 @@ def run_prepared(
         prepare(shot.image, None, options, shot.mask)
     source = _source(inputs, shot, report, cache, doubts, preview=preview)
     instrument, estimate = inputs.recipe.instrument, inputs.recipe.estimate
+    measured = estimate is None and shot.measured
     if estimate is not None:
         instrument = with_prior_of(estimate, shot, instrument, should_stop)
     flattens = any(step.flattens for step in inputs.recipe.steps)
@@ -324,14 +325,13 @@ def run_prepared(
         source_of = partial(_remaining_source, inputs, should_stop=should_stop)
         with suppress(InputError):  # an estimate may refuse a changed image
             instrument = after_steps(
-                instrument, inputs.recipe, inputs.shot, source_of, measured=estimate is None
+                instrument, inputs.recipe, inputs.shot, source_of, measured=measured
             )
     report("prepare", 0, None)
     prepare(shot.image, source, options, shot.mask)
     seconds["source"] = time.perf_counter() - clock
     ensure_compiled(on_progress, should_stop)
     clock = time.perf_counter()
-    measured = estimate is None
     plan = cache.plan(source, shot.mask, options, on_progress, should_stop, measured=measured)
     seconds["sites"] = time.perf_counter() - clock
     inversion = invert(
@@ -408,7 +408,9 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     if setup is not None:
         check_spacing(entered.image, "the image", setup.pixel_sizes)
         check_spacing(entered.source, "the source", setup.pixel_sizes)
-    usable = _mask((loaded.mask, recipe.mask), "mask", loaded.shape)
+    # A mask's file precedes the recipe's; of arrays, both hold.
+    is_file = isinstance(loaded.mask, (str, Path))
+    usable = _mask([loaded.mask, None if is_file else recipe.mask], "mask", loaded.shape)
     is_array = not isinstance(entered.source, Shot | str | Path)
     lit = beam.mask if is_array and beam is not None else None  # of a masked array
     usable = _without_gaps(usable, lit, loaded, beam)
@@ -431,6 +433,7 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
         source=None if beam is None else _origin(beam),
         dark=None if dark is None else _origin(dark),
         brightness=factor,
+        measured=loaded.measured,
     )
     masks = index_masks([origin], [(usable, bare)])
     provenance = Provenance(kind="inversion", recipe=resolved, **masks)

@@ -11,11 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
-from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting import LeaveOneOut, leave_one_out
 from napari_shadowinv.fitting.left_out import check_count
-from napari_shadowinv.fitting.measurements import strengths_of
-from napari_shadowinv.fitting.shots import names_of, values_of
+from napari_shadowinv.fitting.measurements import displacements_of
+from napari_shadowinv.fitting.shots import names_of
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
 from napari_shadowinv.pipeline.inversion_run import AnyShot
@@ -79,15 +78,8 @@ def run_leave_one_out(
 
 def _order_by_energy(inputs: FitInputs) -> list[int]:
     """Sort the images by energy, the most displaced first."""
-    sizes = np.abs(_strengths(inputs)[:, 0])
-    images = [shot.image.tobytes() for shot in inputs.shots]
+    shots = inputs.shots
+    strengths, _ = displacements_of(shots, names_of(shots), inputs.fields)
+    sizes = np.abs(strengths[:, 0])
+    images = [shot.image.tobytes() for shot in shots]
     return sorted(range(len(images)), key=lambda k: (-sizes[k], images[k]))
-
-
-def _strengths(inputs: FitInputs) -> FloatArray:
-    """Displacement of each image by each field, relative to the first image."""
-    strengths = values_of(inputs.shots, "strength")
-    if strengths is None:
-        return strengths_of(inputs.setups, inputs.fields, len(inputs.shots))
-    matrix = np.array(strengths, dtype=np.float64)
-    return np.asarray(matrix / matrix[0])

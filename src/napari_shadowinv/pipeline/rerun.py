@@ -232,7 +232,8 @@ def collect_rerun(
         dataset = result.to_dataset()
     provenance = _checked_provenance(dataset, name)
     listed: Any = () if images is None else images
-    shots = (listed,) if isinstance(listed, (str, Path, Shot)) else tuple(listed)
+    is_one = isinstance(listed, (str, Path, Shot)) or getattr(listed, "ndim", 0) == 2
+    shots = (listed,) if is_one else tuple(listed)
     reader = _Reader(name, folder or Path(), shots, source, other_folders)
     if provenance.version != __version__:
         reader.changes.append(f"made by version {provenance.version}, now {__version__}")
