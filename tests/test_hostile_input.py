@@ -126,7 +126,10 @@ def test_model_inside_another_is_named_with_its_place() -> None:
             r"run is \[1\], expected RunOptions",
         ),
         (lambda: fit(np.ones((32, 32)), options="x"), "options is 'x', expected FitOptions"),
-        (lambda: fit(shots_of(np.ones((32, 32)), setup=[{}])), "setup is {}, expected BeamSetup"),
+        (
+            lambda: fit(shots_of(np.ones((32, 32)), setup=[{}])),
+            "setup is {}: expected a ProtonSetup or an OpticalSetup",
+        ),
     ],
 )
 def test_wrong_kind_of_argument_is_named(call: Callable[[], Any], message: str) -> None:

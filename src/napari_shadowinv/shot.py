@@ -113,6 +113,10 @@ class Shot(Summarised):
     source_in_file: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        if self.setup is not None and not hasattr(self.setup, "pixel_sizes"):
+            raise InputError(
+                f"setup is {self.setup!r:.60}: expected a ProtonSetup or an OpticalSetup"
+            )
         if self.strength is not None:
             strengths = as_numbers("strength", self.strength).ravel()
             if not strengths.size or not np.isfinite(strengths).all():
@@ -135,11 +139,15 @@ class Shot(Summarised):
         return [", ".join(parts) or "no setup", *(caution.text for caution in self.warnings)]
 
     def _picture(self) -> FloatArray | None:
-        return None if isinstance(self.image, (str, Path)) else np.asarray(self.image)
+        return np.asarray(self.image) if np.ndim(self.image) == 2 else None
 
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (H, W) of the image."""
+        if np.ndim(self.image) != 2:
+            raise InputError(
+                f"the shot's image is {self.image!r:.60}: read it first, or give a plane"
+            )
         height, width = np.shape(self.image)
         return height, width
 

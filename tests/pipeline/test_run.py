@@ -374,3 +374,13 @@ def test_a_source_that_was_not_recorded_has_the_error_of_an_estimate(image: Floa
     assert beams[1] is not None
     assert beams[0].beam_basis == "assumed"
     assert beams[1].beam_basis != "assumed"
+
+
+def test_a_shot_is_shown_and_what_an_inversion_does_not_use_is_named(image: FloatArray) -> None:
+    assert "Shot" in repr(Shot("shot.tif", name="shot"))
+    with pytest.raises(InputError, match=r"image is 'shot\.tif': read it first"):
+        _ = Shot("shot.tif").shape
+    with pytest.raises(InputError, match=r"setup is 'setup\.toml': expected a ProtonSetup"):
+        Shot(image, setup="setup.toml")
+    texts = [c.text for c in run(Recipe(options=OPTIONS), Shot(image, psf=2.0)).report.warnings]
+    assert any("the shot has psf, which only fits use" in text for text in texts)

@@ -260,6 +260,11 @@ def run(
     report("prepare", 0, None, "image and source")
     inputs = collect_inputs(recipe, shot)
     inputs.recipe.check(inputs.shot)
+    of_fits = ("strength", "psf", "noise", "fiducials", "start")
+    if unused := [name for name in of_fits if getattr(inputs.shot, name) is not None]:
+        text = f"the shot has {', '.join(unused)}, which only fits use: fit the image to use it"
+        warnings = (*inputs.shot.warnings, Caution("file", text))
+        inputs = replace(inputs, shot=replace(inputs.shot, warnings=warnings))
     ready = inputs.prepare(should_stop)
     return run_prepared(
         inputs,
