@@ -85,8 +85,9 @@ class Shot(Summarised):
         ``geometry``, the part of the setup in the file.
     warnings : tuple of Caution
         Reasons to doubt the content of the file.
-    source_in_file : ndarray, shape (H, W), optional
-        The source that came in the image's file, which a recipe may replace.
+    in_file : mapping
+        Attributes that came in the image's file, such as its ``source``: a recipe precedes them,
+        as it does not precede those that were given.
 
     Examples
     --------
@@ -110,7 +111,7 @@ class Shot(Summarised):
     path: Path | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[Caution, ...] = ()
-    source_in_file: FloatArray | None = None
+    in_file: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.setup is not None and not hasattr(self.setup, "pixel_sizes"):
@@ -164,7 +165,12 @@ class Shot(Summarised):
     @property
     def has_own_source(self) -> bool:
         """Whether its source came in the file of its image, so that a recipe may replace it."""
-        return self.source is not None and self.source is self.source_in_file
+        return self.source is not None and self.given("source") is None
+
+    def given(self, name: str) -> Any:
+        """Return an attribute; None if it came in the image's file."""
+        value = getattr(self, name)
+        return None if value is self.in_file.get(name) else value
 
     def completed_by(self, recorded: Shot) -> Shot:
         """Return the shot as read from its file, with all that is known beside the file."""
@@ -185,14 +191,19 @@ class Shot(Summarised):
         self, values: Callable[[FloatArray], FloatArray], masks: Callable[[BoolArray], BoolArray]
     ) -> Shot:
         """Return the same with a function applied to image and source, another to the masks."""
-        return replace(
-            self,
+        return self._changed(
             image=values(self.image),
             source=None if self.source is None else values(self.source),
             dark=None if self.dark is None else values(self.dark),
             mask=None if self.mask is None else masks(self.mask),
             source_mask=None if self.source_mask is None else masks(self.source_mask),
         )
+
+    def _changed(self, **values: Any) -> Shot:
+        """Return the same with values made from its own; those of the file stay the file's."""
+        of_file = {name: value for name, value in values.items() if name in self.in_file}
+        kept = {name: value for name, value in of_file.items() if self.given(name) is None}
+        return replace(self, **values, in_file={**self.in_file, **kept})
 
     def bin_pixels(self, factor: int) -> Shot:
         """Sum blocks of `factor` × `factor` pixels; the setup's pixel grows with them.
@@ -221,11 +232,11 @@ class Shot(Summarised):
             )
         if factor == 1:
             return self
-        binned = replace(
-            self.map_planes(
-                lambda plane: block_sums(plane, factor),
-                lambda mask: block_sums(mask, factor) == factor**2,
-            ),
+        merged = self.map_planes(
+            lambda plane: block_sums(plane, factor),
+            lambda mask: block_sums(mask, factor) == factor**2,
+        )
+        binned = merged._changed(
             setup=None if self.setup is None else bin_setup(self.setup, factor),
             metadata={**self.metadata, "bin": factor * int(self.metadata.get("bin", 1))},
         )

@@ -26,9 +26,13 @@ from napari_shadowinv.cli._flags import recipe_of, takes_recipe
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import number_of_sites
 from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io.pradformat import write_radiograph
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline import Cache, read_recipe, run, write_recipe
+from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
+from napari_shadowinv.pipeline.inversion_run import collect_inputs
+from napari_shadowinv.pipeline.rerun import rerun
 from napari_shadowinv.preprocessing import (
     ESTIMATES,
     STEPS,
@@ -384,3 +388,34 @@ def test_a_shot_is_shown_and_what_an_inversion_does_not_use_is_named(image: Floa
         Shot(image, setup="setup.toml")
     texts = [c.text for c in run(Recipe(options=OPTIONS), Shot(image, psf=2.0)).report.warnings]
     assert any("the shot has psf, which only fits use" in text for text in texts)
+
+
+def test_a_setup_of_the_shot_precedes_the_recipe_and_that_of_its_file_does_not(
+    image: FloatArray, tmp_path: Path
+) -> None:
+    ours, file, theirs = (
+        paper_setup().model_copy(update={"energy": energy}) for energy in (3.0, 9.0, 15.0)
+    )
+    write_radiograph(tmp_path / "shot.h5", image, file, "shot")
+    recorded = read_radiograph(tmp_path / "shot.h5")
+    recipe, shot = Recipe(setup=theirs, options=OPTIONS), Shot(image, ours)
+    assert collect_inputs(recipe, shot).shot.setup == ours
+    fits = collect_fit_inputs(recipe.model_copy(update={"source": None}), [shot])
+    assert fits.setups == (ours,)
+    for of_file in (recorded, recorded.bin_pixels(2)):
+        assert collect_inputs(recipe, of_file).shot.setup == theirs
+        assert collect_inputs(Recipe(), of_file).shot.setup == of_file.setup
+    assert recorded.setup is not None
+    assert recorded.setup.energy == pytest.approx(file.energy)
+    again = rerun(run(recipe, shot), [image])
+    assert again.is_identical
+    assert again.content.provenance.setup == ours
+
+
+def test_arrays_that_no_result_repeats_are_refused(image: FloatArray) -> None:
+    with pytest.raises(InputError, match="dark frame, which a result cannot repeat"):
+        run(Recipe(options=OPTIONS), Shot(image, dark=image))
+    with pytest.raises(InputError, match="array as its start, which a result cannot repeat"):
+        collect_fit_inputs(Recipe(), [Shot(image, start=image)])
+    with pytest.raises(InputError, match="expected rows of y, x, dy, dx, σ in px"):
+        collect_fit_inputs(Recipe(), [Shot(image, fiducials=[[1.0, 2.0]])])

@@ -255,7 +255,7 @@ def test_an_unknown_beam_is_not_an_assumed_one(images: list[FloatArray]) -> None
         (Recipe(fit=FitChoices(beam="unknown")), np.ones(SHAPE)),
     ):
         shots = [
-            Shot(image, setup, source=source, source_in_file=source)
+            Shot(image, setup, source=source, in_file={"source": source})
             for image, setup in zip(images, SETUPS, strict=True)
         ]
         inputs = collect_fit_inputs(recipe, shots)

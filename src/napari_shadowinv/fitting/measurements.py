@@ -743,14 +743,20 @@ def _start_of(
     return potential, near
 
 
-def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fiducials | None:
-    if fiducials is None:
-        return None
+def check_fiducials(fiducials: ArrayLike) -> FloatArray:
+    """Return fiducials as rows of y, x, dy, dx and their σ in px, or raise an `InputError`."""
     table = as_numbers("fiducials", fiducials)
     if table.ndim != 2 or table.shape[1] != 5 or not np.isfinite(table).all():
         raise InputError(
             f"fiducials have shape {table.shape}: expected rows of y, x, dy, dx, σ in px"
         )
+    return table
+
+
+def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fiducials | None:
+    if fiducials is None:
+        return None
+    table = check_fiducials(fiducials)
     places, displacements, errors = table[:, :2], table[:, 2:4], table[:, 4]
     if ((places < -0.5) | (places > np.array(size) - 0.5)).any() or not (errors > 0).all():
         raise InputError("fiducials lie outside the image or have no positive σ: check their rows")

@@ -145,9 +145,11 @@ def _read_file(
         )
     shot = _as_radiograph(path, array, facts, channel)
     warnings = film_warnings(array, channel) if file_format.is_scan else ()
+    setup = _complete_setup(path, metadata.get("geometry", {}))
     return replace(
         shot,
-        setup=_complete_setup(path, metadata.get("geometry", {})),
+        setup=setup,
+        in_file={**shot.in_file, "setup": setup},
         path=path,
         warnings=(*warnings, *shot.warnings),
     )
@@ -171,7 +173,7 @@ def _as_radiograph(
         image=image,
         metadata=facts,
         source=source,
-        source_in_file=source,
+        in_file={"source": source},
         mask=mask,
         warnings=tuple(facts.pop("warnings", ())),
     )

@@ -21,7 +21,8 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, compare, fit, point_spread
-from napari_shadowinv.fitting.shots import common_values, value_of_first, values_of
+from napari_shadowinv.fitting.measurements import check_fiducials
+from napari_shadowinv.fitting.shots import NearField, common_values, value_of_first, values_of
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.normalise import mask_unlit
 from napari_shadowinv.io.files import name_of, sha256, text_of
@@ -286,11 +287,12 @@ def _with_free_brightness(
 ) -> FitChoices:
     """Return choices with the brightness of shots, which a result can repeat; refuse arrays."""
     for shot, name in zip(shots, names, strict=True):
-        for key in ("noise", "psf"):
-            if np.ndim(getattr(shot, key)):
+        for key in ("noise", "psf", "start"):
+            value = getattr(shot, key)
+            if np.ndim(value) or isinstance(value, NearField):
                 raise InputError(
-                    f"{name} has an array as its {key}, which a result cannot repeat: give a "
-                    "number, or pass the shots to fit"
+                    f"{name} has an array as its {key}, which a result cannot repeat: pass the "
+                    "shots to fit" + (", or give a number" if key != "start" else "")
                 )
     free = common_values(
         names, [shot.brightness == "free" or None for shot in shots], "free brightness"
@@ -403,7 +405,7 @@ def _read_fiducials(fiducials: ArrayLike | Path | None) -> tuple[FloatArray | No
         fiducials = Path(fiducials)
         origin = Origin(file=text_of(fiducials.name), sha256=sha256(fiducials))
         return np.array(fiducials_from(fiducials)), origin
-    return np.array(fiducials, dtype=np.float64), Origin()
+    return check_fiducials(fiducials), Origin()
 
 
 def _image_origins(

@@ -223,8 +223,9 @@ def run(
     recipe : Recipe
         Steps and options.
     shot : Shot, array_like of shape (H, W), or path
-        The image, with its attributes. The recipe's setup precedes the shot's, its measured source
-        that in the image's file; a pixel is used where the masks of both are true.
+        The image, with its attributes. What is given with the shot precedes the recipe's setup and
+        source, which precede those in the image's file; a pixel is used where the masks of both are
+        true.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.invert`.
     cache : Cache, optional
@@ -408,7 +409,7 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     """Collect the inputs of a recipe: read files, and fill in defaults of the shot."""
     entered = shot if isinstance(shot, Shot) else Shot(shot)
     loaded = load_shot(entered, "the image")
-    setup = loaded.setup if recipe.setup is None else recipe.setup
+    setup = loaded.given("setup") or recipe.setup or loaded.setup
     beam = _beam_of(recipe, loaded)
     if setup is not None:
         check_spacing(entered.image, "the image", setup.pixel_sizes)
@@ -485,6 +486,11 @@ def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
 def _dark_frame(recipe: Recipe, shot: Shot) -> Shot | None:
     """Read the dark frame that the recipe subtracts, if it names a file."""
     file = recipe.dark_file
+    if shot.dark is not None:
+        raise InputError(
+            "the shot has a dark frame, which a result cannot repeat: name its file in the "
+            "step dark"
+        )
     if file is None:
         return None
     frame = read_radiograph(file)
