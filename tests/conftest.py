@@ -19,7 +19,7 @@ from hypothesis import settings
 
 from helpers.public_data import public_file, public_names
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.inversion import Inversion, Report
 from napari_shadowinv.inversion.error_budget import ErrorEstimate, Errors
@@ -205,8 +205,9 @@ def fit_exactly(
             for start, value, away in (("from far", 100 / 3, 0.0), ("from near", 40.0, 0.3))
         ),
         "folded": 0.1,
-        "verdict": Verdict.DETERMINED,
-        "explanation": "all starts lead to one field, which explains 2 images to the noise",
+        "assessment": Assessment(
+            Verdict.DETERMINED, "all starts lead to one field, which explains 2 images to the noise"
+        ),
         "report": FitReport(
             100 / 3, 12, True, {"starts": 0.5, "full size": 1.5}, 0.02, parts={"noise": 0.02}
         ),

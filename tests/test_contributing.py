@@ -110,7 +110,7 @@ def test_the_quantity_is_the_effect_of_a_nonlinear_detector(monkeypatch):
     np.testing.assert_allclose(inversion.errors.total, total)
     assert inversion.errors.of_peak.cause == "nonlinear detector"
     facts = {fact.key: fact.text for fact in inversion.facts}
-    assert "nonlinear detector 4." in facts["errors"]
+    assert "nonlinear detector 4." in facts["error_limited_by"]
     restored = Inversion.from_dataset(inversion.to_dataset())
     assert restored.errors == inversion.errors
 

@@ -23,9 +23,17 @@ from napari_shadowinv import (
     synthetic_image,
 )
 from napari_shadowinv._napari.widgets._panels import fact_rows as window_rows
-from napari_shadowinv.cautions import Caution
+from napari_shadowinv.cautions import CAUTION_CODES, Caution
 from napari_shadowinv.cli._summary import fact_rows as table_rows
-from napari_shadowinv.facts import Headline, Level, Verdict, percent, to_figures, with_error
+from napari_shadowinv.facts import (
+    Assessment,
+    Headline,
+    Level,
+    Verdict,
+    percent,
+    to_figures,
+    with_error,
+)
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.shot import Shot, shots_of
@@ -80,8 +88,9 @@ def test_two_figures_never_end_in_an_exponent_of_a_program(value, written):
 def test_errors_without_a_displacement_have_their_length():
     texts = texts_by_key(invert(np.full((32, 32), 7.0)).facts)
     assert texts["errors"].startswith("0.")
-    assert " px (r.m.s.): beam 0." in texts["errors"]
-    assert "%" not in texts["errors"].partition("(5 %")[0]
+    assert " px (r.m.s.)" in texts["errors"]
+    assert texts["error_limited_by"].startswith("beam 0.")
+    assert "%" not in texts["errors"] + texts["error_limited_by"].partition("(5 %")[0]
 
 
 def results_of(image, inversion):
@@ -162,7 +171,7 @@ def test_facts_give_the_numbers_of_the_report(inversion):
 
 def test_facts_with_a_setup_add_the_field_in_its_unit(inversion):
     setup = paper_setup()
-    texts = texts_by_key(inversion.facts_in(setup))
+    texts = texts_by_key(inversion.in_units(setup).facts)
     strength = setup.field_in_si("path_integrated_b", inversion.displacement)
     assert f"{1e3 * np.hypot(*strength).max():.3g}" in texts["field"]
     assert "mT·m" in texts["field"]
@@ -179,7 +188,7 @@ def test_a_caution_is_a_doubtful_fact_and_lack_of_convergence_a_failed_one(image
 
 
 def test_every_face_shows_the_same_texts(inversion):
-    table = dict(table_rows(inversion.facts))
+    table = dict(table_rows(inversion.facts, details=True))
     assert inversion.verdict not in table.values()  # it is in the line above
     window = window_rows(inversion.facts) + window_rows(inversion.facts, details=True)
     assert {name.lower(): text for name, text in window} == table
@@ -218,7 +227,25 @@ def test_the_headline_of_a_fit_begins_with_its_peaks(image):
     result = fit(shots_of([image], noise=0.01), options=options)
     (shown,) = shown_fields([result.fields[0].displacement], None, mask=result.used)
     assert result.headline.text.startswith(f"peak |d| {shown.largest:.3g} px; ")
-    assert result.explanation in result.headline.text
+    assert result.assessment.short in result.headline.text
+
+
+def test_a_headline_and_a_report_are_short_and_a_report_repeats_nothing(image, inversion):
+    words = ("peak |∫B×dz| 9.734 ± 0.077 mT·m", "peak |∫E dz| (1.34 ± 0.12) × 10⁻⁴ MV")
+    long = Assessment(Verdict.UNCERTAIN, "a reason of six words, say", "advice " * 9)
+    doubts = [Caution(code, "a sentence") for code in CAUTION_CODES]
+    for peaks in (words[:1], words):
+        for assessment in (long, Assessment(Verdict.DETERMINED, "limited by noise")):
+            headline = Headline.of(peaks, assessment, doubts)
+            assert len(headline.text.split()) <= Headline.MOST_WORDS
+            assert headline.text.startswith(f"{'; '.join(peaks)}; {assessment.reason}")
+    options = FitOptions(samples=3, max_iterations=20, spacing=0.25)
+    fitted = fit(shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01), options=options)
+    for facts in (inversion.facts, inversion.in_units(paper_setup()).facts, fitted.facts):
+        rows = table_rows(facts)
+        assert 4 <= len(rows) <= 6, "and the setup"
+        texts = [text for _, text in rows]
+        assert not [text for text in texts if sum(text in other for other in texts) > 1]
 
 
 def test_each_fitted_field_has_its_significance(image):
@@ -230,7 +257,7 @@ def test_each_fitted_field_has_its_significance(image):
     causes = "beam; noise; assumed background, 5 %; assumed gamma, 0.05"
     assert f"up to {structures.peaks[0]:.3g} σ (σ by {causes})" in fact.text
     assert "assumed" not in result.report.ranking, "parts keep their names"
-    assert dict(table_rows(result.facts))["significance B"] == fact.text
-    assert dict(window_rows(result.facts))["Significance B"] == fact.text
+    assert dict(table_rows(result.facts, details=True))["significance B"] == fact.text
+    assert dict(window_rows(result.facts, details=True))["Significance B"] == fact.text
     field = dataclasses.replace(result.fields[0], uncertainty=None)
     assert "significance_B" not in texts_by_key(dataclasses.replace(result, fields=(field,)).facts)

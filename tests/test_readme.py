@@ -42,7 +42,7 @@ def test_the_python_example_prints_the_field_with_its_error(shot_folder, capsys)
     (shown,) = re.findall(r"print\(.*# (.*) …", block)
     assert shown in printed  # a peak with its error, in µT·m, and what it depends on
     field = float(np.hypot(*names["field"]).max())
-    assert float(shown.split()[-5]) == pytest.approx(1e6 * field, abs=0.05)
+    assert float(shown.split()[-6]) == pytest.approx(1e6 * field, abs=0.05)
     result = names["result"]
     assert isinstance(result, xarray.Dataset)
     assert result.potential.attrs["units"] == "pixel**2"

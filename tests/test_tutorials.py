@@ -68,7 +68,7 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
     residual = float(measured.attrs["image_residual"])
     assert residual == pytest.approx(0.0825, abs=5e-4)
     assert f"**Image residual** {percent(residual)}" in page
-    assert "**Caustics** 0 % of the pixels" in page
+    assert "**Caustics**, under *More*, 0 % of the pixels" in page
     assert not measured.caustic.any()
     from napari_shadowinv.inversion.variables import setup_from_dataset
 

@@ -1,5 +1,7 @@
 """A result in words, for every face: `Fact`, `Headline`, `Level`, `Verdict`; its `ResultKind`.
 
+The verdict on a field with its limit and the next step: `Assessment`.
+
 A few lines and a picture of a result, as in a notebook: `Summarised`.
 
 Numbers in words: `to_figures`, `percent`, `with_error`; their power of ten: `power_of_ten`.
@@ -18,10 +20,10 @@ import base64
 import html
 import math
 import textwrap
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -209,23 +211,77 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
+class Assessment:
+    """Verdict on a field, with its limit and the next step.
+
+    Attributes
+    ----------
+    verdict : Verdict
+        Whether the field is known.
+    reason, advice : str
+        Its limit and the next step in a few words; empty if there is nothing to say.
+    explanation : str
+        The reason in a sentence. Default: reason and advice.
+    caution : Caution, optional
+        The one that decided it, if one did.
+    """
+
+    verdict: Verdict
+    reason: str
+    advice: str = ""
+    explanation: str = ""
+    caution: Caution | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "explanation", self.explanation or self.short)
+
+    @property
+    def short(self) -> str:
+        """Reason and advice, for a headline."""
+        return ": ".join(filter(None, (self.reason, self.advice)))
+
+
+@dataclass(frozen=True)
 class Headline:
-    """A result in one line, which begins with its title.
+    """A result in one line of at most `MOST_WORDS`, which begins with its title.
 
     Attributes
     ----------
     level : Level
         Failed if the solver did not converge, doubtful with a warning, else that of the verdict.
     text : str
-        The peak of the main field with its error, the reason of the verdict, and the warnings in
-        a few words.
+        The peak of the main field with its error, its limit, the next step, and the first warning
+        in a few words.
     verdict : Verdict, optional
         None for results without one.
     """
 
+    MOST_WORDS: ClassVar = 25
+
     level: Level
     text: str
     verdict: Verdict | None = None
+
+    @classmethod
+    def of(
+        cls,
+        peaks: Iterable[str],
+        assessment: Assessment,
+        cautions: Iterable[Caution] = (),
+        *,
+        converged: bool = True,
+    ) -> Headline:
+        """Return the headline of a field by its peaks, without parts that would be too long."""
+        doubts = list(cautions)
+        level = Level.DOUBTFUL if doubts else assessment.verdict.level
+        warnings = [each.short for each in doubts if each is not assessment.caution]
+        text = "; ".join(filter(None, peaks))
+        for part in filter(None, (assessment.reason, assessment.advice, *warnings[:1])):
+            sign = ": " if part == assessment.advice else "; "
+            longer = f"{text}{sign * bool(text)}{part}"
+            if len(longer.split()) <= cls.MOST_WORDS:
+                text = longer
+        return cls(level if converged else Level.FAILED, text, assessment.verdict)
 
     @property
     def title(self) -> str:
@@ -267,11 +323,6 @@ class Fact:
     short: str = ""
 
 
-def in_headline(cautions: Iterable[Caution]) -> list[str]:
-    """Return cautions in a few words, each once; their facts have the sentences."""
-    return list(dict.fromkeys(caution.short for caution in cautions))
-
-
 def verdict_fact(verdict: Verdict) -> Fact:
     """Return a verdict, whose reason is in the headline."""
     return Fact("verdict", "Verdict", str(verdict), verdict.level, short=str(verdict))
@@ -292,6 +343,14 @@ def error_fact(name: str, text: str) -> Fact:
     """Return a contribution to the error budget."""
     key = name if name.startswith("error") else f"error_{name}"
     return Fact(key.replace(" ", "_"), name.capitalize(), text)
+
+
+def folded(facts: Iterable[Fact], shown: Collection[str]) -> tuple[Fact, ...]:
+    """Return facts as a report shows them: those with other keys are details, unless doubtful."""
+    return tuple(
+        fact if fact.key in shown or not fact.level.is_success else replace(fact, is_detail=True)
+        for fact in facts
+    )
 
 
 def time_fact(seconds: Mapping[str, float]) -> Fact:

@@ -22,7 +22,7 @@ from napari_shadowinv.facts import (
     ResultKind,
     Summarised,
     caution_facts,
-    in_headline,
+    percent,
 )
 from napari_shadowinv.film.pack import Pack
 from napari_shadowinv.film.unfolding import relative_strengths
@@ -144,10 +144,10 @@ class FilmDoses(Summarised):
 
     @property
     def headline(self) -> Headline:
-        """Warnings, number of films and their energies in one line."""
-        texts = in_headline(self.cautions)
+        """Number of films, their energies and the warnings in one line."""
+        texts = dict.fromkeys(caution.short for caution in self.cautions)
         level = Level.DOUBTFUL if texts else Level.SOUND
-        return Headline(level, "; ".join([*texts, f"{len(self.energies)} films, {self._range}"]))
+        return Headline(level, "; ".join([f"{len(self.energies)} films, {self._range}", *texts]))
 
     @property
     def facts(self) -> tuple[Fact, ...]:
@@ -156,7 +156,7 @@ class FilmDoses(Summarised):
         pixels = [f"{height} × {width}"]
         if self.pixel_size is not None:
             pixels.append(f"{1e6 * self.pixel_size:.4g} µm on the film")
-        pixels.append(f"{self.usable.mean():.0%} usable")
+        pixels.append(f"{percent(self.usable.mean())} usable")
         facts = [
             *caution_facts(self.cautions),
             Fact("films", "Films", f"{len(self.energies)}, {self._range}"),
@@ -204,7 +204,7 @@ class FilmDoses(Summarised):
         return {
             **cells,
             "median dose": f"{np.median(self.dose[k][usable]):.3g} Gy",
-            "usable": f"{usable.mean():.0%}",
+            "usable": f"{percent(usable.mean())}",
             "shift": f"y {dy:+.1f}, x {dx:+.1f} px (± {self.shift_errors[k]:.1f})",
         }
 

@@ -18,7 +18,7 @@ from helpers.command_line import content, flat, interrupted, shadowinv
 from helpers.fit_images import of_each
 from napari_shadowinv.cli._flags import fit_recipe_of
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit, LeaveOneOut, point_spread
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
@@ -118,10 +118,12 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
     assert setup_from_dataset(dataset) == FIRST
     output = flat(result.stdout)
     assert "determined peak |∫B×dz| " in output
+    assert fit.assessment.short in output
+    output = flat(shadowinv("info", "a_fit.shadowinv").stdout)
     assert fit.explanation in output
     assert "image 2 b.tif, 5 MeV proton, χ²" in output
     assert "MG·µm)" in output
-    assert "; peak |d|" in output
+    assert "displacement B peak |d|" in output
     assert "a beam that differs by 1 %" in output
 
     description = flat(shadowinv("info", "a_fit.shadowinv").stdout)
@@ -411,7 +413,7 @@ def test_forward_asks_which_of_two_fields(
 
 def test_info_shows_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
     doubtful = dataclasses.replace(
-        make_fit(), verdict=Verdict.SEVERAL, explanation="2 different fields explain the data"
+        make_fit(), assessment=Assessment(Verdict.SEVERAL, "2 different fields explain the data")
     )
     write("fit.shadowinv", doubtful)
     output = flat(shadowinv("info", "fit.shadowinv").stdout)

@@ -185,7 +185,7 @@ def test_invert_writes_the_result_of_the_library(folder: Path, shot: Path) -> No
     assert provenance.image == ImageOrigin(file="shot.npy", sha256=sha256(shot), shape=(24, 32))
     assert provenance.recipe == Recipe(source=UniformEstimate(), options=options)
     assert len(np.unique(iio.imread("shot.png"))) > 100
-    for word in ("300", "converged", "peak |d|", "shot.shadowinv", "shot.png"):
+    for word in ("limited by", "peak |d|", "shot.shadowinv", "shot.png"):
         assert word in result.stdout
 
 
@@ -260,7 +260,8 @@ def test_bin_sums_and_widens_pixels(folder: Path) -> None:
     setup = setup_from_dataset(saved)
     assert isinstance(setup, OpticalSetup)
     assert setup.pixel_size == 2e-5
-    assert "binned 2 × 2, 0 rows and 1 columns cut off" in " ".join(result.stdout.split())
+    output = shadowinv("info", "fine.shadowinv").stdout
+    assert "binned 2 × 2, 0 rows and 1 columns cut off" in flat(output)
 
 
 def test_pradformat_in_and_out(folder: Path) -> None:
@@ -344,7 +345,7 @@ def test_negative_pixels_are_clipped_counted_and_reported(folder: Path) -> None:
     inversion = Inversion.from_dataset(dataset("shot.shadowinv"))
     assert inversion.report.clipped_pixels == 3
     assert (inversion.image[3, 4:7] == 0).all()
-    assert "3 clipped" in " ".join(result.stdout.split())
+    assert "3 clipped" in flat(shadowinv("info", "shot.shadowinv").stdout)
 
 
 def test_free_boundary_is_chosen_reported_and_kept(folder: Path) -> None:
@@ -356,7 +357,7 @@ def test_free_boundary_is_chosen_reported_and_kept(folder: Path) -> None:
     assert inversion.options.boundary == "free"
     assert inversion.options.margin == 6
     assert inversion.report.flux_left["left"] > 0.001
-    text = " ".join(result.stdout.split())
+    text = flat(shadowinv("info", "shot.shadowinv").stdout)
     assert f"left {percent(inversion.report.flux_left['left'])}" in text
     refused = shadowinv("invert", "shot.npy", "--flux", "known", "--out", "other.shadowinv")
     assert refused.exit_code == 2
@@ -544,7 +545,7 @@ def test_forward_traces_a_3d_field(grid: Path) -> None:
         "--width", "30", "--truth", "truth.nc", "--out", "image.tif",
     )  # fmt: skip
     assert traced.exit_code == 0
-    assert "faces reaches 100%" in flat(traced.output)
+    assert "faces reaches 100 %" in flat(traced.output)
     assert tifffile.imread("image.tif").shape == (20, 30)
     with xr.open_dataset("truth.nc", engine="h5netcdf") as truth:
         field = truth["path_integrated_b"].sel(component="y").values
@@ -743,7 +744,7 @@ def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
         assert provenance is not None
         assert provenance.recipe.estimate is not None
         assert provenance.recipe.estimate.name() == name
-        text = " ".join(result.stdout.split())
+        text = flat(shadowinv("info", "shot.shadowinv").stdout)
         assert f"source {provenance.recipe.estimate.summary}" in text
         basis = "measured outside the object" if name == "kriged" else "assumed"
         assert f"beam {basis}" in text
@@ -763,7 +764,6 @@ def test_filters_match_the_library(folder: Path) -> None:
     flags = ["--hot-pixels", 6, "--bin", 2, "--background-degree", 1, "--low-pass", 1.5]
     result = shadowinv("invert", "shot.npy", *flags)
     assert result.exit_code == 0, result.output
-    assert "1 hot and 0 dead pixels replaced" in " ".join(result.stdout.split())
     saved = dataset("shot.shadowinv")
     np.testing.assert_allclose(
         saved["image"], expected * saved["source"].mean().item() / expected.mean()
@@ -775,7 +775,7 @@ def test_filters_match_the_library(folder: Path) -> None:
         BackgroundFilter(degree=1),
         LowPassFilter(width=1.5),
     )
-    assert "1 hot and 0 dead pixels" in " ".join(shadowinv("info", "shot.shadowinv").stdout.split())
+    assert "1 hot and 0 dead pixels replaced" in flat(shadowinv("info", "shot.shadowinv").stdout)
     # The same from a file, where a flag wins.
     (folder / "recipe.toml").write_text(
         "[options]\nn_sites = 300\n"
@@ -1093,7 +1093,7 @@ def test_a_film_pack_is_described_but_has_no_field(
     text = flat(shadowinv("info", "pack.shadowinv").stdout)
     assert "film pack of shadowinv 1.2" in text
     assert "films 2, 3 to 5.5 MeV" in text
-    assert "pixels 5 × 7, 100% usable" in text
+    assert "pixels 5 × 7, 100 % usable" in text
     assert "film 2 is dark" in text
     refused("forward", "pack.shadowinv", names="pack.shadowinv is a film pack")
 

@@ -493,7 +493,7 @@ def test_errors_that_are_not_known_are_said_to_be(image):
     assert "discretisation was not estimated, as only one level was solved" in facts["errors"]
     facts = error_facts(invert(image, options=InversionOptions(n_sites=900)))
     assert "not estimated" not in facts["errors"]
-    assert facts["errors"].endswith("crossing rays are not in it")
+    assert "crossing rays are not in it" in facts["errors"]
 
 
 def test_noise_that_was_smoothed_is_not_passed_off_as_measured():
@@ -507,7 +507,7 @@ def test_noise_that_was_smoothed_is_not_passed_off_as_measured():
     stated = run(Recipe(options=stated_options, steps=(smooth,)), image)
     assert stated.errors.noise.rms == pytest.approx(plain.errors.noise.rms, rel=0.2)
     assert 1 / 1.6 < filtered.errors.noise.rms / plain.errors.noise.rms < 1.6
-    assert "(correlated over 1." in error_facts(filtered)["errors"]
+    assert "(correlated over 1." in error_facts(filtered)["error_limited_by"]
     assert "error_noise" not in error_facts(filtered) | error_facts(stated)
 
 
@@ -747,7 +747,7 @@ def test_a_reference_of_another_exposure_is_assumed_uneven_and_a_given_uniform_o
     recorded = invert(image, source=reference).errors
     assert (recorded.beam_basis, recorded.beam_variation) == ("reference", 0.005)
     assert recorded.beam.rms == pytest.approx(0.5 * recorded.beam_sensitivity.rms)
-    assert "assumed" in recorded.rows()[0][1]
+    assert "assumed" in recorded.rows()[1][1]
     assert invert(image, source=reference, instrument={"beam_rms": 0}).errors.beam is None
     assert invert(image, source=np.full((40, 40), 400.0)).errors.beam is None
 

@@ -536,7 +536,7 @@ def test_the_headline_begins_with_the_peak_and_ends_with_warnings(image):
     assert inversion.headline.level == "sound"
     peak_text, reason = inversion.headline.text.split("; ")
     assert peak_text.startswith(f"peak |d| {peak(inversion.displacement):.4f} ± ")
-    assert reason.startswith("errors of ")
+    assert reason.startswith("limited by ")
     doubtful = inversion.with_warnings([Caution("beam", "the beam is wrong")]).headline
     assert doubtful.level == "doubtful"
     assert doubtful.text == f"{inversion.headline.text}; {CAUTION_CODES['beam']}"

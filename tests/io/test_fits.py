@@ -11,7 +11,7 @@ import pytest
 import xarray as xr
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
@@ -95,7 +95,9 @@ def test_file_gives_back_every_bit(
 
 
 def test_unknown_parts_stay_unknown(tmp_path: Path, make_fit: MakeFit) -> None:
-    complete_fit = make_fit(strengths=(1.0,), verdict=Verdict.AMBIGUOUS, explanation="cannot tell")
+    complete_fit = make_fit(
+        strengths=(1.0,), assessment=Assessment(Verdict.AMBIGUOUS, "cannot tell")
+    )
     fields = tuple(dataclasses.replace(field, uncertainty=None) for field in complete_fit.fields)
     report = dataclasses.replace(complete_fit.report, total=float("nan"))
     fit = dataclasses.replace(complete_fit, fields=fields, report=report)
@@ -135,7 +137,7 @@ def test_other_formats_are_refused(tmp_path: Path, make_fit: MakeFit, ending: st
 def test_the_field_of_a_fit_is_written_as_pradformat_with_its_verdict(
     tmp_path: Path, make_fit: MakeFit
 ) -> None:
-    fit = make_fit(setups=(protons(14.7), protons(5.0)), verdict=Verdict.SEVERAL)
+    fit = make_fit(setups=(protons(14.7), protons(5.0)), assessment=Assessment(Verdict.SEVERAL, ""))
     write(tmp_path / "fit.h5", fit)
     again = read(tmp_path / "fit.h5")
     assert isinstance(again, xr.Dataset)

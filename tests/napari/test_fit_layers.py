@@ -25,7 +25,7 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import add_layers, outline
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitOptions, Instrument
@@ -64,8 +64,8 @@ def found(fields: tuple[str, ...]) -> Fit:
     alternative = replace(
         first, start="from near", distance=0.5, displacement=first.displacement / 2
     )
-    verdict = {"verdict": Verdict.SEVERAL, "explanation": WHY}
-    return replace(best, basins=(first, alternative), **verdict)
+    assessment = Assessment(Verdict.SEVERAL, WHY)
+    return replace(best, basins=(first, alternative), assessment=assessment)
 
 
 @pytest.fixture(scope="module")
@@ -136,7 +136,7 @@ def test_a_verdict_cannot_be_missed(
         assert metadata_of(layer)["verdict"] == "one of several"
         assert metadata_of(layer)["explanation"] == WHY
     assert layers["field"].name == "? |∫B×dz| (µT·m) – pack"
-    good = replace(doubtful, verdict=Verdict.DETERMINED, explanation="all starts lead to one")
+    good = replace(doubtful, assessment=Assessment(Verdict.DETERMINED, "all starts lead to one"))
     layers = opened(viewer, write(tmp_path / "good.shadowinv", good))
     assert len(messages) == 1
     assert metadata_of(layers["field"])["verdict"] == "determined"

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
@@ -127,7 +127,8 @@ def test_figure_shows_sites_warnings_and_failure(make_inversion: Make) -> None:
     good = report_figure(make_inversion((30, 30)))
     bad = report_figure(make_inversion((30, 30), converged=False, warnings=()))
     text = " ".join(item.get_text() for item in good.texts)
-    assert "Sites: 17" in text
+    assert "Image residual: 1.7 %" in text
+    assert "Sites" not in text
     assert "1 negative pixel was set to zero" in text
     assert "not converged" not in text
     assert "not converged" in " ".join(item.get_text() for item in bad.texts)
@@ -232,8 +233,7 @@ def test_no_panel_of_a_fit_touches_another(
         names,
         (1.0, 1.2, 1.4, 1.6, 1.8)[:count],
         setups=setups_of(proton_setup, count),
-        verdict=Verdict.MISFIT,
-        explanation="a long explanation " * 20,
+        assessment=Assessment(Verdict.MISFIT, "a long explanation " * 20),
     )
     figure = fit_figure(fit, title=", ".join(["some_shot_of_the_night.tif"] * count))
     assert_nothing_overlaps(figure)
@@ -307,7 +307,7 @@ def test_fields_and_error_bars_of_a_fit_are_in_si(
 
 def test_the_verdict_of_a_fit_is_on_top_in_its_colour(make_fit: MakeFit) -> None:
     good = make_fit()
-    bad = dataclasses.replace(good, verdict=Verdict.SEVERAL, explanation="two fields explain it")
+    bad = dataclasses.replace(good, assessment=Assessment(Verdict.SEVERAL, "two fields explain it"))
     colours = []
     for fit in (good, bad):
         (line,) = [

@@ -369,14 +369,14 @@ class AxisymmetricProfile(Product):
         if edge > self.limits.edge:
             yield Caution(
                 "edge",
-                f"the deflection at the edge is {edge:.0%} of the largest: the object does not end "
-                "inside the radius, which shifts and bends the profile; use a wider image",
+                f"the deflection at the edge is {percent(edge)} of the largest: the object does "
+                "not end inside the radius, which shifts and bends the profile; use a wider image",
             )
         if halves > self.limits.asymmetry:
             yield Caution(
                 "misfit",
-                f"the halves of the object differ by {halves:.0%} (r.m.s.): it is not symmetric "
-                "about this axis, and the profile is that of the mean of the halves",
+                f"the halves of the object differ by {percent(halves)} (r.m.s.): it is not "
+                "symmetric about this axis, and the profile is that of the mean of the halves",
             )
         profile = np.atleast_2d(quantities[next(iter(self._profile_variables(frame)))].value)
         yield from _length_cautions(np.abs(profile), frame, self.limits)
@@ -556,7 +556,7 @@ def _length_cautions(
     if share > limits.length:
         yield Caution(
             "setup",
-            f"the object is {length_text(length)} long along the beam, {share:.0%} of its distance "
-            "from the source: rays are not parallel inside it and magnify its front more than its "
-            "back, which the Abel inversion does not allow for",
+            f"the object is {length_text(length)} long along the beam, {percent(share)} of its "
+            "distance from the source: rays are not parallel inside it and magnify its front more "
+            "than its back, which the Abel inversion does not allow for",
         )

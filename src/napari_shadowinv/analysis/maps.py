@@ -36,7 +36,7 @@ from napari_shadowinv.analysis.product import (
     quantity_text,
 )
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact
+from napari_shadowinv.facts import Fact, percent
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import length_text
 
@@ -207,7 +207,7 @@ class _SourceMap(Smoothed):
             return []
         gap = float(np.sqrt(((curvature - image)[used] ** 2).mean())) / size
         text = (
-            f"the contrast of the image, equally smoothed, differs from this map by {gap:.0%} "
+            f"the contrast of the image, equally smoothed, differs from this map by {percent(gap)} "
             "(r.m.s.); for deflections as weak as these they are nearly the same"
         )
         return [Fact("linear", "Linear limit", text)]

@@ -20,7 +20,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, decimals_of, power_of_ten
+from napari_shadowinv.facts import Fact, decimals_of, percent, power_of_ten
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.units import PIXEL, display_unit, prefix_for
 from napari_shadowinv.preprocessing.steps import Choice
@@ -235,7 +235,8 @@ def mask_cautions(
     if share <= notable:
         return []
     text = (
-        f"{share:.0%} of {name} is at masked pixels, where the field is only a smooth continuation"
+        f"{percent(share)} of {name} is at masked pixels, where the field is only a smooth "
+        "continuation"
     )
     return [Caution("mask", text)]
 

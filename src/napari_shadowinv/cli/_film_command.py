@@ -127,8 +127,7 @@ def film(
         written.append(corners)
     if not quiet:
         say(film_table(doses))
-        facts = [fact for fact in doses.facts if not fact.is_detail]
-        say(two_columns("Film pack", [*fact_rows(facts), *written_rows(written, failed)]))
+        say(two_columns("Film pack", [*fact_rows(doses.facts), *written_rows(written, failed)]))
 
 
 def film_table(doses: FilmDoses) -> Table:

@@ -73,7 +73,7 @@ def fit_file_rows(dataset: xarray.Dataset) -> _summary.Rows:
     return [
         ("kind", f"fit of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
-        *fit_rows(fit),
+        *fit_rows(fit, details=True),
         *_summary.fact_rows(left_out),
         *([] if provenance is None else _provenance_rows(provenance)),
         ("options", _summary.options_text(fit.options.model_dump())),
@@ -98,12 +98,18 @@ def _provenance_rows(provenance: Provenance) -> _summary.Rows:
     return rows
 
 
-def fit_rows(fit: Fit, names: Sequence[str] = (), printed: tuple[str, ...] = ()) -> _summary.Rows:
-    """Return the headline and facts of a fit, and the size and setup of its images, by `names`."""
+def fit_rows(
+    fit: Fit,
+    names: Sequence[str] = (),
+    printed: tuple[str, ...] = (),
+    *,
+    details: bool = False,
+) -> _summary.Rows:
+    """Return the headline, facts and setup of a fit of images with these names."""
+    facts = fit.facts_with_names(names) if names else fit.facts
     return [
         _summary.headline_row(fit.headline),
-        *_summary.fact_rows(fit.facts_with_names(names) if names else fit.facts, printed),
-        ("size", _summary.size_text(fit.images[0])),
+        *_summary.fact_rows(facts, printed, details=details),
         ("setup", _summary.setup_text(fit.setup, shape=fit.images[0].shape)),
     ]
 

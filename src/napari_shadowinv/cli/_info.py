@@ -167,12 +167,12 @@ def _inversion_rows(dataset: xarray.Dataset) -> _summary.Rows:
 
     inversion, setup = Inversion.from_dataset(dataset), setup_from_dataset(dataset)
     return [
-        _summary.headline_row(inversion.headline_in(setup)),
+        _summary.headline_row(inversion.in_units(setup).headline),
         ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
         ("created", str(dataset.attrs["created"])),
         *_origin_rows(inversion.provenance),
         *_experiment_rows(inversion.displacement, setup),
-        *_summary.fact_rows(inversion.facts_in(setup)),
+        *_summary.fact_rows(inversion.in_units(setup).facts, details=True),
         ("options", _summary.options_text(inversion.options.model_dump())),
     ]
 
@@ -184,7 +184,7 @@ def _film_rows(dataset: xarray.Dataset) -> _summary.Rows:
     return [
         ("kind", f"film pack of shadowinv {doses.provenance.version}"),
         ("created", doses.created),
-        *_summary.fact_rows(doses.facts),
+        *_summary.fact_rows(doses.facts, details=True),
     ]
 
 
@@ -200,7 +200,7 @@ def _field_rows(dataset: xarray.Dataset) -> _summary.Rows:
     return [
         ("kind", kind),
         *_experiment_rows(field.displacement, field.setup),
-        *_summary.fact_rows(field.facts),
+        *_summary.fact_rows(field.facts, details=True),
     ]
 
 

@@ -17,7 +17,6 @@ from napari_shadowinv.cli import _flags, _inputs
 from napari_shadowinv.cli._summary import (
     fact_rows,
     headline_row,
-    provenance_rows,
     setup_text,
     size_text,
     two_columns,
@@ -32,7 +31,7 @@ from napari_shadowinv.cli._terminal import (
     work_callbacks,
 )
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.facts import ResultKind, percent
 from napari_shadowinv.io.formats import IMAGE_WRITERS, NETCDF_SUFFIX, PNG, RESULT, TIFF, kind_of
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
@@ -175,13 +174,11 @@ def invert(
     if not quiet:
         rows = [
             headline_row(inversion.headline),
-            ("image", f"{shot.path}, {size_text(inversion.image)}"),
-            *provenance_rows(inversion.provenance),
-            ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),
             *fact_rows(inversion.facts, printed),
+            ("setup", setup_text(inversion.setup, shot, inversion.image.shape)),
             *written_rows(outputs, failed),
         ]
-        say(two_columns("Inversion", rows))
+        say(two_columns(f"{shot.path}, {size_text(inversion.image)}", rows))
     exit_unless_sound(inversion, result)
 
 
@@ -330,7 +327,10 @@ def forward(
     write(path, image, setup=target, overwrite=overwrite)
     if not quiet:
         inside = image.sum() / (image.size if beam is None else beam.sum())
-        say(f"Wrote {path}: {size_text(image)}, {inside:.2%} of the flux lands inside the image")
+        say(
+            f"Wrote {path}: {size_text(image)}, {percent(inside)} of the flux lands inside the "
+            "image"
+        )
         if note:
             say(note)
 
@@ -403,9 +403,9 @@ def demo(
     result = write(out / f"{name}{RESULT.suffix}", inversion, setup=setup, overwrite=True)
     failed = _inputs.write_figures(figures, overwrite=True)
     rows = [
-        headline_row(inversion.headline_in(setup)),
+        headline_row(inversion.in_units(setup).headline),
+        *fact_rows(inversion.in_units(setup).facts),
         ("setup", setup_text(setup, shape=image.shape)),
-        *fact_rows(inversion.facts_in(setup)),
         ("error", errors["Retrieved"]),
         ("error of Poisson", errors["Poisson"]),
         *written_rows([result, *figures], failed),
@@ -419,7 +419,7 @@ def _error_text(estimate: FloatArray, truth: FloatArray) -> str:
     if not true_peak:
         return f"peak {peak:.3g} px where the truth is zero"
     distance = float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
-    return f"peak {peak / true_peak - 1:+.1%}, L2 {distance:.1%}"
+    return f"peak {peak / true_peak - 1:+.1%}, L2 {percent(distance)}"
 
 
 def trace_field(

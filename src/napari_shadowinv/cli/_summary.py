@@ -69,13 +69,16 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
     return rows
 
 
-def fact_rows(facts: Iterable[Fact], printed: tuple[str, ...] = ()) -> Rows:
+def fact_rows(
+    facts: Iterable[Fact], printed: tuple[str, ...] = (), *, details: bool = False
+) -> Rows:
     """Return facts as rows of a table, without the verdict and cautions that are printed."""
     return [
         (fact.title[:1].lower() + fact.title[1:], fact.text)
         for fact in facts
         # A fit puts the name of the image first.
         if fact.key != "verdict" and not fact.text.endswith(printed)
+        if details or not fact.is_detail
     ]
 
 

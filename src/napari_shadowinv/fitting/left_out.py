@@ -10,7 +10,7 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level, to_figures
+from napari_shadowinv.facts import Fact, Level, percent, to_figures
 from napari_shadowinv.fitting.result import noise_in, normalise_residual, setups_in
 from napari_shadowinv.physics.setup import Setup, beam_values
 from napari_shadowinv.physics.units import FLUX_DENSITY, label
@@ -125,7 +125,7 @@ class LeaveOneOut:
             f"alone {to_figures(self.alone[k], 3)}",
             f"limit {to_figures(self.limit[k], 3)}",
         ]
-        text = f"{', '.join(parts)}, r.m.s. {self.rms[k]:.2%}: {verdict}"
+        text = f"{', '.join(parts)}, r.m.s. {percent(self.rms[k])}: {verdict}"
         level = Level.SOUND if is_explained else Level.DOUBTFUL
         short = chi2 if is_explained else f"{chi2}, {verdict}"
         return Fact(f"left_out_{k + 1}", f"Left out {k + 1}", text, level, short=short)

@@ -29,6 +29,7 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import Around, imperfect_instrument
 from napari_shadowinv.fitting.rays import RayModel
@@ -538,7 +539,9 @@ def _checked_planes(
             )
         if plane.mean() < 0.05:
             check_usable(plane, f"mask of {name}")
-            raise InputError(f"{name} has {plane.mean():.1%} of its pixels in use: unmask some")
+            raise InputError(
+                f"{name} has {percent(plane.mean())} of its pixels in use: unmask some"
+            )
         if not image[plane].mean() > 0:
             raise InputError(f"{name} has no flux: expected a beam; check its background")
     return data, beams, used

@@ -16,6 +16,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import (
+    Assessment,
     Fact,
     Headline,
     Level,
@@ -24,7 +25,7 @@ from napari_shadowinv.facts import (
     Verdict,
     caution_facts,
     error_fact,
-    in_headline,
+    folded,
     masked_fact,
     percent,
     time_fact,
@@ -92,7 +93,19 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
 _OF_IMAGES = "images", "source", "reprojection", "residual", "mask", "chi2", "brightness"
 _OF_BASINS = "objective", "chi2", "distance", "displacement"
 _LINEAR_ENOUGH, _SPREAD_ENOUGH = 0.5, 0.3
-_ATTRIBUTES = ("options", "instrument", "report", "verdict", "explanation", "folded", "setups")
+_WORDS = "reason", "advice", "explanation"  # of the assessment
+_ATTRIBUTES = ("options", "instrument", "report", "verdict", *_WORDS, "folded", "setups")
+_REPORT = "verdict", "errors", "error_limited_by", "error_measure_next", "residual"
+
+# What makes a part of the errors smaller.
+_MEASURE = "measure the {}, or add an image at another energy"
+_REMEDIES = {
+    "noise": "average shots, or take images at energies that differ more",
+    "other_field": "fit both fields, with images at more energies",
+    "registration": "align the images by marks on each of them",
+    "edge": "record a larger field of view",
+    "beam": "record a reference",
+}
 
 
 @dataclass(frozen=True)
@@ -239,8 +252,8 @@ class FitReport:
         if np.isnan(self.nonlinearity):
             return ""
         return (
-            f"to first order, samples differ from fitted ones by {self.nonlinearity:.0%} of their "
-            f"change, and fitted ones scatter {to_figures(self.spread_ratio)} times as far"
+            f"to first order, samples differ from fitted ones by {percent(self.nonlinearity)} of "
+            f"their change, and fitted ones scatter {to_figures(self.spread_ratio)} times as far"
         )
 
     @property
@@ -253,6 +266,12 @@ class FitReport:
     def ranking(self) -> str:
         """The parts as shares of the displacement, the largest first."""
         return ", ".join(f"{TITLES[key]} {percent(share)}" for key, share in self.parts.items())
+
+    @property
+    def next_step(self) -> str:
+        """A remedy for the largest part."""
+        largest = next(iter(self.parts), "noise")
+        return _REMEDIES.get(largest, _MEASURE).format(TITLES[largest])
 
     @property
     def error_name(self) -> str:
@@ -306,10 +325,8 @@ class Fit(Summarised):
         Where the starts have led, the best first.
     folded : float
         Share of the pixels whose rays have crossed others, in the image where it is largest.
-    verdict : Verdict
-        Whether the fields may be believed.
-    explanation : str
-        Why, in a sentence.
+    assessment : Assessment
+        Whether the fields may be believed, and why.
     report : FitReport
         Time and convergence.
     options : FitOptions
@@ -337,13 +354,22 @@ class Fit(Summarised):
     noise: FloatArray
     basins: tuple[Basin, ...]
     folded: float
-    verdict: Verdict
-    explanation: str
+    assessment: Assessment
     report: FitReport
     options: FitOptions
     instrument: Instrument = dataclasses.field(default_factory=Instrument)
     setups: tuple[Setup, ...] = ()
     provenance: Provenance | None = None
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the fields may be believed."""
+        return self.assessment.verdict
+
+    @property
+    def explanation(self) -> str:
+        """Why, in a sentence."""
+        return self.assessment.explanation
 
     @property
     def normalised_residual(self) -> FloatArray:
@@ -373,14 +399,17 @@ class Fit(Summarised):
         return f"{TITLES[key]} {percent(share)}"
 
     def _error_facts(self) -> Iterator[Fact]:
-        """The errors of the displacement, and its sensitivity to what is not stated."""
+        """The errors of the displacement, and its sensitivity to numbers that are not stated."""
         report = self.report
         if np.isnan(report.total):
             return
-        text = f"{percent(report.total)} of the displacement (r.m.s.): {report.ranking}"
+        text = f"{percent(report.total)} of the displacement (r.m.s.)"
         if report.noise_correlation > 0:
             text += f"; noise is correlated over {report.noise_correlation:.1f} px"
         yield error_fact("errors", text)
+        yield error_fact("limited by", report.ranking)
+        is_condition = self.verdict.level is Level.CONDITIONAL
+        yield error_fact("measure next", self.explanation if is_condition else report.next_step)
         if report.numbers:
             numbers = "; ".join(number_text(*each) for each in report.numbers.items())
             yield error_fact("instrument", numbers)
@@ -430,16 +459,10 @@ class Fit(Summarised):
     @property
     def headline(self) -> Headline:
         """The peaks of the fields, the verdict and the warnings in one line."""
-        level = Level.DOUBTFUL if self.cautions else self.verdict.level
-        texts = []
-        if self.verdict.level is not Level.CONDITIONAL:  # whose explanation is the peak
-            peaks = (self._shown_peak(field, self.setup) for field in self.fields)
-            texts = [shown.short_peak_text(error) for shown, error in peaks]
-        texts += [self.explanation, *in_headline(self.warnings)]
-        if not self.report.converged:
-            level = Level.FAILED
-            texts.append(f"not converged in {self.report.iterations} steps")
-        return Headline(level, "; ".join(texts), self.verdict)
+        shown = (self._shown_peak(field, self.setup) for field in self.fields)
+        peaks = [peak.short_peak_text(error) for peak, error in shown]
+        converged = self.report.converged
+        return Headline.of(peaks, self.assessment, self.warnings, converged=converged)
 
     @property
     def facts(self) -> tuple[Fact, ...]:
@@ -454,16 +477,27 @@ class Fit(Summarised):
         names : sequence of str
             A name for each image, or none.
         """
-        return (
+        numbers = ", ".join(to_figures(chi2, 3) for chi2 in self.chi2)
+        fields = [fact for field in self.fields for fact in self._field_facts(field)]
+        facts = (
             verdict_fact(self.verdict),
             *caution_facts(self.warnings),
-            *self._image_facts(names),
-            *(self._field_fact(field) for field in self.fields),
-            *self._significance_facts(),
+            *self._why(),
+            *fields,
             *self._error_facts(),
+            Fact("residual", "Residual", f"χ² {numbers}, where 1 is expected"),
+            *self._significance_facts(),
+            *self._image_facts(names),
             *self._solution_facts(),
             time_fact(self.report.seconds),
         )
+        return folded(facts, (*(f"field_{field.name}" for field in self.fields), *_REPORT))
+
+    def _why(self) -> Iterator[Fact]:
+        """The explanation if it says more than the headline and the errors."""
+        level = self.verdict.level
+        if level is not Level.CONDITIONAL and self.explanation != self.assessment.short:
+            yield Fact("why", "Why", self.explanation, level)
 
     def pixel_errors(self, field: FittedField) -> PixelErrors | None:
         """Return the total error of a field in every pixel with its causes; None if not known."""
@@ -565,13 +599,13 @@ class Fit(Summarised):
         (shown,) = shown_fields([field.displacement], frame, deflector, mask=self.used)
         return shown, self.peak_error(field, shown)
 
-    def _field_fact(self, field: FittedField) -> Fact:
+    def _field_facts(self, field: FittedField) -> Iterator[Fact]:
         setup, deflector = self.setup, deflector_titles()[field.name]
         (_, error), (_, field_error) = (self._shown_peak(field, frame) for frame in (None, setup))
         errors = {"error": error, "field_error": field_error}
         peaks = peak_facts(field.displacement, setup, deflector, mask=self.used, **errors)
-        text = "; ".join(fact.text for fact in peaks)
-        return Fact(f"field_{field.name}", f"Field {field.name}", text)
+        for key, peak in zip(("field", "displacement"), peaks, strict=False):
+            yield Fact(f"{key}_{field.name}", f"{key.capitalize()} {field.name}", peak.text)
 
     def _solution_facts(self) -> Iterator[Fact]:
         best, *alternatives = self.basins
@@ -615,7 +649,7 @@ class Fit(Summarised):
             "instrument": self.instrument.model_dump_json(),
             "report": json.dumps(dataclasses.asdict(self.report)),
             "verdict": self.verdict.value,
-            "explanation": self.explanation,
+            **{name: getattr(self.assessment, name) for name in _WORDS},
             "folded": self.folded,
             "fields": json.dumps(names),
             "setups": json.dumps([each.model_dump(mode="json") for each in self.setups]),
@@ -682,8 +716,12 @@ class Fit(Summarised):
             frames=arrays["frame"],
             basins=tuple(basins),
             folded=float(attributes["folded"]),
-            verdict=Verdict(attributes["verdict"]),
-            explanation=str(attributes["explanation"]),
+            assessment=Assessment(
+                Verdict(attributes["verdict"]),
+                reason=str(attributes["reason"]),
+                advice=str(attributes["advice"]),
+                explanation=str(attributes["explanation"]),
+            ),
             report=FitReport(**{name: content[name] for name in entries & content.keys()}),
             options=FitOptions.model_validate_json(attributes["options"]),
             instrument=Instrument.model_validate_json(attributes["instrument"]),

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting.conjugate_gradients import product
 from napari_shadowinv.fitting.exploration import Openness
 from napari_shadowinv.fitting.forward import Scene
@@ -137,8 +137,7 @@ def summarise(
         chi2=data.noise.relative_chi2(scene.chi2(unknowns, counts)),
         basins=basins,
         folded=float((jacobian < 0).mean()),
-        verdict=Verdict.UNCERTAIN,
-        explanation="",
+        assessment=Assessment(Verdict.UNCERTAIN, ""),
         report=_with_shares(report, errors, displacements),
         options=options,
         instrument=data.instrument,
@@ -155,8 +154,7 @@ def summarise(
         searched=data.near is None,
         noise=data.noise,
     )
-    verdict, explanation = assess_verdict(evidence)
-    return replace(unassessed, verdict=verdict, explanation=explanation)
+    return replace(unassessed, assessment=assess_verdict(evidence))
 
 
 def report_of(

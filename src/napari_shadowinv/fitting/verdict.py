@@ -14,13 +14,13 @@ import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.facts import Verdict, to_figures
+from napari_shadowinv.facts import Assessment, Verdict, percent, to_figures
 from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.measurements import NoiseMatch
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
-from napari_shadowinv.physics.edge import edge_doubt
+from napari_shadowinv.physics.edge import beyond_sides, edge_doubt
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import Condition, shown_fields
 
@@ -72,13 +72,6 @@ def hidden_contrast(
 MISFIT_CHI2 = 1.3
 """χ² of an image beyond which the model does not explain it."""
 _UNDERESTIMATED = {"blur", "gamma", "absorption"}
-_MEASURE = "measure the {}, or add an image at another energy, which shows more of it"
-_ADVICE = {
-    "noise": "average shots, or take images at energies that differ more",
-    "other_field": "fit both fields, with images at more energies",
-    "registration": "align the images by marks on each of them",
-    "edge": "record a larger field of view",
-}
 
 
 @dataclass(frozen=True)
@@ -194,52 +187,68 @@ class Evidence:
         return self.safety * self.fit.report.total > self.fit.options.max_error
 
 
-Answer = tuple[Verdict, str] | None
+Answer = Assessment | None
 
 
-def assess_verdict(evidence: Evidence) -> tuple[Verdict, str]:
-    """Return the verdict on a fit, and a sentence that says why, by the first rule that applies."""
+def assess_verdict(evidence: Evidence) -> Assessment:
+    """Return the assessment of a fit by the first rule that applies."""
     answers = (rule(evidence) for rule in _RULES)
-    return next(filter(None, answers), (Verdict.DETERMINED, _why_determined(evidence)))
+    return next(filter(None, answers), None) or _determined(evidence)
 
 
 def _not_explained(case: Evidence) -> Answer:
     chi2, pattern = case.fit.chi2, case.pattern
-    worst = _those(case.names, chi2, chi2 > MISFIT_CHI2)
-    if not worst:
+    misfits = chi2 > MISFIT_CHI2
+    if not misfits.any():
         return None
     causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
     if len(chi2) > 1:
         causes = f"the object may have changed between images, or energies, {causes}"
     causes = _cause_text(pattern) or causes
     # An object that the edge cuts is explained by nothing within it, but nearly.
-    is_near = chi2.max() < case.limits.chi2_at_edge and not pattern.cause
-    verdict = Verdict.EDGE if case.at_edge and is_near else Verdict.MISFIT
-    misfit = f"the forward model does not explain {worst}, where 1 is expected"
-    return verdict, f"{misfit}: {causes if verdict is Verdict.MISFIT else case.at_edge}"
+    if case.at_edge and chi2.max() < case.limits.chi2_at_edge and not pattern.cause:
+        verdict, causes = Verdict.EDGE, case.at_edge
+    else:
+        verdict = Verdict.MISFIT
+    worst = case.names[int(np.argmax(chi2))]
+    return Assessment(
+        verdict,
+        f"the model does not explain {worst} (χ² {to_figures(chi2.max())})",
+        _short_cause(case, verdict),
+        f"the forward model does not explain {_those(case.names, chi2, misfits)}, where 1 is "
+        f"expected: {causes}",
+    )
 
 
 def _beam_or_object(case: Evidence) -> Answer:
     if not (case.single and case.beam_unknown):
         return None
-    return Verdict.AMBIGUOUS, (
+    return Assessment(
+        Verdict.AMBIGUOUS,
+        "one image cannot tell the beam from the object",
+        "take another energy, or an image of the beam",
         "one image cannot tell the beam from the object: many pairs of them explain it; take "
-        "another energy, or an image of the beam"
+        "another energy, or an image of the beam",
     )
 
 
 def _likely_cause(case: Evidence) -> Answer:
     if not case.pattern.cause or case.pattern.is_certain:
         return None
-    return Verdict.MISFIT, f"the images do not look like the model: likely {case.pattern.cause}"
+    reason = "the images do not look like the model"
+    why = f"{reason}: likely {case.pattern.cause}"
+    return Assessment(Verdict.MISFIT, reason, _short_cause(case, Verdict.MISFIT), why)
 
 
 def _rays_lost(case: Evidence) -> Answer:
     if not case.single or (lost := _share_lost(case.displacement)) <= case.limits.lost_rays:
         return None
-    return Verdict.AMBIGUOUS, (
-        f"the object sends {lost:.0%} of the rays past the image, and one image does not show "
-        "which; record a larger field of view, or take another energy"
+    return Assessment(
+        Verdict.AMBIGUOUS,
+        f"{percent(lost)} of the rays miss the image",
+        "record a larger field of view, or another energy",
+        f"the object sends {percent(lost)} of the rays past the image, and one image does not show "
+        "which; record a larger field of view, or take another energy",
     )
 
 
@@ -249,10 +258,13 @@ def _rays_meet(case: Evidence) -> Answer:
     meeting = _share_squeezed(case.jacobian, case.displacement, case.limits.meeting)
     if meeting <= case.limits.few:
         return None
-    return Verdict.AMBIGUOUS, (
-        f"rays meet or cross over {meeting:.0%} of the object, and one image does not show "
+    return Assessment(
+        Verdict.AMBIGUOUS,
+        f"rays meet or cross over {percent(meeting)} of the object",
+        "take another energy",
+        f"rays meet or cross over {percent(meeting)} of the object, and one image does not show "
         "which came from where: the same bright lines come from fields with other folds; take "
-        "another energy"
+        "another energy",
     )
 
 
@@ -262,25 +274,34 @@ def _pattern_left(case: Evidence) -> Answer:
     # An object that the edge cuts leaves a pattern, too.
     verdict = Verdict.EDGE if case.at_edge else Verdict.MISFIT
     texts = [case.at_edge, _pattern_text(case.pattern, case.names)]
-    return verdict, "; ".join(filter(None, texts))
+    reason = "the residual has a pattern"
+    if verdict is Verdict.EDGE:
+        reason = f"the object goes on {beyond_sides(case.fit.report.sides)}"
+    return Assessment(verdict, reason, _short_cause(case, verdict), "; ".join(filter(None, texts)))
 
 
 def _counts_missing(case: Evidence) -> Answer:
     pattern = case.pattern
     if not pattern.lacks_counts or pattern.missing_counts <= case.limits.missing_counts:
         return None
-    share = f"{pattern.missing_counts:.0%}"
-    return Verdict.UNCERTAIN, (
+    share = percent(pattern.missing_counts)
+    return Assessment(
+        Verdict.UNCERTAIN,
+        f"the noise is {share} smaller than of as many counts",
+        "subtract the dark level, or give the noise",
         f"the noise is {share} smaller than that of as many counts: a dark level of about "
         f"{share} seems to be left in the images, or the detector's response is not linear, "
         "and either weakens the field; subtract the dark level from images and source, "
         "linearise the images, or, if the counts were averaged, scaled or "
-        "smoothed, give their noise"
+        "smoothed, give their noise",
     )
 
 
 def _beyond_edge(case: Evidence) -> Answer:
-    return (Verdict.EDGE, case.at_edge) if case.at_edge else None
+    if not case.at_edge:
+        return None
+    reason = f"the object goes on {beyond_sides(case.fit.report.sides)}"
+    return Assessment(Verdict.EDGE, reason, _short_cause(case, Verdict.EDGE), case.at_edge)
 
 
 def _other_answers(case: Evidence) -> Answer:
@@ -293,53 +314,62 @@ def _other_answers(case: Evidence) -> Answer:
     ]
     if not rivals:
         return None
-    return Verdict.SEVERAL, (
+    return Assessment(
+        Verdict.SEVERAL,
+        f"{len(rivals) + 1} fields, up to {percent(max(rivals))} apart, explain the data",
+        "take another energy",
         f"{len(rivals) + 1} different fields explain the data about as well; they differ by "
-        f"up to {max(rivals):.0%} (r.m.s.); take another energy, or compare them with what is "
-        "known"
+        f"up to {percent(max(rivals))} (r.m.s.); take another energy, or compare them with what is "
+        "known",
     )
 
 
 def _errors_large(case: Evidence) -> Answer:
     if case.condition or not case.is_too_uncertain:
         return None
-    total, parts = case.fit.report.total, case.fit.report.parts
-    ranking = ", ".join(f"{TITLES[key]} {share:.1%}" for key, share in parts.items())
-    text = f"errors of {total:.1%} of the displacement (r.m.s.): {ranking}; "
-    if total <= case.fit.options.max_error:
+    report, explanation = case.fit.report, ""
+    if report.total <= case.fit.options.max_error:
         small = f"with fewer than {SMALL_PX} px along a side"
         where = small if case.is_small else "where these are fitted"
-        text += f"{where}, errors can be {case.safety:.2g} times as large; "
-    largest = next(iter(parts))
-    return Verdict.UNCERTAIN, text + _ADVICE.get(largest, _MEASURE).format(TITLES[largest])
+        explanation = f"{where}, errors can be {case.safety:.2g} times as large"
+    return Assessment(Verdict.UNCERTAIN, _limited(case), report.next_step, explanation)
 
 
 def _noise_unmeasured(case: Evidence) -> Answer:
     if not (case.single and case.noise is not None and case.noise.is_hidden):
         return None
-    return Verdict.UNCERTAIN, (
+    return Assessment(
+        Verdict.UNCERTAIN,
+        "structure fills the image and hides the noise",
+        "give the noise and its correlation",
         "the noise was not measured: structure fills the image, and noise that is correlated "
         "over a few pixels looks like it; give the noise, and its correlation if the image was "
-        "smoothed or resampled"
+        "smoothed or resampled",
     )
 
 
 def _search_unfinished(case: Evidence) -> Answer:
     if case.fit.report.converged:
         return None
-    return Verdict.UNCERTAIN, (
-        "the search reached its maximum number of iterations before it ended: allow more"
+    return Assessment(
+        Verdict.UNCERTAIN,
+        f"not converged in {case.fit.report.iterations} steps",
+        "allow more",
+        "the search reached its maximum number of iterations before it ended: allow more",
     )
 
 
 def _object_masked(case: Evidence) -> Answer:
     if case.hidden <= case.limits.hidden:
         return None
-    return Verdict.UNCERTAIN, (
-        f"the mask hides part of the object where its image has {case.hidden:.0%} of its strongest "
-        "contrast: folds beneath were not seen, the field there is the smoothest that the "
-        "surroundings allow, and the error bars do not include that; unmask what is sound, or "
-        "add an image in which it is seen"
+    return Assessment(
+        Verdict.UNCERTAIN,
+        "the mask hides part of the object",
+        "unmask it, or add an image",
+        f"the mask hides part of the object where its image has {percent(case.hidden)} of its "
+        "strongest contrast: folds beneath were not seen, the field there is the smoothest that "
+        "the surroundings allow, and the error bars do not include that; unmask what is sound, or "
+        "add an image in which it is seen",
     )
 
 
@@ -350,9 +380,7 @@ def _conditional(case: Evidence) -> Answer:
     field = fit.fields[0]
     deflector = deflector_titles()[field.name]
     (shown,) = shown_fields([field.displacement], fit.setup, deflector, mask=fit.used)
-    is_detector = condition.subject == "detector"
-    verdict = Verdict.DETECTOR if is_detector else Verdict.CONDITIONAL
-    return verdict, shown.conditional_text(condition)
+    return shown.conditional(condition)
 
 
 _RULES = (
@@ -373,7 +401,23 @@ _RULES = (
 )
 
 
-def _why_determined(case: Evidence) -> str:
+def _limited(case: Evidence) -> str:
+    """The largest part of the errors, with their total; "" if there are none."""
+    report = case.fit.report
+    if not (report.parts and np.isfinite(report.total)):
+        return ""
+    return f"limited by {TITLES[next(iter(report.parts))]} (errors {percent(report.total)})"
+
+
+def _short_cause(case: Evidence, verdict: Verdict) -> str:
+    """The likely cause of a misfit, or a check, in a few words."""
+    if verdict is Verdict.EDGE:
+        return "record a larger field of view"
+    cause = case.pattern.cause.partition(":")[0]
+    return f"likely {cause}" if cause else "check noise, source and point spread"
+
+
+def _determined(case: Evidence) -> Assessment:
     fit, pattern, noise, chi2 = case.fit, case.pattern, case.noise, case.fit.chi2
     unchecked = "" if np.isfinite(fit.report.total) else "; error bars were not worked out"
     if pattern.correlation > 0:
@@ -389,9 +433,12 @@ def _why_determined(case: Evidence) -> str:
     several = "one image" if case.single else f"{len(chi2)} images"
     starts = "all starts lead to" if case.searched else "the given start leads to"
     unchecked += "" if case.searched else "; alternative solutions were not looked for"
-    return (
+    return Assessment(
+        Verdict.DETERMINED,
+        _limited(case) or "error bars were not worked out",
+        "",
         f"{starts} one field, which explains {several} to the noise (χ² "
-        f"{np.min(chi2):.2f} to {np.max(chi2):.2f}){unchecked}"
+        f"{np.min(chi2):.2f} to {np.max(chi2):.2f}){unchecked}",
     )
 
 

@@ -45,7 +45,7 @@ from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Summarised, to_figures
+from napari_shadowinv.facts import Summarised, percent, to_figures
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.inversion._invert import invert, plan_sites
 from napari_shadowinv.inversion.imperfections import InstrumentDraws, LitObject, RecordedShot
@@ -630,7 +630,7 @@ def _doubts(
         cause = "noise and instrument" if has_instrument else "noise"
         text = (
             f"the response to {cause} is not linear: samples that were solved differ by "
-            f"{nonlinearity:.0%} of what these change; use the method 'resolve'"
+            f"{percent(nonlinearity)} of what these change; use the method 'resolve'"
         )
         warnings = (Caution("samples", text), *warnings)
     if failed := converged.count(False):

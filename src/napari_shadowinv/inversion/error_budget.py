@@ -180,11 +180,6 @@ class Errors:
         return share_of(self.total.rms, self.rms)
 
     @property
-    def largest_part(self) -> str:
-        """Largest part with its share, such as "beam 23 % (5 % rms over a quarter, assumed)"."""
-        return self._part_text(next(iter(self.parts)))
-
-    @property
     def ranking(self) -> str:
         """The parts as shares of the displacement (r.m.s.), the largest first."""
         return ", ".join(map(self._part_text, self.parts))
@@ -234,14 +229,17 @@ class Errors:
             subject="reference" if is_reference else "beam",
         )
 
-    def measured_text(self, subject: str) -> str:
-        """Return the measured errors, and the largest one if it was assumed."""
+    @property
+    def reason(self) -> str:
+        """The largest measured part, and the largest of all if that was assumed."""
         measured = self._measured
         if measured.parts.get("edge") != self.parts.get("edge"):  # the beam explains some of it
             measured = self
-        text = f"errors of {measured.share_text} of the {subject} (r.m.s.): {measured.largest_part}"
-        is_same = next(iter(measured.parts)) == next(iter(self.parts))
-        return text if is_same else f"{text}, and {self.largest_part}"
+        first, largest = (next(iter(each.parts)) for each in (measured, self))
+        text = f"limited by {self._title(first)} (errors {measured.share_text}"
+        if first == largest:
+            return f"{text})"
+        return f"{text}) and {self._title(largest)} (assumed, {self.share_text})"
 
     def measure_next(self, share: float) -> str:
         """Return what has to be known better for a total of at most `share`, and that total.
@@ -254,7 +252,7 @@ class Errors:
         Returns
         -------
         str
-            Such as "with the beam known to 0.5 %: 12 %"; empty if the total is no larger.
+            Such as "the beam known to 0.5 % for errors of 12 %"; empty if the total is no larger.
         """
         if not self.rms > 0:
             return ""
@@ -277,7 +275,7 @@ class Errors:
         total = math.sqrt(sum(squares.values()))
         *others, last = statements
         listed = f"{', '.join(others)} and {last}" if others else last
-        return f"with {listed}: {share_of(total, self.rms)}"
+        return f"{listed} for errors of {share_of(total, self.rms)}"
 
     def _statement(self, name: str, factor: float) -> tuple[str, float]:
         """Return what reduces a part by a factor, in round numbers, and their factor."""
@@ -331,15 +329,18 @@ class Errors:
         effects = {**self.effects, cause: ErrorEstimate(self.rms, self.peak).times(share)}
         return replace(self, effects=effects, sizes={**self.sizes, cause: size})
 
-    def rows(self, subject: str = "displacement") -> list[tuple[str, str]]:
-        """Describe the budget of a subject in words: names and texts."""
+    def rows(self, subject: str = "displacement", *, rough: float = 0.5) -> list[tuple[str, str]]:
+        """Describe the budget of a subject in words: names and texts.
+
+        A total above `rough`, as a share of it, is said to be rough.
+        """
         of_subject = f" of the {subject}" if self.rms > 0 else ""
-        text = (
-            f"{self.share_text}{of_subject} (r.m.s.): {self.ranking}; crossing rays are not in it"
-        )
+        text = f"{self.share_text}{of_subject} (r.m.s.); crossing rays are not in it"
+        if self.rms > 0 and self.share > rough:
+            text += "; errors this large are rough, as they are not proportional to their causes"
         if math.isnan(self.discretisation.rms):
             text += "; discretisation was not estimated, as only one level was solved"
-        rows = [("errors", text)]
+        rows = [("errors", text), ("limited by", self.ranking)]
         if next_step := self.measure_next(self.share / 2):
             rows.append(("measure next", next_step))
         basis = "exact" if self.beam is None else self._beam_name.removeprefix("beam ")

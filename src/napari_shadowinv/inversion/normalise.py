@@ -20,6 +20,7 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.preprocessing.image_checks import mask_dark, mask_gaps
 
@@ -235,20 +236,21 @@ def _warnings(
         )
         cautions.append(Caution("flux", text))
     if clipped > _NOTABLE_RAISED * size:
-        text = f"negative pixels set to zero: {clipped} ({clipped / size:.2%})"
+        text = f"negative pixels set to zero: {clipped} ({percent(clipped / size)})"
         cautions.append(Caution("negative-pixels", text))
     dark = floored - clipped  # but for as many as the source has
     if dark > _NOTABLE_RAISED * size:
         text = (
-            f"dark pixels raised to the floor: {dark} ({dark / size:.2%}); "
+            f"dark pixels raised to the floor: {dark} ({percent(dark / size)}); "
             "the field inside dark areas is not reliable"
         )
         cautions.append(Caution("dark-pixels", text))
     excluded = 1 - float(usable.mean())
     if excluded >= _NOTABLE_MASK:
         text = (
-            f"the mask excludes {excluded:.1%} of the pixels: the field there is only a smooth "
-            "continuation. To hide the object from a source estimate, use a source mask instead"
+            f"the mask excludes {percent(excluded)} of the pixels: the field there is only a "
+            "smooth continuation. To hide the object from a source estimate, use a source mask "
+            "instead"
         )
         if excluded > _MOSTLY_MASKED:
             text += "; in NeXus pixel masks 0 is usable: invert such a mask"

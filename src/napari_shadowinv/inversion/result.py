@@ -1,4 +1,7 @@
-"""The result of an inversion, `Inversion` with a `Report`, and a field alone, `RetrievedField`."""
+"""The result of an inversion, `Inversion` with a `Report`, and a field alone, `RetrievedField`.
+
+The result in words, in the units of a setup: `InversionInUnits`.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -17,6 +20,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import (
+    Assessment,
     Fact,
     Headline,
     Level,
@@ -25,7 +29,7 @@ from napari_shadowinv.facts import (
     Verdict,
     caution_facts,
     error_fact,
-    in_headline,
+    folded,
     masked_fact,
     percent,
     time_fact,
@@ -42,21 +46,25 @@ from napari_shadowinv.inversion.variables import (
     setup_from_dataset,
 )
 from napari_shadowinv.options import Instrument, InversionOptions
+from napari_shadowinv.physics.edge import beyond_sides
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.significance import (
     PixelErrors,
     Structures,
-    significance_fact,
+    significance_facts,
     structures_of,
 )
-from napari_shadowinv.physics.units import label, numbers_of, peak_facts, shown_fields
+from napari_shadowinv.physics.units import ShownField, label, numbers_of, peak_facts, shown_fields
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     import xarray
 
-# Fields with other beams against the linear response: 5 to 20 % of the change up to this error.
-_MAX_LINEAR = 0.5  # of the displacement, r.m.s.
+_MOST_ADVICE = 12  # words
+_REPORT = (  # keys of the rows of a report
+    *("verdict", "field", "displacement", "image_residual"),
+    *("errors", "error_noise", "error_limited_by", "error_measure_next"),
+)
 
 
 @dataclass(frozen=True)
@@ -119,14 +127,6 @@ class Report:
     image_residual: float
     sites_reason: str = ""
     errors: Errors | None = None
-
-
-class Assessment(NamedTuple):
-    """Verdict on an inversion, its reason, and the caution that decided it, if one did."""
-
-    verdict: Verdict
-    reason: str
-    caution: Caution | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -208,24 +208,6 @@ class Inversion(Summarised):
         """Error budget of the displacement; see `Report`."""
         return self.report.errors
 
-    def errors_in(self, setup: Setup | None) -> Errors | None:
-        """Return the error budget of the main field of a setup, px of displacement.
-
-        Parameters
-        ----------
-        setup : Setup or None
-            Its beam's energy scales the field, whose error adds to the others. None: the budget of
-            the displacement.
-        """
-        error = self.instrument.energy
-        if self.errors is None or setup is None or not error:
-            return self.errors
-        share = error * abs(setup.sensitivity_to_beam(setup.main_field.name))
-        if not share:
-            return self.errors
-        noun = setup.beam_quantity().noun
-        return self.errors.with_scale(f"{noun}, {percent(error)}", error, share)
-
     @property
     def total_error(self) -> float | None:
         """Total error as a share of the displacement (r.m.s.); None if not estimated."""
@@ -255,26 +237,6 @@ class Inversion(Summarised):
             return None
         return structures_of(self.displacement, errors, self.mask, element=element)
 
-    def _subject(self, errors: Errors) -> str:
-        return "displacement" if errors is self.errors else "field"
-
-    def _error_rows(self, errors: Errors | None) -> list[tuple[str, str]]:
-        """Describe an error budget in words: names and texts."""
-        if errors is None:
-            return []
-        rows = errors.rows(self._subject(errors))
-        steps = () if self.provenance is None else self.provenance.recipe.steps
-        smoothing = [step.title for step in steps if step.smooths]
-        is_stated = (self.options.noise_level, self.options.units_per_quantum) != (None, None)
-        if smoothing and not is_stated and not errors.noise_correlation:
-            caveat = (
-                f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
-                "error is larger than stated; give the noise level, or units per quantum, of the "
-                "recorded image"
-            )
-            rows.append(("noise", caveat))
-        return rows
-
     @property
     def setup(self) -> Setup | None:
         """Geometry of the pixels, if the provenance contains it."""
@@ -283,128 +245,32 @@ class Inversion(Summarised):
     @property
     def verdict(self) -> Verdict:
         """Whether the field is known within the largest error of the options."""
-        return self.assess_in(self.setup).verdict
-
-    def assess_in(self, setup: Setup | None) -> Assessment:
-        """Return the verdict on the main field of a setup, with its reason.
-
-        Parameters
-        ----------
-        setup : Setup or None
-            None: the verdict on the displacement.
-        """
-        by_code = {caution.code: caution for caution in reversed(self.report.warnings)}
-        if not self.report.converged:
-            reason = "not converged: do not trust the field"
-            return Assessment(Verdict.UNCERTAIN, reason, by_code.get("not-converged"))
-        for code, verdict in DECISIVE.items():
-            if code in by_code:
-                reason = by_code[code].text if verdict is Verdict.EDGE else by_code[code].short
-                return Assessment(verdict, reason, by_code[code])
-        errors, max_error = self.errors_in(setup), self.options.max_error
-        if errors is None:
-            return Assessment(Verdict.UNCERTAIN, "errors were not worked out")
-        if not errors.rms > 0:
-            return Assessment(Verdict.UNCERTAIN, "there is no displacement to compare errors with")
-        text = f"errors of {errors.share_text} of the {self._subject(errors)} (r.m.s.)"
-        if errors.share <= max_error:
-            return Assessment(Verdict.DETERMINED, f"{text}, limited by {errors.limited_by}")
-        if condition := errors.condition(max_error):
-            (field,) = shown_fields([self.displacement], setup, mask=self.lit)
-            return Assessment(Verdict.CONDITIONAL, field.conditional_text(condition))
-        parts = [errors.measured_text(self._subject(errors)), errors.measure_next(max_error)]
-        if errors.share > _MAX_LINEAR:
-            parts.append(
-                "errors this large are not proportional to their causes, so they are rough"
-            )
-        return Assessment(Verdict.UNCERTAIN, "; ".join(filter(None, parts)))
+        return self.in_units(self.setup).assessment.verdict
 
     @property
     def headline(self) -> Headline:
-        """The peak of the main field, the verdict and the warnings in one line."""
-        return self.headline_in(self.setup)
-
-    def headline_in(self, setup: Setup | None) -> Headline:
-        """Return the headline in the units of a setup.
-
-        Parameters
-        ----------
-        setup : Setup or None
-            Gives the main field in SI units; None the displacement in px.
-        """
-        errors = self.errors_in(setup)
-        error = None if errors is None else errors.of_peak
-        (field,) = shown_fields([self.displacement], setup, mask=self.lit)
-        (verdict, reason, caution), cautions = self.assess_in(setup), self.report.warnings
-        # The reason of a condition is the peak.
-        texts = [] if verdict is Verdict.CONDITIONAL else [field.short_peak_text(error)]
-        texts += [reason, *in_headline(each for each in cautions if each is not caution)]
-        level = Level.DOUBTFUL if cautions else verdict.level
-        if not self.report.converged:
-            level = Level.FAILED
-        return Headline(level, "; ".join(texts), verdict)
+        """The peak of the main field, its limit, and the next step."""
+        return self.in_units(self.setup).headline
 
     @property
     def facts(self) -> tuple[Fact, ...]:
         """The result in words, as every face shows it below the headline."""
-        return self.facts_in(self.setup)
+        return self.in_units(self.setup).facts
 
-    def facts_in(self, setup: Setup | None) -> tuple[Fact, ...]:
-        """Return the facts in the units of a setup.
+    def in_units(self, setup: Setup | None) -> InversionInUnits:
+        """Return errors, assessment, headline and facts in the units of a setup.
 
         Parameters
         ----------
         setup : Setup or None
-            Gives the main field in SI units; None the displacement in px.
+            Gives the main field in SI units, and the error of its energy; None the displacement in
+            px.
+
+        Returns
+        -------
+        InversionInUnits
         """
-        report, errors = self.report, self.errors_in(setup)
-        error_of_peak = None if errors is None else errors.of_peak
-        flows = {
-            "flux_left": ("Flux left", report.flux_left),
-            "flux_entered": ("Flux entered", report.flux_entered),
-        }
-        details = {
-            "sites": f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; "),
-            "iterations": f"{report.iterations} on {len(report.levels)} levels",
-            "floor": f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
-            f"{report.clipped_pixels} clipped",
-        }
-        convergence = Level.SOUND if report.converged else Level.FAILED
-        return (
-            verdict_fact(self.assess_in(setup).verdict),
-            *caution_facts(report.warnings),
-            *peak_facts(self.displacement, setup, mask=self.lit, error=error_of_peak),
-            Fact(
-                "image_residual",
-                "Image residual",
-                f"{percent(report.image_residual)} of the mean (r.m.s.)",
-                short=f"residual {percent(report.image_residual)}",
-            ),
-            *_significance_facts(self.structures, self.pixel_errors),
-            *(error_fact(name, text) for name, text in self._error_rows(errors)),
-            Fact("caustics", "Caustics", f"{percent(self.caustic.mean())} of the pixels"),
-            *masked_fact(self.mask),
-            *(
-                Fact(
-                    key,
-                    title,
-                    ", ".join(f"{side} {percent(share)}" for side, share in flow.items()),
-                )
-                for key, (title, flow) in flows.items()
-                if flow
-            ),
-            Fact(
-                "flux_residual",
-                "Flux residual",
-                f"{to_figures(report.residual)} of a cell, tolerance "
-                f"{to_figures(report.tolerance)}: "
-                f"{'converged' if report.converged else 'NOT converged'}",
-                convergence,
-                short="" if report.converged else "NOT converged",
-            ),
-            *(Fact(key, key.capitalize(), text, is_detail=True) for key, text in details.items()),
-            time_fact(report.seconds),
-        )
+        return InversionInUnits(self, setup)
 
     def with_warnings(self, cautions: Iterable[Caution]) -> Inversion:
         """Return the same inversion with more warnings in its report.
@@ -449,8 +315,9 @@ class Inversion(Summarised):
             setup = self.setup if setup is None else setup
         if self.pixel_errors is not None:
             history["error_causes"] = json.dumps(self.pixel_errors.causes)
-        errors, assessment = self.errors_in(setup), self.assess_in(setup)
-        history |= {"verdict": assessment.verdict.value, "explanation": assessment.reason}
+        in_units = self.in_units(setup)
+        errors, assessment = in_units.errors, in_units.assessment
+        history |= {"verdict": assessment.verdict.value, "explanation": assessment.explanation}
         if errors is not None and setup is not None:
             field = setup.main_field
             (unit,) = (si_field.unit for si_field in setup.si_fields if si_field.name == field.name)
@@ -504,15 +371,161 @@ class Inversion(Summarised):
         )
 
 
+@dataclass(frozen=True)
+class InversionInUnits:
+    """An inversion in the units of a setup.
+
+    Attributes
+    ----------
+    inversion : Inversion
+        The result.
+    setup : Setup or None
+        Gives the main field in SI units, and the error of its energy; None the displacement in px.
+    """
+
+    inversion: Inversion
+    setup: Setup | None
+
+    @property
+    def field(self) -> ShownField:
+        """The main field, where rays start."""
+        (field,) = shown_fields([self.inversion.displacement], self.setup, mask=self.inversion.lit)
+        return field
+
+    @property
+    def errors(self) -> Errors | None:
+        """Error budget of the main field, px of displacement; None if it was not estimated."""
+        errors, setup, error = self.inversion.errors, self.setup, self.inversion.instrument.energy
+        if errors is None or setup is None or not error:
+            return errors
+        share = error * abs(setup.sensitivity_to_beam(setup.main_field.name))
+        if not share:
+            return errors
+        noun = setup.beam_quantity().noun
+        return errors.with_scale(f"{noun}, {percent(error)}", error, share)
+
+    @property
+    def assessment(self) -> Assessment:
+        """Verdict on the main field, its limit, and the next step."""
+        report, max_error = self.inversion.report, self.inversion.options.max_error
+        by_code = {caution.code: caution for caution in reversed(report.warnings)}
+        if not report.converged:
+            caution = by_code.get("not-converged")
+            advice = "do not trust the field"
+            return Assessment(Verdict.UNCERTAIN, "not converged", advice, caution=caution)
+        errors = self.errors
+        for code, (verdict, advice) in DECISIVE.items():
+            if code in by_code:
+                caution = by_code[code]
+                reason = caution.short
+                if code == "edge" and errors is not None and errors.sides:
+                    reason = f"the object goes on {beyond_sides(errors.sides)}"
+                return Assessment(verdict, reason, advice, caution.text, caution)
+        if errors is None:
+            return Assessment(Verdict.UNCERTAIN, "errors were not worked out")
+        if not errors.rms > 0:
+            return Assessment(Verdict.UNCERTAIN, "there is no displacement to compare errors with")
+        if errors.share <= max_error:
+            return Assessment(Verdict.DETERMINED, errors.reason)
+        if condition := errors.condition(max_error):
+            return self.field.conditional(condition)
+        steps = (errors.measure_next(share) for share in (max_error, errors.share / 2))
+        # That of the headline is a short one.
+        advice = next((text for text in steps if len(text.split()) <= _MOST_ADVICE), "")
+        return Assessment(Verdict.UNCERTAIN, errors.reason, advice)
+
+    @property
+    def headline(self) -> Headline:
+        """The peak of the main field, its limit, and the next step."""
+        errors = self.errors
+        error = None if errors is None else errors.of_peak
+        peaks, report = [self.field.short_peak_text(error)], self.inversion.report
+        return Headline.of(peaks, self.assessment, report.warnings, converged=report.converged)
+
+    @property
+    def facts(self) -> tuple[Fact, ...]:
+        """The result in words, as every face shows it below the headline."""
+        inversion = self.inversion
+        report, errors = inversion.report, self.errors
+        error_of_peak = None if errors is None else errors.of_peak
+        flows = {
+            "flux_left": ("Flux left", report.flux_left),
+            "flux_entered": ("Flux entered", report.flux_entered),
+        }
+        details = {
+            "sites": f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; "),
+            "iterations": f"{report.iterations} on {len(report.levels)} levels",
+            "floor": f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
+            f"{report.clipped_pixels} clipped",
+        }
+        convergence = Level.SOUND if report.converged else Level.FAILED
+        assessment, error_rows = self.assessment, dict(self._error_rows(errors))
+        if assessment.verdict is Verdict.CONDITIONAL:
+            error_rows["measure next"] = assessment.explanation
+        facts = (
+            verdict_fact(assessment.verdict),
+            *caution_facts(report.warnings),
+            *peak_facts(
+                inversion.displacement, self.setup, mask=inversion.lit, error=error_of_peak
+            ),
+            *(error_fact(name, text) for name, text in error_rows.items()),
+            Fact(
+                "image_residual",
+                "Image residual",
+                f"{percent(report.image_residual)} of the mean (r.m.s.)",
+                short=f"residual {percent(report.image_residual)}",
+            ),
+            *significance_facts(inversion.structures, inversion.pixel_errors),
+            Fact("caustics", "Caustics", f"{percent(inversion.caustic.mean())} of the pixels"),
+            *masked_fact(inversion.mask),
+            *(
+                Fact(
+                    key,
+                    title,
+                    ", ".join(f"{side} {percent(share)}" for side, share in flow.items()),
+                )
+                for key, (title, flow) in flows.items()
+                if flow
+            ),
+            Fact(
+                "flux_residual",
+                "Flux residual",
+                f"{to_figures(report.residual)} of a cell, tolerance "
+                f"{to_figures(report.tolerance)}: "
+                f"{'converged' if report.converged else 'NOT converged'}",
+                convergence,
+                short="" if report.converged else "NOT converged",
+            ),
+            *(Fact(key, key.capitalize(), text, is_detail=True) for key, text in details.items()),
+            time_fact(report.seconds),
+        )
+        return folded(facts, _REPORT)
+
+    def _subject(self, errors: Errors) -> str:
+        return "displacement" if errors is self.inversion.errors else "field"
+
+    def _error_rows(self, errors: Errors | None) -> list[tuple[str, str]]:
+        """Describe an error budget in words: names and texts."""
+        if errors is None:
+            return []
+        rows = errors.rows(self._subject(errors))
+        provenance, options = self.inversion.provenance, self.inversion.options
+        steps = () if provenance is None else provenance.recipe.steps
+        smoothing = [step.title for step in steps if step.smooths]
+        is_stated = (options.noise_level, options.units_per_quantum) != (None, None)
+        if smoothing and not is_stated and not errors.noise_correlation:
+            caveat = (
+                f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
+                "error is larger than stated; give the noise level, or units per quantum, of the "
+                "recorded image"
+            )
+            rows.append(("noise", caveat))
+        return rows
+
+
 @cache
 def _report_schema() -> TypeAdapter[Report]:
     return TypeAdapter(Report)
-
-
-def _significance_facts(structures: Structures | None, errors: PixelErrors | None) -> list[Fact]:
-    if structures is None or errors is None:
-        return []
-    return [significance_fact(structures, errors)]
 
 
 def _pixel_errors(dataset: xarray.Dataset, name: str) -> PixelErrors | None:
@@ -569,7 +582,7 @@ class RetrievedField(Summarised):
     @property
     def facts(self) -> tuple[Fact, ...]:
         """The peak of the field and its significance in words."""
-        significance = _significance_facts(self.structures, self.pixel_errors)
+        significance = significance_facts(self.structures, self.pixel_errors)
         return (*peak_facts(self.displacement, self.setup), *significance)
 
     @property

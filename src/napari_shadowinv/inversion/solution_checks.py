@@ -49,7 +49,7 @@ from scipy import ndimage
 from napari_shadowinv._system.machine import available_threads, begin, in_ranges
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.facts import Verdict, to_figures
+from napari_shadowinv.facts import Verdict, percent, to_figures
 from napari_shadowinv.geometry.compiler import kernel
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared
@@ -85,15 +85,15 @@ class FoldCheck:
 
 
 DECISIVE = {
-    "misfit": Verdict.MISFIT,
-    "negative": Verdict.UNCERTAIN,
-    "no-deflection": Verdict.UNCERTAIN,
-    "folds": Verdict.AMBIGUOUS,
-    "edge": Verdict.EDGE,
-    "masked-peak": Verdict.UNCERTAIN,
-    "correlated-noise": Verdict.UNCERTAIN,
+    "misfit": (Verdict.MISFIT, "check source, mask and point spread"),
+    "negative": (Verdict.UNCERTAIN, "invert its grey values, or keep it as it is"),
+    "no-deflection": (Verdict.UNCERTAIN, "average more shots"),
+    "folds": (Verdict.AMBIGUOUS, "fit images at two energies"),
+    "edge": (Verdict.EDGE, "record a larger field of view"),
+    "masked-peak": (Verdict.UNCERTAIN, "unmask what is sound"),
+    "correlated-noise": (Verdict.UNCERTAIN, "give the noise level"),
 }
-"""Cautions that decide the verdict, the gravest first."""
+"""Cautions that decide the verdict, the gravest first, and a remedy for each."""
 
 
 def image_residual(image: FloatArray, reprojection: FloatArray, mask: BoolArray) -> float:
@@ -262,7 +262,7 @@ def _misfit(
         )
     return (
         "the picture does not fit: the re-projection misses a pattern in the image, by "
-        f"{share:.0%} of the mean (r.m.s.); do not trust the field: {advice}"
+        f"{percent(share)} of the mean (r.m.s.); do not trust the field: {advice}"
     )
 
 
@@ -283,8 +283,8 @@ def _no_deflection(noise: ImageNoise, rms: float) -> str:
         return ""
     return (
         f"no deflection found: the displacement of {to_figures(rms)} px (r.m.s.) is no larger than "
-        f"the {to_figures(usual)} px expected from the image's noise of {noise.typical:.1%} per "
-        "pixel; average shots, or bin or smooth the image, before interpreting the field"
+        f"the {to_figures(usual)} px expected from the image's noise of {percent(noise.typical)} "
+        "per pixel; average shots, or bin or smooth the image, before interpreting the field"
     )
 
 

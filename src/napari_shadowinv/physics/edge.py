@@ -179,10 +179,21 @@ def edge_doubt(error: float, others: float, largest: float, sides: Sequence[str]
     """
     if error <= max(largest, 2 * others):
         return ""
-    *first, last = sides
-    listed = f"{', '.join(first)} and {last} edges" if first else f"{last} edge"
-    where = f"beyond the {listed}" if len(sides) < len(SIDES) else "beyond the image, on all sides"
     return (
-        f"{percent(error)} of the displacement (r.m.s.) rests on what lies {where}: record a "
-        "larger field of view, or compare closed and free boundaries"
+        f"{percent(error)} of the displacement (r.m.s.) rests on what lies {beyond_sides(sides)}: "
+        "record a larger field of view, or compare closed and free boundaries"
     )
+
+
+def beyond_sides(sides: Sequence[str]) -> str:
+    """Return in words where an object goes on.
+
+    Examples
+    --------
+    >>> beyond_sides(["top", "left"]), beyond_sides(SIDES)
+    ('beyond the top and left edges', 'beyond the image, on all sides')
+    """
+    if len(sides) == len(SIDES):
+        return "beyond the image, on all sides"
+    *first, last = sides
+    return f"beyond the {', '.join(first)} and {last} edges" if first else f"beyond the {last} edge"

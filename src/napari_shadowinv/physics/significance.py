@@ -223,3 +223,10 @@ def significance_fact(
     else:
         reason = f"the field reaches {to_figures(structures.largest)} σ"
     return Fact(key, title, f"{text}: {reason}", Level.DOUBTFUL)
+
+
+def significance_facts(structures: Structures | None, errors: PixelErrors | None) -> list[Fact]:
+    """Return the significance of structures as a fact; none without pixel errors."""
+    if structures is None or errors is None:
+        return []
+    return [significance_fact(structures, errors)]

@@ -34,7 +34,7 @@ from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level, Summarised
+from napari_shadowinv.facts import Fact, Level, Summarised, percent
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
 from napari_shadowinv.physics.forward import checked_shape, synthetic_image, usable_threads
 from napari_shadowinv.physics.particle_flight import (
@@ -156,7 +156,7 @@ class TracedImage(Summarised):
         peaks += [f"∫E dz {field_e:.3g} V"] if field_e else []
         thin = self.thin_screen_error
         length = 1e3 * self.length
-        thin_text = f"{thin:.2%} r.m.s. of the displacement; the grid is {length:.3g} mm long"
+        thin_text = f"{percent(thin)} r.m.s. of the displacement; the grid is {length:.3g} mm long"
         thin_level = Level.DOUBTFUL if thin > _MAX_THIN_ERROR else Level.SOUND
         facts = [
             Fact("landed", noun.capitalize(), counts, Level.DOUBTFUL if self.lost else Level.SOUND),
@@ -165,8 +165,8 @@ class TracedImage(Summarised):
         ]
         if self.edge_share > _MAX_EDGE_SHARE:
             edge_text = (
-                f"the field on the faces reaches {self.edge_share:.0%} of its peak: beyond them it "
-                "is taken as zero, so the image has edges that the object has not"
+                f"the field on the faces reaches {percent(self.edge_share)} of its peak: beyond "
+                "them it is taken as zero, so the image has edges that the object has not"
             )
             facts.append(Fact("edge_share", "Edge of the grid", edge_text, Level.DOUBTFUL))
         return tuple(facts)

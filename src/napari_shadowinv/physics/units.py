@@ -24,7 +24,15 @@ import numpy as np
 
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.facts import Fact, percent, round_down, to_figures, with_error
+from napari_shadowinv.facts import (
+    Assessment,
+    Fact,
+    Verdict,
+    percent,
+    round_down,
+    to_figures,
+    with_error,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -52,13 +60,32 @@ def prefix_for(largest: float, allowed: Collection[int] = tuple(_PREFIXES)) -> t
     return 10.0**-power, _PREFIXES[power]
 
 
-# If known to that, if off by that, and what to do.
+# What limits a field, what to do, if known to that, and if off by that.
 _CONDITIONS = {
-    "beam": "the beam is even to {}|it is {} uneven|record a reference",
-    "reference": "beam and reference agree to {}|they differ by {}|compare two references",
-    "detector": "the detector is exact to {}|it is off by {}|state the instrument",
-    "beam and detector": "beam and detector are exact to {}|they are off by {}|record a reference, "
-    "and state the instrument",
+    "beam": (
+        "the beam (assumed {} uneven)",
+        "record a reference",
+        "the beam is even to {}",
+        "it is {} uneven",
+    ),
+    "reference": (
+        "the reference (assumed {} off)",
+        "compare two references",
+        "beam and reference agree to {}",
+        "they differ by {}",
+    ),
+    "detector": (
+        "the detector (assumed)",
+        "state the instrument",
+        "the detector is exact to {}",
+        "it is off by {}",
+    ),
+    "beam and detector": (
+        "beam and detector (assumed)",
+        "record a reference, state the instrument",
+        "beam and detector are exact to {}",
+        "they are off by {}",
+    ),
 }
 
 
@@ -141,15 +168,19 @@ class ShownField:
         share = error.share if error else 0.0
         return f"peak {self.symbol} {with_error(self.largest, share * self.largest)} {self.unit}"
 
-    def conditional_text(self, condition: Condition) -> str:
-        """Write the largest magnitude with its errors without and with the assumption."""
+    def conditional(self, condition: Condition) -> Assessment:
+        """Return the assessment of the largest magnitude, whose error rests on an assumption."""
+        limit, remedy, exact, off = _CONDITIONS[condition.subject]
+        is_detector = condition.subject == "detector"
         peak = self.short_peak_text(PeakError(condition.peak_if_exact, ""))
-        exact, off, remedy = _CONDITIONS[condition.subject].split("|")
-        return (
+        return Assessment(
+            Verdict.DETECTOR if is_detector else Verdict.CONDITIONAL,
+            f"limited by {limit.format(condition.difference)}",
+            f"{remedy} for ± {to_figures(condition.peak_if_exact * self.largest)}",
             f"{peak} if {exact.format(condition.agreement)}; "
             f"± {to_figures(condition.peak_if_off * self.largest)} "
             f"(field {percent(condition.field_if_off)}) "
-            f"if {off.format(condition.difference)} (assumed); {remedy}"
+            f"if {off.format(condition.difference)} (assumed)",
         )
 
     def peak_text(self, error: PeakError | None = None) -> str:
@@ -228,7 +259,7 @@ def peak_facts(
     of_field = field_error or error
     return [
         Fact("field", "Field", field.peak_text(of_field), short=field.short_peak_text(of_field)),
-        Fact("displacement", "Displacement", text),
+        Fact("displacement", "Displacement", text, is_detail=True),
     ]
 
 

@@ -21,6 +21,7 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.film import (
     Calibration,
     Pack,
@@ -519,7 +520,7 @@ def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) 
     cautions = [
         Caution(
             "film-range",
-            f"{film.name}: {film_doses.too_dark:.0%} of the pixels are darker than the "
+            f"{film.name}: {percent(film_doses.too_dark)} of the pixels are darker than the "
             "calibration covers and were masked",
         )
         for film, film_doses in zip(films, doses, strict=True)

@@ -393,7 +393,8 @@ def _inverted(
         options=InversionOptions(max_error=options.max_error, threads=1),
         should_stop=should_stop,
     )
-    assessment, errors = inversion.assess_in(setup), inversion.errors_in(setup)
+    in_units = inversion.in_units(setup)
+    assessment, errors = in_units.assessment, in_units.errors
     shot = PlannedShot(
         number,
         assessment.verdict,

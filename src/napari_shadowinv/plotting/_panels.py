@@ -215,7 +215,12 @@ def fact_line(facts: Iterable[Fact]) -> str:
 
 def footer_lines(facts: Iterable[Fact], headline: str, letters: int) -> list[tuple[str, str]]:
     """Return the facts that a headline does not contain as lines; long ones have their own."""
-    shown = [fact for fact in facts if fact.key != "verdict" and fact.text not in headline]
+    shown = [
+        fact
+        for fact in facts
+        if fact.key in _LEGENDS
+        or not (fact.is_detail or fact.key == "verdict" or fact.text in headline)
+    ]
     warnings = [
         fact for fact in shown if fact.key in CAUTION_CODES or fact.level is not Level.SOUND
     ]

@@ -55,7 +55,8 @@ def report_figure(
     setup = inversion.setup if setup is None else setup
     shape = inversion.potential.shape
     (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
-    headline, facts = inversion.headline_in(setup), inversion.facts_in(setup)
+    in_units = inversion.in_units(setup)
+    headline, facts = in_units.headline, in_units.facts
     with _panels.shot_page(shape, setup, title, headline, facts) as (figure, panels):
         mean = float(inversion.source.mean())
         limits = intensity_limits(inversion.image / mean)

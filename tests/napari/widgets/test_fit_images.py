@@ -36,7 +36,7 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.widgets import _fitting
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit, compilation, fit
 from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.options import FitOptions
@@ -224,7 +224,7 @@ def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
     assert messages == []
     count = len(window.layers)
     explanation = "the forward model does not explain image 2"
-    show(tool, replace(fitted, verdict=Verdict.MISFIT, explanation=explanation))
+    show(tool, replace(fitted, assessment=Assessment(Verdict.MISFIT, explanation)))
     assert "Does not fit" in tool.view.verdict.text()
     assert explanation[1:] in tool.view.verdict.text()
     assert tool.view.verdict.styleSheet() != sound_style
@@ -642,8 +642,7 @@ def test_other_answers_are_shown_beside_the_best(
     doubtful = replace(
         result,
         basins=(best, alternative),
-        verdict=Verdict.SEVERAL,
-        explanation="2 different fields",
+        assessment=Assessment(Verdict.SEVERAL, "2 different fields"),
     )
     show(tool, doubtful)
     assert len(messages) == 1

@@ -421,7 +421,7 @@ def test_forward_model_traces_a_3d_field_from_a_file(tmp_path):
     # Seen with x to the left, y points up.
     expected = setup.displacement_from_path_integrated_b([-0.5 * 4e-4, 0.0])[1]
     np.testing.assert_allclose(prediction.displacement[1], expected, rtol=1e-2)
-    assert "faces reaches 100%" in prediction.warning
+    assert "faces reaches 100 %" in prediction.warning
 
 
 def test_a_plane_is_sampled_exactly_at_its_place_in_the_world() -> None:

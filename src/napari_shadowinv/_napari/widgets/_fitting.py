@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from napari.utils.notifications import show_warning
@@ -18,7 +18,7 @@ from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
-from napari_shadowinv.facts import Fact
+from napari_shadowinv.facts import Fact, percent
 from napari_shadowinv.fitting import Fit
 
 _REDRAW_MS = 500
@@ -66,7 +66,7 @@ class FitView(QWidget):
             "the best."
         )
         self._solutions_row = forms.labelled("Solution", self.solutions)
-        self.report = panels.ReportTable()
+        self.report = panels.FoldedReport()
         column(self, self.verdict, self._solutions_row, self.curve, self.report)
         self._redraw_timer = timer(self, _REDRAW_MS, self._draw)
         self.solutions.currentIndexChanged.connect(self._show_alternative)
@@ -107,11 +107,12 @@ class FitView(QWidget):
             self._show_report(result.content, result.content.facts)
         return True
 
-    def _show_report(self, fit: Fit, facts: Iterable[Fact], inputs: panels.Rows = ()) -> None:
+    def _show_report(self, fit: Fit, facts: Sequence[Fact], inputs: panels.Rows = ()) -> None:
         self.verdict.show_headline(fit.headline)
         warnings = [("Warning", caution.text) for caution in fit.warnings]
         rows = [row for row in warnings if row not in inputs]
-        self.report.show_rows([*rows, *inputs, *panels.fact_rows(facts, details=None)])
+        shown, details = (panels.fact_rows(facts, details=flag) for flag in (False, True))
+        self.report.show_rows([*rows, *inputs, *shown], details)
 
     def _list_solutions(self, fit: Fit) -> None:
         with QSignalBlocker(self.solutions):
@@ -120,7 +121,7 @@ class FitView(QWidget):
             self.solutions.addItem(f"{start_name(best)}: best", 0)
             for number, basin in enumerate(alternatives, 1):
                 excess = f"{100 * (basin.objective / best.objective - 1):+.1f} %"
-                start, distance = start_name(basin), f"{basin.distance:.0%}"
+                start, distance = start_name(basin), f"{percent(basin.distance)}"
                 self.solutions.addItem(f"{start}: {excess}, differs by {distance}", number)
                 tip = f"{start}: objective {excess}, displacement differs by {distance} (r.m.s.)"
                 self.solutions.setItemData(number, tip, Qt.ItemDataRole.ToolTipRole)

@@ -21,6 +21,7 @@ from napari_shadowinv._system.arrays import complete_block_means, join_masks
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.io.formats import SCAN_SUFFIXES
 from napari_shadowinv.io.images import film_warnings
 from napari_shadowinv.preprocessing import Crop
@@ -455,7 +456,7 @@ class MaskPicker(QWidget):
         is_supplied = image is not None and about.usable_of(image) is not None
         names = [] if self.layer is None else [f"layer '{self.layer.name}'"]
         names += ["the film's mask"] if is_supplied else []
-        return f"{' and '.join(names)}, excludes {1 - usable.mean():.1%} of the pixels"
+        return f"{' and '.join(names)}, excludes {percent(1 - usable.mean())} of the pixels"
 
     def follow(self, image: Any) -> None:
         """Select the mask that came with an image's file, if there is one."""

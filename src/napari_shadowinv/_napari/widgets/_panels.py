@@ -327,15 +327,15 @@ class RunPanel(QtWidgets.QWidget):
             show_user_error(error)
 
 
-def fact_rows(facts: Iterable[Fact], *, details: bool | None = False) -> list[tuple[str, str]]:
-    """Return facts as rows: of the result, of the solver (`details`) or, with None, of both.
+def fact_rows(facts: Iterable[Fact], *, details: bool = False) -> list[tuple[str, str]]:
+    """Return facts as rows: those of the report, or the `details`.
 
     Warnings have rows of their own: `warning_rows`.
     """
     return [
         (fact.title, fact.text)
         for fact in facts
-        if details in (fact.is_detail, None) and fact.key not in CAUTION_CODES
+        if details == fact.is_detail and fact.key not in CAUTION_CODES
     ]
 
 
@@ -396,7 +396,7 @@ class FoldedReport(QtWidgets.QWidget):
     def __init__(self) -> None:
         super().__init__()
         self.table, self._details = ReportTable(), ReportTable()
-        self.details = forms.section("Solver and timing", self._details)
+        self.details = forms.section("More", self._details)
         self.details.toggled.connect(lambda _: self._details.setVisible(True))
         qt.column(self, self.table, self.details)
         self.empty()

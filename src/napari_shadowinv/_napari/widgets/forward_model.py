@@ -26,7 +26,7 @@ from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Level
+from napari_shadowinv.facts import Level, percent
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
@@ -55,11 +55,11 @@ class Prediction:
         texts = [self.assumption] if self.assumption else []
         if self.caustic_share > 0:
             texts.append(
-                f"Caustics: rays cross or nearly cross in {self.caustic_share:.2%} of the "
+                f"Caustics: rays cross or nearly cross in {percent(self.caustic_share)} of the "
                 "pixels. Once rays cross, one image no longer determines the whole field."
             )
         if self.flux_inside < 0.99:
-            texts.append(f"Only {self.flux_inside:.1%} of the flux lands inside the image.")
+            texts.append(f"Only {percent(self.flux_inside)} of the flux lands inside the image.")
         return " ".join(texts)
 
 

@@ -25,6 +25,7 @@ from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.setup import Setup
@@ -233,8 +234,8 @@ class InvertShot(InversionInputs, panels.LivePanel):
             self.reveal(self.verdict)
 
     def _report(self, inversion: Inversion, setup: Setup | None, input_rows: panels.Rows) -> None:
-        self.verdict.show_headline(inversion.headline_in(setup))
-        facts = inversion.facts_in(setup)
+        self.verdict.show_headline(inversion.in_units(setup).headline)
+        facts = inversion.in_units(setup).facts
         said = self.setup.warning_label.text()  # in the form, above
         warnings = [row for row in panels.warning_rows(facts) if row[1] not in said]
         rows = [*warnings, *input_rows, *panels.fact_rows(facts)]
@@ -382,8 +383,9 @@ class EstimateSource(panels.LivePanel):
         share = _pattern_share(finished.content, job)
         if share >= _NOTABLE_PATTERN:
             self.panel.say(
-                f"The estimate contains {share:.0%} of the pattern in the image: what of it is the "
-                "object's is missing in the field. Choose a smoother estimate, or mask the object.",
+                f"The estimate contains {percent(share)} of the pattern in the image: what of it "
+                "is the object's is missing in the field. Choose a smoother estimate, or mask "
+                "the object.",
                 problem=True,
             )
 
