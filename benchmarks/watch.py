@@ -6,8 +6,8 @@
 Burner frames, written as TIFF at a given rate into a folder that is watched with their reference
 beam; each frame is summed over `--binning` pixels. For each rate: how many shots a second were
 stored, the time from a file being closed to its shot being stored, and how many files waited at
-most. Then the mean time of a shot where all files are there, against a run over them in one group
-of warm starts, and late shots against early ones for many small frames.
+most. Then the mean time of a shot where all files are there, against a run over them, and late
+shots against early ones for many small frames.
 
 Then a watch of the latest of small simulated frames, written by another process faster than they
 can be inverted: the age of a result when it is stored, from the time stamp of its file, in s and in
@@ -142,11 +142,11 @@ def against_a_run(folder: Path, recipe: Recipe, count: int) -> None:
             with_all,
             source=source,
             scheduler="synchronous",
-            run=RunOptions(warm_start=count, overwrite=True),
+            run=RunOptions(overwrite=True),
         )
         times.append(time.perf_counter() - began)
     run = (times[1] - times[0]) / (count - 1)
-    print("\n| a shot, warm-started | s |\n|---|---|")
+    print("\n| a shot | s |\n|---|---|")
     print(f"| watched | {watched:.3f} |")
     print(f"| in a run over all files, one worker | {run:.3f} |")
 

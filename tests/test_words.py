@@ -140,7 +140,7 @@ def model_keys() -> set[str]:
 
 def test_messages_below_the_faces_suit_each_of_them():
     """A window has no flags, a command no keywords; words such as a free boundary suit both."""
-    keys = "|".join(model_keys() | {"warm_start", "max_shots", "other_folders"})
+    keys = "|".join(model_keys() | {"max_shots", "other_folders"})
     options = "|".join([*InversionOptions.model_fields, *FitOptions.model_fields])
     of_one_face = re.compile(rf"--[a-z]{{2}}|\b(?:{keys})\b|\b(?:{options})='")
     assert not [

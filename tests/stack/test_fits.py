@@ -179,7 +179,6 @@ def test_error_bars_are_stored_if_they_are_made(images: Any, out: Path) -> None:
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "two fields": ({"fields": ("B", "E")}, "B, E, and a store holds one"),
-    "warm start": ({"warm_start": 4}, "fits start on their own"),
     "variable": ({"variables": ("caustic",)}, "no variable 'caustic' of a fit"),
     "step": ({"steps": [{"step": "low-pass"}]}, "what the forward model is fitted to"),
 }

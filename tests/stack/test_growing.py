@@ -164,16 +164,6 @@ def test_sources_arrive_with_their_shots(night, out, hidden):
         night.run(out, source=sources)
 
 
-def test_runs_of_alike_shots_go_on_over_the_old_end(night, out, tmp_path, hidden):
-    more = {"warm_start": 3, "variables": ("weights",)}
-    night.run(tmp_path / "whole.shadowinv.zarr", **more)
-    hidden(4, 5)
-    night.run(out, **more)
-    hidden()
-    night.run(out, **more)
-    assert content(out, "weights") == content(tmp_path / "whole.shadowinv.zarr", "weights")
-
-
 def test_arrays_and_films_grow_too(night, out, tmp_path, whole):
     film = tmp_path / "film.tif"
     for count in (4, 6):

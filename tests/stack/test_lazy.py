@@ -196,20 +196,6 @@ def test_a_source_for_each_shot(night, plans_made):
         invert_stack(night.images, Recipe(options=OPTIONS), source=sources[:2])
 
 
-def test_warm_start_agrees_within_tolerance_in_fewer_steps(night):
-    alike = np.stack([night.images[1] * (1 + 0.001 * i * np.eye(24, 28)) for i in range(6)])
-    options = InversionOptions(n_sites=600, tolerance=1e-4)
-    cold = invert_stack(alike, Recipe(options=options), source=night.source)
-    warm = invert_stack(alike, Recipe(options=options), source=night.source, warm_start=3)
-    cold, warm = (s[["potential", "iterations"]].compute() for s in (cold, warm))
-    np.testing.assert_allclose(warm.potential, cold.potential, atol=2e-3)
-    assert (warm.iterations[[0, 3]] == cold.iterations[[0, 3]]).all()
-    assert warm.iterations[[1, 2, 4, 5]].sum() < cold.iterations[[1, 2, 4, 5]].sum()
-    # Where a slice begins does not change it.
-    part = invert_stack(alike, Recipe(options=options), source=night.source, warm_start=3)
-    np.testing.assert_array_equal(part.potential.isel(shot=5), warm.potential.isel(shot=5))
-
-
 class TestInputs:
     def potential(self, shots, **more) -> np.ndarray:
         return invert_stack(shots, Recipe(options=OPTIONS), **more).potential.compute().values

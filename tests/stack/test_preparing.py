@@ -151,8 +151,6 @@ def test_a_store_is_not_continued_with_other_filters_or_guesses(night, out, bare
             "excluded from the inversion",
         ),
         ({"source": IsotropicEstimate()}, "'isotropic' without a setup"),
-        ({"source": LowPassEstimate(width=6), "warm_start": 2}, "its own source"),
-        ({"source": np.ones((6, 24, 28)), "warm_start": 2}, "its own source"),
         (
             {"source": LowPassEstimate(width=6), "source_mask": np.ones((3, 3), bool)},
             r"mask has shape \(3, 3\)",

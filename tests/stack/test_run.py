@@ -197,27 +197,6 @@ def test_each_shot_brings_its_own_source(night, out):
     np.testing.assert_array_equal(written.sites[4], lazy.sites)
 
 
-def test_a_warm_start_does_not_depend_on_where_a_run_stopped(night, out, tmp_path):
-    arguments = {
-        "source": night.source,
-        "options": OPTIONS,
-        "warm_start": 3,
-        "variables": ("weights",),
-        "scheduler": "synchronous",
-    }
-    other_store = tmp_path / "other.shadowinv.zarr"
-    run_stack(night.images, other_store, **grouped(arguments))
-    spoilt = night.images.copy()
-    run_stack(spoilt, out, **grouped(arguments))
-    # As if the run had been killed after the first shot of the second three.
-    for index in (4, 5):
-        (out / "status" / "c" / str(index)).unlink()
-        for path in (out / "weights" / "c" / str(index)).rglob("*"):
-            path.write_bytes(b"torn")
-    run_stack(spoilt, out, **grouped(arguments))
-    assert content(out, "weights") == content(other_store, "weights")
-
-
 @pytest.fixture(scope="module")
 def finished(any_night, tmp_path_factory):
     out = tmp_path_factory.mktemp("finished") / "n.shadowinv.zarr"
@@ -303,7 +282,6 @@ class TestRefusals:
             ({"scheduler": "quick"}, "scheduler is 'quick'"),
             ({"workers": 0}, "'workers' is 0: workers must be at least 1"),
             ({"dtype": "int8"}, "must be 'float32' or 'float64'"),
-            ({"warm_start": 0}, "warm start must be at least 1"),
         ],
     )
     def test_arguments_that_mean_nothing(self, night, tmp_path, changes, words):

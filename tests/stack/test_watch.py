@@ -49,41 +49,18 @@ def test_watch_inverts_existing_files_first_then_arrivals(folder, out):
     assert [event.name for event in watch.shots] == names
     assert list(watch.result.name.values) == names
     assert watch.shots[0].total == 1
-    assert watch.result.attrs["warm_start"] == "each shot from an earlier one, as they arrived"
 
 
-def test_watch_equals_a_run_and_later_shots_need_fewer_steps(folder, out, tmp_path):
+def test_watch_equals_a_run(folder, out, tmp_path):
     put(folder, *range(6))
-    warm = watched_once(folder, out)
-    cold = watched_once(folder, tmp_path / "cold.shadowinv.zarr", warm_start=False)
+    watched = watched_once(folder, out)
     from napari_shadowinv import run_stack
 
     files = [folder / f"shot_{index}.npy" for index in range(6)]
     run = run_stack(files, tmp_path / "run.shadowinv.zarr", Recipe(options=OPTIONS), source=SOURCE)
-    np.testing.assert_array_equal(cold.displacement, run.displacement)
-    scale = float(np.abs(run.displacement).max())
-    np.testing.assert_allclose(warm.displacement, run.displacement, atol=5e-3 * scale)
-    np.testing.assert_array_equal(warm.displacement[:2], run.displacement[:2])
-    assert not np.array_equal(warm.displacement[2:], run.displacement[2:])
+    np.testing.assert_array_equal(watched.displacement, run.displacement)
     for name in ("iterations", "image_residual", "seconds"):
-        assert (warm[name] > 0).all()
-
-
-def test_watch_starts_each_shot_from_the_last_but_one(folder, out, tmp_path):
-    slow = tmp_path / "slow"
-    slow.mkdir()
-    with Watched(slow, tmp_path / "slow.shadowinv.zarr", dtype="float64") as watch:
-        for index in range(6):
-            put(slow, index)
-            watch.ended(index + 1)
-    put(folder, *range(6))
-    fast = watched_once(folder, out, dtype="float64")
-    np.testing.assert_array_equal(watch.result.displacement, fast.displacement)
-    plan = plan_sites(SOURCE, OPTIONS)
-    inversion = None
-    for index in (0, 2, 4):
-        inversion = invert(IMAGES[index], plan=plan, options=OPTIONS, start=inversion)
-        np.testing.assert_array_equal(fast.displacement[index], inversion.displacement)
+        assert (watched[name] > 0).all()
 
 
 def test_a_shot_that_waits_begins_before_the_last_one_is_written(folder, out, monkeypatch):
@@ -210,7 +187,7 @@ def test_a_store_inside_the_folder_does_not_set_it_off(folder):
     assert list(watch.result.status.values) == [DONE, DONE]
 
 
-def test_bad_files_fail_alone_and_the_next_starts_from_zero(folder, out, tmp_path):
+def test_bad_files_fail_alone(folder, out):
     (folder / "shot_0.npy").write_bytes(b"")
     np.save(folder / "shot_1.npy", IMAGES[0][:10])
     (folder / "shot_2.npy").write_text("no image")
@@ -230,9 +207,6 @@ def test_bad_files_fail_alone_and_the_next_starts_from_zero(folder, out, tmp_pat
     assert "image has shape (10, 28), expected (24, 28)" in reasons[1]
     assert reasons[4] == StackStore(out).report(4)["reason"]
     assert np.isnan(result.displacement[4]).all()
-    cold = watched_once(folder, tmp_path / "cold.shadowinv.zarr", warm_start=False)
-    np.testing.assert_array_equal(cold.displacement[6], result.displacement[6])
-    assert not np.array_equal(cold.displacement[5], result.displacement[5])
 
 
 def test_without_a_good_shot_there_is_no_store(folder, out):
@@ -265,28 +239,21 @@ def test_it_goes_on_with_its_store_and_does_nothing_twice(folder, out):
     assert len(watched_once(folder, out, source=None, skip_existing=True).shot) == 5
     with pytest.raises(InputError, match="different options"):
         watched_once(folder, out, source=None, options=InversionOptions(n_sites=50))
-    with pytest.raises(InputError, match=r"different warm start \(each shot from an earlier one"):
-        watched_once(folder, out, source=None, warm_start=False)
 
 
-def test_a_batch_goes_on_with_a_store_only_if_shots_start_afresh(folder, out, tmp_path):
+def test_a_batch_goes_on_with_the_store_of_a_watch(folder, out, tmp_path):
     np.save(tmp_path / "reference.npy", SOURCE)
     put(folder, 3, 4)
     flags = ["--source", tmp_path / "reference.npy", "--n-sites", 100, "--out", out]
     watch = ["watch", folder, "--pattern", "*.npy", *flags, "--settle", SETTLE, "--idle", 0.2]
-    assert shadowinv(*watch, "--no-warm-start").exit_code == 0
+    assert shadowinv(*watch).exit_code == 0
     put(folder, 1)
-    assert shadowinv(*watch, "--no-warm-start").exit_code == 0
+    assert shadowinv(*watch).exit_code == 0
     put(folder, 0)
     batch = ["batch", f"{folder}/*.npy", *flags, "--scheduler", "threads"]
     result = shadowinv(*batch, "--resume")
     assert result.exit_code == 0, result.output
     assert list(read(out).name.values) == [f"shot_{i}.npy" for i in (3, 4, 1, 0)]
-    shutil.rmtree(out)
-    assert shadowinv(*watch).exit_code == 0
-    result = shadowinv(*batch, "--resume")
-    assert result.exit_code == 2
-    assert "was written by watching a folder" in flat(result.output)
 
 
 def test_a_hundred_frames_cost_alike_and_leave_no_thread(folder, out, opened_paths):

@@ -98,14 +98,14 @@ def seen_arrivals(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_existing_files_are_skipped_but_the_newest_and_done_ones(folder, out, tmp_path):
     put(folder, 1)
-    watched_once(folder, out, warm_start=False)
+    watched_once(folder, out)
     put(folder, 0, 2, 3)
     (folder / "shot_4.npy").write_bytes(b"")
-    stored = watched_once(folder, out, latest=True, warm_start=False)
+    stored = watched_once(folder, out, latest=True)
     expected = [("1", DONE), ("0", SKIPPED), ("2", SKIPPED), ("3", SKIPPED), ("4", FAILED)]
     assert numbers_of(stored) == expected
     status = (out / "status/c/1").stat()
-    stored = watched_once(folder, out, latest=True, warm_start=False)
+    stored = watched_once(folder, out, latest=True)
     assert numbers_of(stored) == expected  # the newest has failed, and nothing else is newer
     assert (out / "status/c/1").stat() == status
     (folder / "shot_4.npy").unlink()

@@ -56,13 +56,6 @@ class RunOptions(_StoreOptions):
     ('potential', 'weights')
     """
 
-    warm_start: int = Field(
-        default=1,
-        ge=1,
-        description="Size of groups in which each shot is initialised from the previous one, for "
-        "similar shots with a common source.",
-        json_schema_extra={"metavar": "N"},
-    )
     workers: int | None = Field(
         default=None,
         ge=1,
@@ -86,12 +79,6 @@ class WatchOptions(_StoreOptions):
         description="File name pattern of the shots, in quotes on the command line; without an "
         "ending, images of the most frequent or first kind. Names that begin with a dot are "
         "ignored.",
-    )
-    warm_start: bool = Field(
-        default=True,
-        description="Initialise each shot from the last but one, because two are inverted "
-        "simultaneously, unless that one failed or did not converge. Fits, and shots with "
-        "estimated sources, always start from zero.",
     )
     latest: bool = Field(
         default=False,

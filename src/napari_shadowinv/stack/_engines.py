@@ -132,12 +132,12 @@ class _Threads:
         """Send a value to the workers, and return its representative for tasks."""
         return value
 
-    def submit(self, task: Callable[..., Any], shots: list[Exposure], *args: Any) -> Any:
-        """Start ``task(shots, blocks, *args)``, where a block is the computed image of a shot.
+    def submit(self, task: Callable[..., Any], shot: Exposure, *args: Any) -> Any:
+        """Start ``task(shot, block, *args)``, where a block is the computed image of a shot.
 
         The future has `add_done_callback` and `cancel`.
         """
-        return self._pool.submit(task, shots, [None] * len(shots), *args)
+        return self._pool.submit(task, shot, None, *args)
 
     def result(self, future: Any) -> Any:
         """Return the result of a task, or None if its worker died and it is repeated.
@@ -192,20 +192,14 @@ class _Cluster:
                 self._client.replicate([future])
         return future
 
-    def submit(self, task: Callable[..., Any], shots: list[Exposure], *args: Any) -> Any:
+    def submit(self, task: Callable[..., Any], shot: Exposure, *args: Any) -> Any:
         # A dask array may live on the cluster already, so its blocks are the cluster's tasks.
         with self._as_engine_error():
-            blocks = [
-                self._client.compute(shot.images.block.to_delayed().ravel()[0])
-                if isinstance(shot.images, BlockReference)
-                else None
-                for shot in shots
-            ]
-            bare = [
-                shot if block is None else replace(shot, images=ImageReference())
-                for shot, block in zip(shots, blocks, strict=True)
-            ]
-            return self._client.submit(task, bare, blocks, *args, pure=False)
+            block = None
+            if isinstance(shot.images, BlockReference):
+                block = self._client.compute(shot.images.block.to_delayed().ravel()[0])
+                shot = replace(shot, images=ImageReference())
+            return self._client.submit(task, shot, block, *args, pure=False)
 
     def result(self, future: Any) -> Any:
         from distributed.scheduler import KilledWorker

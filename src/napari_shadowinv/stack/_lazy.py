@@ -125,7 +125,6 @@ def invert_stack(
     mask: ArrayLike | None = None,
     source_mask: ArrayLike | None = None,
     reader: Reader = read_shot,
-    warm_start: int = 1,
     variables: Collection[str] | None = None,
 ) -> xarray.Dataset:
     """Describe the inversion of many shots, which dask computes on demand.
@@ -155,9 +154,6 @@ def invert_stack(
     reader : callable, optional
         Returns the image of a path; with a keyword ``page`` it also reads multi-page TIFFs.
         `functools.partial(read_shot, channel="red")` reads one channel of colour images.
-    warm_start : int, optional
-        Size of groups in which each shot is initialised from the previous one, for similar shots
-        with a common source. Results agree within the tolerance.
 
     Returns
     -------
@@ -195,7 +191,7 @@ def invert_stack(
             "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "
             "leave the section out"
         )
-    stack = describe_stack(shots, recipe, source, mask, source_mask, reader, variables, warm_start)
+    stack = describe_stack(shots, recipe, source, mask, source_mask, reader, variables)
     return _lazy_dataset(choose_sites(stack))
 
 
@@ -205,19 +201,15 @@ def _invert(
     block: AnyArray | None,
     beam: Beam | None,
     task: AnyTask,
-    previous: dict[str, Any] | None = None,
-    keep: bool = False,
 ) -> dict[str, Any]:
-    """Invert one shot; return its variables, and the inversion if the next shot starts from it."""
+    """Invert one shot, and return its variables."""
     try:
         images, _ = (shot.images if block is None else ArrayReference(block[0])).load()
         source = None if shot.source is None else shot.source.images.read()[0]
-        start = None if previous is None else previous["inversion"]
-        inversion = task.run(images, beam, source, start=start)
+        inversion = task.run(images, beam, source)
     except InputError as error:
         raise error.about(label) from error
-    start_of_next = {"inversion": inversion} if keep else {}
-    return {**task.arrays(inversion), **column_values(INVERSIONS, inversion), **start_of_next}
+    return {**task.arrays(inversion), **column_values(INVERSIONS, inversion)}
 
 
 def _pick(record: dict[str, Any], name: str) -> AnyArray:
@@ -231,7 +223,7 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
     from dask.highlevelgraph import HighLevelGraph
 
     da: Any = import_module("dask.array")
-    shots, array, group = stack.shots, stack.shots.array, stack.warm_start
+    shots, array = stack.shots, stack.shots.array
     token = tokenize(
         [shot.images for shot in shots.items] if array is None else array.name,
         [shot.source and shot.source.images for shot in shots.items],
@@ -241,7 +233,6 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
         stack.task.inputs.shot.source_mask,
         stack.task.recipe.model_dump_json(),
         stack.task.variables,
-        stack.warm_start,
     )
     name = f"invert-shot-{token}"
     task = delayed(stack.task, name=f"task-{token}", traverse=False)
@@ -251,10 +242,8 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
         shot, block = item, None
         if array is not None:
             shot, block = replace(item, images=ImageReference()), (array.name, index, 0, 0)
-        previous = (name, index - 1) if index % group else None
-        keep = group > 1 and (index + 1) % group != 0
         inputs = (shots.label(index), shot, block, None if beam is None else beam.key)
-        tasks[name, index] = (_invert, *inputs, task.key, previous, keep)
+        tasks[name, index] = (_invert, *inputs, task.key)
     graph = HighLevelGraph.from_collections(name, tasks, dependencies=dependencies)
     return da.Array(graph, name, ((1,) * len(shots),), dtype=object), token
 

@@ -66,8 +66,6 @@ from napari_shadowinv.stack._worker import (
     try_shot,
 )
 
-CHAINED = "each shot from an earlier one, as they arrived"
-
 MAX_TRIED_SHOTS = 10  # at the beginning of a stack
 _DECIDING_SHOTS = 3
 
@@ -89,9 +87,7 @@ class Stack:
     beam: Beam | None  # to invert, after all steps; None if shots have their own
     common: AnyArray | None = None  # measured source of rows to invert without one, as recorded
     reader: str = ""  # name of the reader of the files
-    warm_start: int = 1  # shots in a group, each initialised from the one before
     as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
-    chained: bool = False  # whether each shot starts from an earlier one, without groups
     dtype: str = "float64"  # of fields in a store
 
     @property
@@ -191,7 +187,7 @@ def needed_shares(stack: Stack, should_stop: ShouldStop | None = None) -> list[f
     most = count_sites(stack.beam.image, stack.task.recipe.options, mask=stack.beam.mask)
     needed = []
     for shot in stack.shots.items[:MAX_TRIED_SHOTS]:
-        result: Any = try_shot(stack.task, shot, stack.beam, None, 1, should_stop).result
+        result: Any = try_shot(stack.task, shot, stack.beam, 1, should_stop).result
         if result is None:  # the error is reported when it is its turn
             continue
         needed.append(result.report.n_sites / most)
@@ -215,13 +211,8 @@ def describe_stack(
     source_mask: ArrayLike | None,
     reader: Reader,
     variables: Collection[str] | None,
-    warm_start: int = 1,
 ) -> Stack:
     """Describe a stack, and check everything that can be checked before a shot is read."""
-    if warm_start < 1:
-        raise InputError(
-            f"warm start is {warm_start}: expected a number of shots, or 1 to disable it"
-        )
     resolved = Recipe() if recipe is None else recipe
     if isinstance(source, Estimate):
         resolved = resolved.model_copy(update={"source": source})
@@ -243,9 +234,9 @@ def describe_stack(
     image = None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
     task: AnyTask
     if resolved.fit is not None:
-        task, beam = _plan_fit(inputs, shot_sources, image, resolved, variables, warm_start)
+        task, beam = _plan_fit(inputs, shot_sources, image, resolved, variables)
     else:
-        task, beam = _plan_inversion(stack_shots, inputs, image, resolved, variables, warm_start)
+        task, beam = _plan_inversion(stack_shots, inputs, image, resolved, variables)
     common = image if task.by_row else None
     own_sources = None if shot_sources is None else shot_sources.items
     if common is not None and beam is None:
@@ -257,7 +248,7 @@ def describe_stack(
             for shot, source_shot in zip(stack_shots.items, own_sources, strict=True)
         ]
         stack_shots = replace(stack_shots, items=items)
-    return Stack(stack_shots, task, beam, common, reader_text(reader), warm_start)
+    return Stack(stack_shots, task, beam, common, reader_text(reader))
 
 
 def _plan_inversion(
@@ -266,19 +257,12 @@ def _plan_inversion(
     source: AnyArray | None,
     recipe: Recipe,
     variables: Collection[str] | None,
-    warm_start: int,
 ) -> tuple[InvertTask, Beam | None]:
     """Return the task of an inversion, and the beam that all shots share."""
     rows = [row for shot in shots.items for row in shot.rows]
     own_masks = any(row.mask is not None for row in rows)
     per_shot = own_masks or any(row.source is not None for row in rows)
     beam = None if per_shot else _shared_beam(inputs, source)
-    if beam is None and warm_start > 1:
-        raise InputError(
-            f"warm start is {warm_start} and each shot has its own source or mask: the previous "
-            "solution belongs to different sites; leave the warm start out, or give one source and "
-            "mask for all shots"
-        )
     options = inputs.recipe.options
     ragged = own_masks or (beam is None and (options.boundary == "free" or options.is_adaptive))
     chosen = _checked_variables(variables, inputs.recipe, ragged=ragged)
@@ -295,13 +279,10 @@ def _plan_fit(
     source: AnyArray | None,
     recipe: Recipe,
     variables: Collection[str] | None,
-    warm_start: int,
 ) -> tuple[FitTask, Beam | None]:
     """Return the task of a fit, and the beam as recorded, because a fit applies the steps."""
     check_fit(recipe)
     task = FitTask(inputs=inputs, variables=(), requested=recipe)
-    if warm_start > 1:
-        raise InputError(f"warm start is {warm_start}: fits start on their own; leave it out")
     fields = task.choices.fields
     if fields is not None and len(fields) > 1:
         raise InputError(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import queue
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -57,7 +57,6 @@ from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._engines import Engine, WorkerDiedError, engine_for, is_local
 from napari_shadowinv.stack._plan import (
-    CHAINED,
     STORED,
     Stack,
     attributes_of,
@@ -68,7 +67,7 @@ from napari_shadowinv.stack._plan import (
     values_of_beam,
 )
 from napari_shadowinv.stack._shots import Reader, differences, read_shot
-from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext, run_shots
+from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext, run_shot
 
 if TYPE_CHECKING:
     import xarray
@@ -187,8 +186,8 @@ def run_stack(
     out : str or Path
         The store, ``name.shadowinv.zarr``.
     run : RunOptions, optional
-        Choices of the run: stored variables and their type, workers, warm start, whether to
-        overwrite the store or to repeat failed shots. A mapping is converted.
+        Choices of the run: stored variables and their type, workers, whether to overwrite the
+        store or to repeat failed shots. A mapping is converted.
     scheduler : str, distributed.Client, cluster or None, optional
         ``"threads"``, ``"processes"``, ``"synchronous"``, the address of a scheduler, a client or
         a cluster. Default: dask's current client, else threads. The results do not depend on it.
@@ -216,9 +215,7 @@ def run_stack(
     path = check_store_path(out)
     run = as_model(RunOptions, run, "run")
     variables = stored_variables(run.variables, recipe)
-    stack = describe_stack(
-        shots, recipe, source, mask, source_mask, reader, variables, run.warm_start
-    )
+    stack = describe_stack(shots, recipe, source, mask, source_mask, reader, variables)
     stack = replace(stack, dtype=run.dtype)
     again = (PENDING, SKIPPED, *([FAILED] if run.redo_failed else []))
 
@@ -331,16 +328,15 @@ class _Run:
         beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
         context = engine.share(TaskContext(self._writer, stack.shot_task, engine.workers), name)
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        running: dict[Any, list[int]] = {}
-        batches = self._batches()
+        running: dict[Any, int] = {}
+        todo = iter(sorted(self._todo))
         try:
             while True:
                 window = engine.window(files=stack.shots.array is None)
-                while len(running) < window and (batch := next(batches, None)) is not None:
-                    labels = [(index, index in self._todo) for index in batch]
-                    items = [stack.shots.items[index] for index in batch]
-                    future = engine.submit(run_shots, items, labels, beam, context, engine.stop)
-                    running[future] = batch
+                while len(running) < window and (index := next(todo, None)) is not None:
+                    item = stack.shots.items[index]
+                    future = engine.submit(run_shot, item, index, beam, context, engine.stop)
+                    running[future] = index
                     future.add_done_callback(ended.put)
                 if not running:
                     return
@@ -356,16 +352,6 @@ class _Run:
                 future.cancel()
             raise
 
-    def _batches(self) -> Iterator[list[int]]:
-        """Yield the shots of a task: one, or a group in which each starts from the previous."""
-        run = self._stack.warm_start
-        for first in range(0, len(self._stack.shots), run):
-            batch = range(first, min(first + run, len(self._stack.shots)))
-            pending = [index for index in batch if index in self._todo]
-            if pending:
-                # From its beginning, so that the values do not depend on where a run stopped.
-                yield list(range(first, pending[-1] + 1))
-
     def _wait(self, engine: Engine, ended: queue.SimpleQueue[Any]) -> Any:
         """Return a finished task, or None after a timeout."""
         if self._should_stop is not None and self._should_stop():
@@ -376,20 +362,16 @@ class _Run:
             engine.check()
             return None
 
-    def _end(self, engine: Engine, future: Any, batch: list[int]) -> bool:
-        """Count the shots of a task, or return False if the task is repeated."""
+    def _end(self, engine: Engine, future: Any, index: int) -> bool:
+        """Count the shot of a task, or return False if the task is repeated."""
         try:
-            outcomes = engine.result(future)
+            outcome = engine.result(future)
         except WorkerDiedError as error:
-            lost = [index for index in batch if index in self._todo]
-            outcomes = [ShotOutcome(index, FAILED, 0.0, str(error)) for index in lost]
-            for index in lost:
-                self._writer.write(index, {}, {"reason": str(error)}, FAILED)
-        if outcomes is None:
+            outcome = ShotOutcome(index, FAILED, 0.0, str(error))
+            self._writer.write(index, {}, {"reason": str(error)}, FAILED)
+        if outcome is None:
             return False
-        for outcome in outcomes:
-            self._todo.discard(outcome.index)
-            self.report(engine.name, outcome)
+        self.report(engine.name, outcome)
         return True
 
 
@@ -457,7 +439,6 @@ def _identity(stack: Stack, shots: int | None = None) -> dict[str, str]:
         "image_size": f"{width} × {height} px",
         "stored": f"{', '.join(stack.task.variables)} as {stack.dtype}",
         "reader": stack.reader,
-        "warm_start": CHAINED if stack.chained else str(stack.warm_start),
     }
 
 
@@ -467,11 +448,6 @@ def _mask_text(mask: BoolArray | None) -> str:
 
 def resume(store: StackStore, stack: Stack) -> Stack:
     """Return the stack in the order of its store, new shots last; an `InputError` if it differs."""
-    if store.attributes.get("warm_start") == CHAINED and not stack.as_arrived:
-        raise InputError(
-            f"{store.path} was written by watching a folder, where each shot starts from the one "
-            "before: continue with shadowinv watch, overwrite the store, or choose another name"
-        )
     shots = stack.shots.reordered(_order(store, stack.shots.names))
     stack = match_store(store, replace(stack, shots=shots))
     for index in np.flatnonzero(store.statuses() == DONE):

@@ -1,6 +1,6 @@
 """Tasks of a worker: `InvertTask` inverts one shot, `FitTask` fits one.
 
-- several shots one after the other, each written to the store: `run_shots`
+- a shot inverted and written to the store: `run_shot`
 - its two parts: `try_shot`, `write_shot`
 """
 
@@ -232,7 +232,6 @@ class InvertTask(Task):
         beam: Beam | None,
         source: AnyArray | None = None,
         *,
-        start: Inversion | None = None,
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Inversion:
@@ -264,7 +263,7 @@ class InvertTask(Task):
             options = options.model_copy(update={"threads": threads_here(workers)})
         inputs = replace(inputs, recipe=recipe.model_copy(update={"options": options}))
         sites = _SharedSites(beam=beam)
-        inversion = run_prepared(inputs, ready, cache=sites, start=start, should_stop=should_stop)
+        inversion = run_prepared(inputs, ready, cache=sites, should_stop=should_stop)
         return _with_sites_reason(inversion) if self.sites_chosen else inversion
 
     def _inputs_of_row(self, row: Shot, beam: Beam | None, source: AnyArray | None) -> Inputs:
@@ -358,11 +357,10 @@ class FitTask(Task):
         beam: Beam | None,
         source: AnyArray | None = None,
         *,
-        start: Any = None,
         workers: int | None = None,
         should_stop: ShouldStop | None = None,
     ) -> Fit:
-        """Fit a shot; `start` is ignored."""
+        """Fit a shot."""
         common = beam.source if source is None and beam is not None else source
         completed = [self._completed(shot, common) for shot in images]
         fit = run_fit(self._recipe, completed, should_stop=should_stop)
@@ -530,29 +528,23 @@ class TaskContext:
     workers: int | None
 
 
-def run_shots(
-    shots: list[Exposure],
-    blocks: list[AnyArray | None],
-    labels: list[tuple[int, bool]],
+def run_shot(
+    shot: Exposure,
+    block: AnyArray | None,
+    index: int,
     beam: Beam | None,
     context: TaskContext,
     stop: Any = None,
-) -> list[ShotOutcome]:
-    """Task: invert, or fit, some shots one after the other and write each.
+) -> ShotOutcome:
+    """Task: invert, or fit, a shot and write it.
 
     A shot is replaced by its block of a dask array if a cluster has computed that already.
     """
     should_stop = None if stop is None else stop.is_set
-    previous: Inversion | Fit | None = None
-    outcomes = []
-    for shot, block, (index, is_pending) in zip(shots, blocks, labels, strict=True):
-        if block is not None:
-            shot = replace(shot, images=ArrayReference(block[0]))
-        attempt = try_shot(context.task, shot, beam, previous, context.workers, should_stop)
-        previous = attempt.result
-        if is_pending:
-            outcomes.append(write_shot(context.writer, context.task, index, attempt))
-    return outcomes
+    if block is not None:
+        shot = replace(shot, images=ArrayReference(block[0]))
+    attempt = try_shot(context.task, shot, beam, context.workers, should_stop)
+    return write_shot(context.writer, context.task, index, attempt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -570,7 +562,6 @@ def try_shot(
     task: AnyTask,
     shot: Exposure,
     beam: Beam | None,
-    start: Any = None,
     workers: int | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Attempt:
@@ -583,9 +574,7 @@ def try_shot(
         source = None
         if shot.source is not None:
             source, origin["source"] = shot.source.images.read()
-        result = task.run(
-            images, beam, source, start=start, workers=workers, should_stop=should_stop
-        )
+        result = task.run(images, beam, source, workers=workers, should_stop=should_stop)
     except InversionCancelled:
         raise
     except Exception as error:

@@ -24,8 +24,6 @@ from napari_shadowinv._system.machine import clear_up_when_terminated, defer_int
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv.errors import InversionCancelled
-from napari_shadowinv.fitting import Fit
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.files import sha256, text_of
@@ -63,7 +61,6 @@ from napari_shadowinv.stack._status_file import status_file
 from napari_shadowinv.stack._worker import (
     AnyTask,
     Attempt,
-    InvertTask,
     ShotOutcome,
     failure_text,
     try_shot,
@@ -73,9 +70,7 @@ from napari_shadowinv.stack._worker import (
 if TYPE_CHECKING:
     import xarray
 
-# Simultaneous shots. The number is fixed, because each starts from the last one in its lane, and
-# results must not depend on the machine.
-_LANES = 2
+_LANES = 2  # simultaneous shots
 _CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
 
 
@@ -101,15 +96,13 @@ class _NoImage(ImageReference):
 class _RunningShot:
     name: str
     stamp_before: dict[str, int]  # of its file, before it was read
-    lane: int
     attempt: Future[Attempt]
 
 
 class Watch:
     """The loop: inverts two files simultaneously, and writes them in the order of arrival.
 
-    Shots alternate between two lanes; each starts from the last result in its lane. With `latest`,
-    the newest file is next, and all others that wait are skipped.
+    With `latest`, the newest file is next, and all others that wait are skipped.
     """
 
     def __init__(
@@ -134,10 +127,9 @@ class Watch:
         self._pool = ThreadPoolExecutor(_LANES)
         self._abandoned = Event()
         self._running: deque[_RunningShot] = deque()
-        self._lanes: list[Inversion | Fit | None] = [None] * _LANES
         self._redo: set[str] = set()
         self._skipped: dict[str, None] = {}  # not in the store yet, in order of arrival
-        self._begun = self._ended = 0
+        self._ended = 0
         self._last = self._busy_since = time.monotonic()
         self._busy_s = 0.0
         self._left_out: Counter[str] = Counter()  # as reported
@@ -177,10 +169,7 @@ class Watch:
     def _stack_of(self, shots: Iterable[Exposure]) -> Stack:
         """Return the stack of some shots, the first of which can be read."""
         stack = self._describe(Shots(list(shots), (0, 0)))
-        # Shots start from each other only on the same sites.
-        on_same_sites = stack.beam is not None and isinstance(stack.task, InvertTask)
-        chained = self._options.warm_start and on_same_sites
-        return replace(stack, as_arrived=True, chained=chained, dtype=self._options.dtype)
+        return replace(stack, as_arrived=True, dtype=self._options.dtype)
 
     def _file(self, name: str) -> FileReference:
         return FileReference(self._arrivals.folder / name, self._reader)
@@ -288,11 +277,9 @@ class Watch:
         except OSError:
             self._arrivals.check()
             return  # removed before its turn
-        lane = self._begun % _LANES
-        self._begun += 1
-        attempt = self._submit(name, lane)
+        attempt = self._submit(name)
         self._busy_since = self._busy_since if self._running else time.monotonic()
-        self._running.append(_RunningShot(name, stamp_now, lane, attempt))
+        self._running.append(_RunningShot(name, stamp_now, attempt))
         if self._options.latest and self.store is not None:
             # Now, as the shot must not wait for it once it is done.
             with defer_interrupts():
@@ -313,9 +300,6 @@ class Watch:
             return
         if attempt.failure:
             self._arrivals.check()
-        chained = self._stack is not None and self._stack.chained
-        good = attempt.result is not None and attempt.result.report.converged
-        self._lanes[running.lane] = attempt.result if chained and good else None
         self._ended += 1
         try:
             # The latest shot is numbered when it begins, and the first ones create the store.
@@ -352,7 +336,7 @@ class Watch:
             return self._early.get(name)
         return None if name in self._redo or status in (PENDING, SKIPPED) else store.report(name)
 
-    def _submit(self, name: str, lane: int) -> Future[Attempt]:
+    def _submit(self, name: str) -> Future[Attempt]:
         shot = self._shot(name)
         failed = self._prepare(name, shot) if self._task is None else None
         if failed is not None:
@@ -361,10 +345,10 @@ class Watch:
             return done
         assert self._stack is not None
         assert self._task is not None
-        beam, start = self._stack.beam, self._lanes[lane]
+        beam = self._stack.beam
         # Alone, it has all the cores.
         workers = _LANES if self._running or self._arrivals.waiting else 1
-        return self._pool.submit(try_shot, self._task, shot, beam, start, workers, self._is_stopped)
+        return self._pool.submit(try_shot, self._task, shot, beam, workers, self._is_stopped)
 
     def _prepare(self, name: str, shot: Exposure) -> Attempt | None:
         """Describe the stack by its first shot; return a failed attempt if that is impossible."""
@@ -392,7 +376,7 @@ class Watch:
             shares = needed_shares(replace(stack, shots=shots), self._should_stop)
             if not shares:
                 # It fails the same way, and a later shot decides.
-                return try_shot(stack.task, shot, stack.beam, None, 1, self._should_stop)
+                return try_shot(stack.task, shot, stack.beam, 1, self._should_stop)
             stack = with_enough_sites(stack, shares)
         self._use_stack(stack)
         return None
