@@ -27,8 +27,7 @@ from napari_shadowinv import InversionOptions, Recipe, read, run_stack
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.stack import RunStatus
-from napari_shadowinv.stack._engines import local_client
-from stack import plume, warm_up
+from stack import local_client, plume, warm_up
 
 _SAMPLES = 40  # of the memory, over all frames
 

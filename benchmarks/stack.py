@@ -17,7 +17,8 @@ import argparse
 import multiprocessing
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from typing import Any
 
 import numpy as np
 import psutil  # dask needs it, too
-from distributed import Client
+from distributed import Client, LocalCluster
 
 from napari_shadowinv import InversionOptions, Recipe, Shot, run, run_stack, synthetic_image
 from napari_shadowinv.io.store import DONE, StackStore
@@ -33,7 +34,6 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import Cache, RunOptions
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import ShotOutcome, read_shot
-from napari_shadowinv.stack._engines import local_client
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 
@@ -94,6 +94,14 @@ def warm_up(shots: int, folder: Path, scheduler: Any) -> None:
     run_stack(
         few, out, Recipe(options=options), scheduler=scheduler, run=RunOptions(overwrite=True)
     )
+
+
+@contextmanager
+def local_client(count: int) -> Iterator[Client]:
+    """Start workers with one thread each."""
+    local = {"host": "127.0.0.1", "dashboard_address": None, "threads_per_worker": 1}
+    with LocalCluster(n_workers=count, **local) as cluster, Client(cluster) as client:
+        yield client
 
 
 def on_workers(count: int, timed: Callable[[Client], float], folder: Path) -> float:

@@ -42,8 +42,7 @@ from napari_shadowinv.io.store import DONE, SKIPPED, StackStore
 from napari_shadowinv.pipeline import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import RunStatus, read_shot, watch_stack
-from napari_shadowinv.stack._engines import local_client
-from stack import plume, warm_up
+from stack import local_client, plume, warm_up
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 

@@ -31,5 +31,9 @@ class FileFormatError(_UserError, OSError):
     """A file that is missing, damaged, or of another kind than its name says."""
 
 
+class RunInterruptedError(_UserError, OSError):
+    """A run that cannot go on, such as on a full disk; it can be resumed."""
+
+
 class InversionCancelled(Exception):  # noqa: N818 - it is no error: the user asked for it
     """Raised by the core when `should_stop` returned true."""

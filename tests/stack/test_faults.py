@@ -15,20 +15,17 @@ import time
 from collections import Counter
 from pathlib import Path
 
-import distributed
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
-from distributed.client import FuturesCancelledError
 
 from helpers.slow_reading import die, hang_once
 from helpers.store_content import content, whole_content
 from napari_shadowinv import FileFormatError, InversionOptions, Recipe, invert_stack, read
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.errors import RunInterruptedError
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
-from napari_shadowinv.stack import _engines
-from napari_shadowinv.stack._engines import engine_for
+from napari_shadowinv.stack import _schedulers
 from napari_shadowinv.stack._worker import threads_here
 
 OPTIONS = InversionOptions(n_sites=100)
@@ -300,49 +297,6 @@ def test_a_shot_whose_worker_always_dies_fails_with_this_reason(make_night, out,
     assert "the worker crashed on every attempt" in StackStore(out).report(0)["reason"]
 
 
-@pytest.mark.parametrize("error", [ValueError("sample larger"), FuturesCancelledError([])])
-def test_a_worker_lost_while_it_gets_the_beam(night, out, expected, cluster, monkeypatch, error):
-    def replicate(*_):
-        raise error
-
-    monkeypatch.setattr(Client, "replicate", replicate)
-    night.run(out, scheduler=cluster.scheduler_address)
-    assert content(out) == expected
-
-
-def test_workers_that_die_before_a_shot_end_the_run(cluster):
-    from distributed.scheduler import KilledWorker
-
-    class Future:
-        def __init__(self, key: str) -> None:
-            self.key = key
-
-        def result(self, timeout: float) -> None:
-            raise KilledWorker(self.key, None, 3)  # type: ignore[arg-type]
-
-    with Client(cluster, set_as_default=False) as client, engine_for(client) as engine:
-        engine.share(1, "beam-of-all")
-        with pytest.raises(_engines.EngineError, match="crash before starting a shot"):
-            engine.result(Future("beam-of-all"))
-        with pytest.raises(_engines.WorkerDiedError):
-            engine.result(Future("a-shot"))
-
-
-def test_a_result_lost_with_its_worker_is_waited_for(night, out, expected, cluster, monkeypatch):
-    result, slow = distributed.Future.result, Counter()
-
-    def made_again(future, timeout=None):
-        slow[future.key] += 1
-        if slow[future.key] == 1:
-            raise TimeoutError
-        return result(future, timeout)
-
-    monkeypatch.setattr(distributed.Future, "result", made_again)
-    night.run(out, scheduler=cluster.scheduler_address)
-    assert set(slow.values()) == {2}
-    assert content(out) == expected
-
-
 class Dask:
     """A scheduler and a worker, each a process of its own."""
 
@@ -397,7 +351,7 @@ def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected):
 
 
 def test_no_scheduler_answers(night, out, monkeypatch):
-    monkeypatch.setattr(_engines, "_CONNECT_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(_schedulers, "_CONNECT_TIMEOUT_S", 1.0)
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{closed.getsockname()[1]}"
@@ -406,30 +360,13 @@ def test_no_scheduler_answers(night, out, monkeypatch):
     assert not out.exists()
 
 
-def test_the_wait_for_a_scheduler_that_is_not_there_can_be_ended(night, out):
-    calls = []
-
-    def should_stop() -> bool:
-        calls.append(len(calls) >= 2)
-        return calls[-1]
-
-    # It takes the call and says nothing.
-    with socket.socket() as silent:
-        silent.bind(("127.0.0.1", 0))
-        silent.listen()
-        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        with pytest.raises(InversionCancelled, match="run again to resume"):
-            night.run(out, scheduler=address, should_stop=should_stop)
-    assert calls == [False, False, True]
-    assert not out.exists()
-
-
 def test_the_disk_full_while_writing(make_night, small_disk):
     night = make_night(40)
     folder, resize = small_disk
     out = folder / "night.shadowinv.zarr"
-    with pytest.raises(OSError, match=r"No space left on device\): free some disk space"):
+    with pytest.raises(RunInterruptedError, match="device\\): free some disk space") as refused:
         night.run(out)
+    assert refused.value.option == "resume"  # as a command names it
     before = read(out)
     done = before.status.values == DONE
     assert 0 < done.sum() < 40

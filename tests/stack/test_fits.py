@@ -148,7 +148,7 @@ def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> N
         out,
         recipe,
         scheduler="synchronous",
-        on_progress=lambda news: names.append(news.engine),
+        on_progress=lambda news: names.append(news.scheduler),
     )
     assert names == ["nothing to do"]
     assert again["verdict"].values[1] == ""

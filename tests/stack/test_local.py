@@ -1,126 +1,96 @@
-"""Worker processes that the package starts itself."""
+"""Schedulers on this machine: threads, processes, and any function of dask."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import platform
-import ssl
+import sys
 import threading
-import time
-import urllib.error
-import urllib.request
+from concurrent.futures import ThreadPoolExecutor
+from functools import partialmethod
 
 import dask
 import numpy as np
 import psutil  # dask needs it, too
 import pytest
-from distributed import Client, Security
-from distributed.comm import connect
 
-from napari_shadowinv.stack._engines import EngineError, engine_for, local_client
-
-ROUNDS = 200
-
-
-def pages_taken() -> float:
-    """Return how many pages a large array takes from the system, after the first few."""
-    import resource
-
-    for _ in range(5):
-        np.ones(500_000)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(ROUNDS):
-        np.ones(500_000)
-    return (resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) / ROUNDS
+from helpers.slow_reading import die, hang_once
+from helpers.store_content import content
+from napari_shadowinv import InputError, read
+from napari_shadowinv.errors import InversionCancelled, RunInterruptedError
+from napari_shadowinv.io.store import DONE, FAILED
+from napari_shadowinv.stack._worker import threads_here
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="others have no such settings")
-def test_workers_use_memory_again_that_they_had(monkeypatch):
-    before = dask.config.get("distributed.nanny.pre-spawn-environ")
-    # Every cluster of dask leaves this behind in the process that starts it.
-    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", str(before["MALLOC_TRIM_THRESHOLD_"]))
-    with local_client(1) as client:
-        (pages,) = client.run(pages_taken).values()
-    # 4 MB are 977 pages; given back each time, all of them are taken again.
-    assert pages < 50
-    assert dask.config.get("distributed.nanny.pre-spawn-environ") == before
+@pytest.fixture
+def expected(night, tmp_path) -> dict[str, bytes]:
+    store = tmp_path / "expected.shadowinv.zarr"
+    night.run(store, scheduler="synchronous")
+    return content(store)
 
 
-def answers(address: str, **security: object) -> bool:
-    """Return whether a scheduler or worker continues the connection after its greeting."""
-
-    async def greet() -> None:
-        comm = await connect(address, timeout=2, **security)
-        await comm.write({"op": "identity", "reply": True})
-        await comm.read()
-        await comm.close()
-
-    try:
-        asyncio.run(greet())
-    except OSError:
-        return False
-    return True
+def test_the_bytes_do_not_depend_on_the_scheduler(night, out, expected):
+    with ThreadPoolExecutor(2) as pool:
+        for scheduler in ("threads", "processes", pool, dask.get):
+            stored = night.run(out, scheduler=scheduler, overwrite=True)
+            assert list(stored.status.values) == [DONE] * 6
+            assert content(out) == expected
 
 
-def test_only_who_has_the_key_of_a_run_can_talk_to_it():
-    stranger = ssl.create_default_context()
-    stranger.check_hostname, stranger.verify_mode = False, ssl.CERT_NONE
-    other_keys = Security.temporary().get_connection_args("client")
-    with local_client(1) as client:
-        (worker,) = client.scheduler_info()["workers"]
-        for address in (client.scheduler.address, worker):
-            assert not answers(address.replace("tls:", "tcp:"))
-            assert not answers(address, ssl_context=stranger)
-            assert not answers(address, **other_keys)
-            assert answers(address, **client.security.get_connection_args("client"))
-        with Client(client.scheduler.address, security=client.security) as friend:
-            assert friend.submit(sum, (1, 2)).result(timeout=30) == 3
+def test_the_setting_of_dask_is_the_default(night, out):
+    names = []
+    with dask.config.set(scheduler="synchronous"):
+        night.run(out, on_progress=lambda news: names.append(news.scheduler))
+    assert set(names) == {"1 thread"}
+    assert len(names) == 7  # at the start, and after each shot
 
 
-def test_scheduler_and_workers_serve_no_pages():
-    with local_client(1) as client:
-        mine = psutil.Process()
-        ports = [
-            socket.laddr
-            for process in (mine, *mine.children(recursive=True))
-            for socket in process.net_connections("inet")
-            if socket.status == psutil.CONN_LISTEN
-        ]
-        assert {ip for ip, _ in ports} == {"127.0.0.1"}
-        pages = [
-            client.dashboard_link,
-            client.dashboard_link.replace("status", "json/identity.json"),
-        ]
-        for page in pages:
-            with pytest.raises(urllib.error.HTTPError, match="404"):
-                urllib.request.urlopen(page, timeout=5)
+def test_shots_are_told_one_by_one_in_whatever_portions_they_are_given(night, out, monkeypatch):
+    from napari_shadowinv.stack._run import _Run
+
+    monkeypatch.setattr(_Run, "run_on", partialmethod(_Run.run_on, portion=4))
+    ended = []
+    night.run(out, on_progress=lambda news: news.outcome and ended.append(news.outcome.index))
+    assert sorted(ended) == list(range(6))
 
 
-def spawned() -> set[psutil.Process]:
-    """Return the living processes that were started as workers."""
-    found = set()
-    for process in psutil.Process().children(recursive=True):
-        with contextlib.suppress(psutil.Error):  # it may have ended meanwhile
-            if "spawn_main" in " ".join(process.cmdline()):
-                found.add(process)
-    return found
+def test_a_killed_worker_process_ends_the_run_with_a_sentence(night, out, expected):
+    np.save(night.path(3), night.images[3])
+    with pytest.raises(RunInterruptedError, match="use fewer workers, then run again to resume"):
+        night.run(out, scheduler="processes", workers=1, reader=die)
+    assert not (read(out).status == FAILED).any()
+    night.run(out, scheduler="threads", overwrite=True)
+    assert content(out) == expected
 
 
-def test_worker_killed_while_it_starts_gives_one_sentence():
-    before = spawned()  # those of earlier tests may still be ending
+def children() -> set[int]:
+    return {process.pid for process in psutil.Process().children(recursive=True)}
 
-    def kill() -> None:
-        end = time.monotonic() + 60
-        while not (new := spawned() - before) and time.monotonic() < end:
-            time.sleep(0.01)
-        for process in new:
-            process.kill()
 
-    killer = threading.Thread(target=kill)
-    killer.start()
-    message = "1 process for the shots could not be started .* then run again to resume"
-    with pytest.raises(EngineError, match=message), engine_for("processes", 1):
-        pass
-    killer.join()
-    assert not spawned() - before
+@pytest.mark.parametrize("scheduler", ["threads", "processes"])
+def test_a_run_that_is_stopped_ends_its_shots_and_workers(night, out, scheduler):
+    before = children()
+    (night.folder / "hang.txt").write_text("shot_2")
+    hanging = night.folder / "hanging"
+
+    def should_stop() -> bool:
+        if hanging.exists():
+            (night.folder / "release").touch()
+        return hanging.exists()
+
+    with pytest.raises(InversionCancelled, match="run again to resume"):
+        night.run(out, reader=hang_once, scheduler=scheduler, should_stop=should_stop, workers=1)
+    assert list(read(out).status.values[2:]) == [0] * 4
+    assert not children() - before
+    assert "shot" not in {thread.name.partition("_")[0] for thread in threading.enumerate()}
+
+
+def test_shots_of_a_pool_share_the_cores():
+    with ThreadPoolExecutor(1) as pool:
+        counts = {pool.submit(threads_here, workers).result() for workers in (1, 10_000)}
+    assert min(counts) == 1
+
+
+def test_a_scheduler_elsewhere_names_the_extra_that_it_needs(night, out, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"needs distributed: .*napari-shadowinv\[cluster\]"):
+        night.run(out, scheduler="tcp://127.0.0.1:9")
+    assert not out.exists()

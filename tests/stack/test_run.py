@@ -146,7 +146,7 @@ def test_a_finished_run_has_nothing_to_do(night, out):
     night.run(out, shots=night.images)
     progress = []
     night.run(out, shots=night.images, on_progress=progress.append)
-    assert [(p.engine, p.done, p.outcome) for p in progress] == [("nothing to do", 6, None)]
+    assert [(p.scheduler, p.done, p.outcome) for p in progress] == [("nothing to do", 6, None)]
 
 
 def spoil(night) -> dict[int, str]:
@@ -295,7 +295,7 @@ def test_the_first_run_ever_compiles_before_its_shots(night, out, monkeypatch):
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     night.run(out, scheduler="synchronous", on_progress=progress.append)
     assert "minute" in progress[0].stage
-    assert progress[0].engine == ""
+    assert progress[0].scheduler == ""
     assert not any(news.stage for news in progress[1:])
     assert progress[-1].done == 6
     with pytest.raises(InversionCancelled):

@@ -23,7 +23,7 @@ def test_rate_and_forecast_follow_from_the_numbers():
         (RunStatus(total=4, done=4), "4 of 4 done"),
         (RunStatus(total=4, done=2, failed=1, waiting=1), "2 of 4 done, 1 failed"),
         (RunStatus(total=4, done=4, doubtful=3), "4 of 4 done, 3 with warnings"),
-        (RunStatus(done=2, waiting=5, engine="watching"), "2 done, 5 waiting"),
+        (RunStatus(done=2, waiting=5, scheduler="watching"), "2 done, 5 waiting"),
     ],
 )
 def test_text_names_the_numbers_above_zero(status, text):

@@ -144,7 +144,7 @@ def test_damaged_shot_is_pending_until_it_is_redone(any_night, store):
     field(store, 3, "potential").unlink()
 
     def stop(_progress: object) -> None:
-        if _progress.engine:
+        if _progress.scheduler:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -191,7 +191,7 @@ class _ProgressBar:
             remaining = f"{time_left} left" if status.waiting else "finishing"
         self.bars.update(
             self._task,
-            description=status.engine,
+            description=status.scheduler,
             total=status.total,
             completed=status.done + status.failed,
             rate=_rate_text(status),

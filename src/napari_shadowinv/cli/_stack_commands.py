@@ -16,7 +16,7 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 HELP = {
     "source": "Image of the undisturbed beam; batch also takes a glob matching one image per "
     "shot. Default: uniform.",
-    "scheduler": "Address of a dask scheduler (tcp://host:8786), threads or processes.",
+    "scheduler": "threads, processes, or the address of a dask scheduler (tcp://host:8786).",
     "format": "tiff (float32, one file per shot and component), pradformat or openpmd (one file "
     "per shot), or csv (a table with a row per shot).",
     "shots": "A quoted glob, a folder, a list of files, a file with many frames (multi-page TIFF, "
@@ -119,7 +119,7 @@ def _stack_inputs(
 def batch(
     shots: Annotated[list[str], _flags.argument(help=HELP["shots"])],
     out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
-    scheduler: Annotated[str, Option(help=HELP["scheduler"])] = "processes",
+    scheduler: Annotated[str, Option(help=HELP["scheduler"])] = "threads",
     resume: Annotated[bool, Option("--resume", help=HELP["resume"])] = False,
     *,
     run: RunOptions,

@@ -30,7 +30,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 from napari_shadowinv._system.hidden_files import hidden_name
 from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv._typing import AnyArray
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, RunInterruptedError
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.io.store import (
     DONE,
@@ -50,24 +50,20 @@ _TOGETHER = 1024  # values of a coordinate along shots that are one file
 NUMBERED_AS_ARRIVED = {"order": "as they arrived"}
 
 
-class StoreError(OSError):
-    """A store that cannot be written: the run must end, no shot is to blame."""
-
-
 @contextmanager
 def _as_store_errors(path: Path) -> Iterator[None]:
-    """Turn an error of the file system into a `StoreError` with its reason and advice."""
+    """Turn an error of the file system into one with its reason and advice."""
     try:
         yield
-    except StoreError:
+    except RunInterruptedError:
         raise
     except OSError as error:
         if not (path / "zarr.json").exists():
-            raise StoreError(
+            raise RunInterruptedError(
                 f"{path} was removed or moved while it was being written: put it back and run "
                 "again to resume, or start again with another name"
             ) from error
-        raise StoreError(
+        raise RunInterruptedError(
             f"{path} cannot be written ({error.strerror or error}): free some disk space or check "
             "the folder's permissions, then run again to resume"
         ) from error
@@ -91,7 +87,7 @@ class ShotWriter:
     ) -> None:
         """Write a shot and its report; it has its status when this returns, pending if it fails."""
         if read_attributes(self.path).get("store_id", "") != self.store_id:
-            raise StoreError(
+            raise RunInterruptedError(
                 f"{self.path} is missing or is not the store the run started with: all workers "
                 "must share one file system, and the store must not be replaced during the run"
             )
@@ -147,7 +143,7 @@ def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
     arrays = _open_to_write(path)
     shot_count = arrays["status"].shape[0]
     if shot_count != shots:
-        raise StoreError(
+        raise RunInterruptedError(
             f"{path} has {shot_count} shots here and {shots} where the run was started: wait until "
             "the file system is in sync on all machines, then run again to resume"
         )

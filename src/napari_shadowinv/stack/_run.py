@@ -8,10 +8,9 @@
 from __future__ import annotations
 
 import json
-import queue
 import time
-from collections.abc import Callable, Collection
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +27,7 @@ from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray
-from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.errors import InputError, RunInterruptedError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.compilation import ensure_compiled
@@ -55,7 +54,6 @@ from napari_shadowinv.io.store_writing import (
 )
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack._engines import Engine, WorkerDiedError, engine_for, is_local
 from napari_shadowinv.stack._plan import (
     STORED,
     Stack,
@@ -66,14 +64,14 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
     values_of_beam,
 )
+from napari_shadowinv.stack._schedulers import Scheduler, is_local, scheduler_for
 from napari_shadowinv.stack._shots import Reader, differences, read_shot
-from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext, run_shot
+from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext
 
 if TYPE_CHECKING:
     import xarray
 
-WATCHING = "watching"  # name of the engine of a watched folder
-_POLL_S = 0.25  # between two looks at the engine and at `should_stop`
+WATCHING = "watching"  # in place of the scheduler's name
 _CHOSEN_SITES = "chosen_sites"  # attribute: number of sites from the accuracy and the first shots
 _APPENDED = "appended_at"  # attribute: numbers of the first shots appended by later runs
 _ALTERNATIVES = "use the same, overwrite the store, or choose another name"
@@ -97,8 +95,8 @@ class RunStatus:
         Shots that have ended in this run.
     seconds : float
         Time of this run; of a watched folder, the time during which shots were inverted.
-    engine : str
-        Name of the engine that inverts the shots.
+    scheduler : str
+        Name of the scheduler that runs the shots.
     stage : str
         Current stage of the preparation, before all shots.
     name, outcome : str, ShotOutcome or None
@@ -121,7 +119,7 @@ class RunStatus:
     waiting: int = 0
     ended: int = 0
     seconds: float = 0.0
-    engine: str = ""
+    scheduler: str = ""
     stage: str = ""
     name: str = ""
     outcome: ShotOutcome | None = None
@@ -143,7 +141,7 @@ class RunStatus:
     @property
     def text(self) -> str:
         """The numbers of shots."""
-        is_watch = self.engine == WATCHING
+        is_watch = self.scheduler == WATCHING
         numbers = [
             f"{self.done} done" if is_watch else f"{self.done} of {self.total} done",
             f"{self.failed} failed" if self.failed else "",
@@ -188,9 +186,10 @@ def run_stack(
     run : RunOptions, optional
         Choices of the run: stored variables and their type, workers, whether to overwrite the
         store or to repeat failed shots. A mapping is converted.
-    scheduler : str, distributed.Client, cluster or None, optional
-        ``"threads"``, ``"processes"``, ``"synchronous"``, the address of a scheduler, a client or
-        a cluster. Default: dask's current client, else threads. The results do not depend on it.
+    scheduler : str, distributed.Client, cluster, callable or None, optional
+        Any of dask: ``"threads"``, ``"processes"``, ``"synchronous"``, the address of a scheduler,
+        a client, a cluster or a function. Default: dask's current client, its setting, or threads.
+        The results do not depend on it.
     on_progress : callable, optional
         Receives a `RunStatus` at the start and after each shot.
     should_stop : callable, optional
@@ -207,8 +206,9 @@ def run_stack(
         If the arguments do not fit together, or not to the store.
     FileFormatError
         If the store cannot be used, or another process is writing to it.
-    OSError
-        If the disk is full or the cluster is lost; the store can be resumed.
+    RunInterruptedError
+        An `OSError`, if the disk is full, or a worker or the cluster is lost; the store can be
+        resumed.
     InversionCancelled
         If `should_stop` returned true; the store can be resumed.
     """
@@ -240,7 +240,7 @@ def run_stack(
                 _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
                 return read_stack(path)
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
-        with engine_for(scheduler, run.workers, should_stop) as engine:
+        with _resumable(), scheduler_for(scheduler, run.workers) as chosen:
             if store is None:
                 if stack.chooses_sites:
                     prepare("how many sites the first shots need")
@@ -248,8 +248,18 @@ def run_stack(
                 store = create_store(path, contents_of(stack), overwrite=run.overwrite)
             elif arrived:
                 store = append_shots(store, stack)
-            _Run(stack, store, again, on_progress, should_stop).run_on(engine)
+            _Run(stack, store, again, on_progress, should_stop).run_on(chosen)
     return read_stack(path)
+
+
+@contextmanager
+def _resumable() -> Iterator[None]:
+    """Let an interruption name the option that resumes the run."""
+    try:
+        yield
+    except RunInterruptedError as error:
+        error.option = "resume"
+        raise
 
 
 def stored_variables(
@@ -262,7 +272,7 @@ def stored_variables(
 
 
 class _Run:
-    """A run: submits shots to an engine, and counts their outcomes."""
+    """A run: gives shots to a scheduler, and counts their outcomes."""
 
     def __init__(
         self,
@@ -273,14 +283,14 @@ class _Run:
         should_stop: ShouldStop | None,
     ) -> None:
         self._stack = stack
-        self._store, self._writer = store, ShotWriter.of(store)
+        self._store = store
         self._on_progress, self._should_stop = on_progress, should_stop
         statuses, reports = store.statuses(), store.reports()
-        self._todo = {int(index) for index in np.flatnonzero(np.isin(statuses, again))}
+        self._todo = [int(index) for index in np.flatnonzero(np.isin(statuses, again))]
         self._failures = [
             (store.names[index], str(reports[int(index)].get("reason", "unknown")))
             for index in np.flatnonzero(statuses == FAILED)
-            if index not in self._todo
+            if FAILED not in again
         ]
         self._status = RunStatus(
             total=len(statuses),
@@ -292,7 +302,7 @@ class _Run:
         )
         self._began = time.monotonic()
 
-    def report(self, engine: str, outcome: ShotOutcome | None = None) -> None:
+    def report(self, scheduler: str, outcome: ShotOutcome | None = None) -> None:
         status, name = self._status, ""
         if outcome is not None:
             name = self._stack.shots.items[outcome.index].name
@@ -307,72 +317,24 @@ class _Run:
         waiting, failures = status.total - status.done - failed, tuple(self._failures)
         status = replace(status, failed=failed, waiting=waiting, failures=failures)
         self._on_progress(
-            replace(status, seconds=seconds, engine=engine, name=name, outcome=outcome)
+            replace(status, seconds=seconds, scheduler=scheduler, name=name, outcome=outcome)
         )
 
-    def run_on(self, engine: Engine) -> None:
-        """Invert all pending shots, and summarise their reports."""
+    def run_on(self, scheduler: Scheduler, portion: int = 1000) -> None:
+        """Run all pending shots, a portion at a time, and summarise their reports."""
+        stack, items = self._stack, self._stack.shots.items
+        context = TaskContext(ShotWriter.of(self._store), stack.shot_task, scheduler.workers)
+        self.report(scheduler.name)
         try:
-            self._work_on(engine)
+            for first in range(0, len(self._todo), portion):
+                shots = {index: items[index] for index in self._todo[first : first + portion]}
+                for outcome in scheduler.outcomes(shots, stack.beam, context, self._should_stop):
+                    self.report(scheduler.name, outcome)
         except BaseException:
             with suppress(OSError):
                 summarise(self._store)
             raise
         summarise(self._store)
-
-    def _work_on(self, engine: Engine) -> None:
-        self.report(engine.name)
-        stack = self._stack
-        # A name that no earlier run has used: dask would reuse the earlier value.
-        name = f"settings-{self._writer.store_id}-{time.time_ns()}"
-        beam = stack.beam and engine.share(stack.beam, f"beam-{stack.beam.key}")
-        context = engine.share(TaskContext(self._writer, stack.shot_task, engine.workers), name)
-        ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        running: dict[Any, int] = {}
-        todo = iter(sorted(self._todo))
-        try:
-            while True:
-                window = engine.window(files=stack.shots.array is None)
-                while len(running) < window and (index := next(todo, None)) is not None:
-                    item = stack.shots.items[index]
-                    future = engine.submit(run_shot, item, index, beam, context, engine.stop)
-                    running[future] = index
-                    future.add_done_callback(ended.put)
-                if not running:
-                    return
-                future = self._wait(engine, ended)
-                if future is None:
-                    continue
-                if self._end(engine, future, running[future]):
-                    del running[future]
-                else:
-                    future.add_done_callback(ended.put)
-        except BaseException:
-            for future in running:
-                future.cancel()
-            raise
-
-    def _wait(self, engine: Engine, ended: queue.SimpleQueue[Any]) -> Any:
-        """Return a finished task, or None after a timeout."""
-        if self._should_stop is not None and self._should_stop():
-            raise InversionCancelled("stopped on request; run again to resume")
-        try:
-            return ended.get(timeout=_POLL_S)
-        except queue.Empty:
-            engine.check()
-            return None
-
-    def _end(self, engine: Engine, future: Any, index: int) -> bool:
-        """Count the shot of a task, or return False if the task is repeated."""
-        try:
-            outcome = engine.result(future)
-        except WorkerDiedError as error:
-            outcome = ShotOutcome(index, FAILED, 0.0, str(error))
-            self._writer.write(index, {}, {"reason": str(error)}, FAILED)
-        if outcome is None:
-            return False
-        self.report(engine.name, outcome)
-        return True
 
 
 def contents_of(stack: Stack) -> Contents:

@@ -51,7 +51,7 @@ def status_file(
         except OSError as error:
             if not has_failed:
                 note = f"the status file cannot be written: {error}"
-                on_progress(RunStatus(engine=WATCHING, note=note))
+                on_progress(RunStatus(scheduler=WATCHING, note=note))
             has_failed = True
 
     def update(status: RunStatus) -> None:

@@ -530,17 +530,16 @@ class TaskContext:
 
 def run_shot(
     shot: Exposure,
-    block: AnyArray | None,
     index: int,
+    should_stop: ShouldStop | None,
     beam: Beam | None,
     context: TaskContext,
-    stop: Any = None,
+    block: AnyArray | None = None,
 ) -> ShotOutcome:
-    """Task: invert, or fit, a shot and write it.
+    """Task: load a shot, invert or fit it, and write it; what goes wrong with it is its outcome.
 
     A shot is replaced by its block of a dask array if a cluster has computed that already.
     """
-    should_stop = None if stop is None else stop.is_set
     if block is not None:
         shot = replace(shot, images=ArrayReference(block[0]))
     attempt = try_shot(context.task, shot, beam, context.workers, should_stop)
@@ -599,6 +598,12 @@ def write_shot(
     spent = time.perf_counter() - attempt.began
     count = len(report["warnings"])
     return ShotOutcome(index, DONE, spent, converged=result.report.converged, warnings=count)
+
+
+def write_failure(writer: ShotWriter, index: int, reason: str) -> ShotOutcome:
+    """Write a shot that could not be begun."""
+    writer.write(index, {}, {"reason": reason}, FAILED)
+    return ShotOutcome(index, FAILED, 0.0, reason)
 
 
 def failure_text(error: Exception) -> str:

@@ -146,7 +146,7 @@ class Watch:
             waiting=len(self._arrivals.waiting) + len(self._running),
             ended=self._ended,
             seconds=self._busy_s + (time.monotonic() - self._busy_since if self._running else 0.0),
-            engine=WATCHING,
+            scheduler=WATCHING,
             failures=tuple(self._failures.items()),
         )
         self._on_progress(replace(status, **news))

@@ -20,7 +20,7 @@ from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, read_st
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import LowPassEstimate, LowPassFilter
-from napari_shadowinv.stack import _engines, _worker
+from napari_shadowinv.stack import _schedulers, _worker
 
 Array = np.ndarray[Any, Any]
 FEW = {"n_sites": 100}
@@ -298,7 +298,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.store.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
     tool.engine.set_kind("scheduler")
     expect("address is ''")
-    monkeypatch.setattr(_engines, "_CONNECT_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(_schedulers, "_CONNECT_TIMEOUT_S", 0.3)
     tool.engine.address.setText("tcp://127.0.0.1:9")
     expect("o scheduler responds at tcp://127.0.0.1:9")
     tool.engine.set_kind("threads")
