@@ -23,9 +23,6 @@ from napari_shadowinv.cli import _batch
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
 from napari_shadowinv.stack import RunStatus, watch_stack
-from napari_shadowinv.stack import watch as watching
-from napari_shadowinv.stack._worker import Attempt, ShotOutcome
-from napari_shadowinv.stack.watch import Watch
 
 pytestmark = pytest.mark.usefixtures("impatient")
 
@@ -61,48 +58,6 @@ def test_watch_equals_a_run(folder, out, tmp_path):
     np.testing.assert_array_equal(watched.displacement, run.displacement)
     for name in ("iterations", "image_residual", "seconds"):
         assert (watched[name] > 0).all()
-
-
-def test_a_shot_that_waits_begins_before_the_last_one_is_written(folder, out, monkeypatch):
-    put(folder, *range(6))
-    at_work = []
-    write = Watch._write
-
-    def note(self: Watch, name: str, attempt: Attempt) -> ShotOutcome:
-        at_work.append([shot.name for shot in self._running])
-        return write(self, name, attempt)
-
-    monkeypatch.setattr(Watch, "_write", note)
-    result = watched_once(folder, out)
-    names = [f"shot_{index}.npy" for index in range(6)]
-    # The first shot creates the store; until then nothing begins.
-    assert all(names[k + 1] in at_work[k] for k in range(1, 5))
-    assert list(result.name.values) == names
-    assert list(result.status.values) == [DONE] * 6
-
-
-def test_a_file_that_is_written_again_keeps_the_order_of_the_others(folder, out, monkeypatch):
-    put(folder, 0, 1, 2)
-    again = threading.Event()
-    attempt = watching.try_shot
-
-    def note(task: Any, shot: Any, *args: Any) -> Attempt:
-        done = attempt(task, shot, *args)
-        if shot.name == "shot_2.npy" and not again.is_set():
-            np.save(folder / shot.name, 1.01 * IMAGES[2])  # after it was read
-            time.sleep(0.3)
-            again.set()
-            time.sleep(0.3)
-        elif shot.name == "shot_1.npy":
-            again.wait(20)
-        return done
-
-    monkeypatch.setattr(watching, "try_shot", note)
-    with Watched(folder, out) as watched:
-        watched.ended(4)
-    assert [event.name for event in watched.shots] == [f"shot_{k}.npy" for k in (0, 1, 2, 2)]
-    assert list(watched.result.name.values) == [f"shot_{k}.npy" for k in (0, 1, 2)]
-    assert list(watched.result.status.values) == [DONE] * 3
 
 
 def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):
@@ -433,12 +388,13 @@ def test_file_written_during_its_read_is_read_again(folder, out):
             path.write_bytes(whole(4))
         return image
 
-    put(folder, 0)
+    put(folder, 0, 1)
+    names = "shot_0.npy", "shot_1.npy"
     with Watched(folder, out, reader=load_and_change, dtype="float64") as watch:
-        watch.ended(1)
+        watch.ended(3)
         watch.until(lambda: watch.events[-1].waiting == 0)
-    assert len(reads) > 1
-    assert len(watch.shots) == 1
+    assert [(event.name, event.again) for event in watch.shots][-1] == (names[0], True)
+    assert list(watch.result.name.values) == list(names)
     expected = invert(IMAGES[4], plan=plan_sites(SOURCE, OPTIONS), options=OPTIONS)
     np.testing.assert_array_equal(watch.result.displacement[0], expected.displacement)
 

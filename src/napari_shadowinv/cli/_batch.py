@@ -478,7 +478,7 @@ def run_watch(
     remaining = f", {status.skipped} skipped" if status.skipped else ""
     remaining += f", {waiting} not yet inverted" if waiting else ""
     if not done:
-        text = f"Stopped: {failed} failed, nothing written" if failed else "Stopped: no shots"
+        text = f"Stopped: {failed} failed" if failed else "Stopped: no shots"
         text = f"{text}{remaining}; repeat the command to watch again."
     else:
         text = f"Stopped: {done} done, {failed} failed{remaining}"

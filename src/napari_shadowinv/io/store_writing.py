@@ -34,6 +34,7 @@ from napari_shadowinv.errors import FileFormatError, RunInterruptedError
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.io.store import (
     DONE,
+    FAILED,
     FORMAT,
     PENDING,
     SKIPPED,
@@ -333,7 +334,7 @@ class GrowingStore:
     def __init__(self, store: StackStore) -> None:
         self.path = store.path
         # Not the cached arrays, as these grow: other code in this process needs a fixed length.
-        self._writer = replace(ShotWriter.of(store), opened=_open_to_write(store.path))
+        self.writer = replace(ShotWriter.of(store), opened=_open_to_write(store.path))
         self._columns = store.columns
         self._numbers = {name: index for index, name in enumerate(store.names)}
         self._statuses = bytearray(store.statuses().astype(np.uint8).tobytes())
@@ -345,9 +346,9 @@ class GrowingStore:
         """Return how many shots are pending, done or failed."""
         return self._statuses.count(status)
 
-    def done_names(self) -> Iterator[str]:
-        """Return the names of the shots that are done, one by one."""
-        return (name for name, index in self._numbers.items() if self._statuses[index] == DONE)
+    def names_of(self, status: int) -> Iterator[str]:
+        """Return the names of the shots of a status, one by one."""
+        return (name for name, index in self._numbers.items() if self._statuses[index] == status)
 
     def status(self, name: str) -> int | None:
         """Return the status of a shot, None if it is not there yet."""
@@ -356,44 +357,45 @@ class GrowingStore:
 
     def report(self, name: str) -> dict[str, Any]:
         """Return the report of a shot that has ended."""
-        text = str(self._writer.arrays()["report"][self._numbers[name]])
+        text = str(self.writer.arrays()["report"][self._numbers[name]])
         return dict(json.loads(text or "{}"))
 
-    def append(self, *names: str) -> int:
-        """Make room for shots that are not there yet, pending; return the number of the last."""
-        new = [name for name in names if name not in self._numbers]
+    def skip(self, names: Collection[str], *following: str) -> None:
+        """Mark shots that have not ended as skipped; they and those following get their numbers."""
+        new = [name for name in dict.fromkeys([*names, *following]) if name not in self._numbers]
         if new:
             numbers = range(len(self), len(self) + len(new))
             values = {"shot": np.array(numbers), "name": np.array(new, dtype=object)}
-            grow_store(self.path, values, NUMBERED_AS_ARRIVED, self._writer.arrays(), room=64)
+            grow_store(self.path, values, NUMBERED_AS_ARRIVED, self.writer.arrays(), room=64)
             self._numbers.update(zip(new, numbers, strict=True))
             self._statuses.extend([PENDING] * len(new))
-        return self._numbers[names[-1]]
+        for name in names:
+            self.writer.skip(self._numbers[name])
+            self._statuses[self._numbers[name]] = SKIPPED
+
+    def reopen(self, name: str) -> int:
+        """Mark a shot as pending that is to be done again; return its number."""
+        index = self._numbers[name]
+        if self._statuses[index] != PENDING:
+            self.writer.reopen(index)
+            self._statuses[index] = PENDING
+        return index
+
+    def fail(self, name: str, report: Mapping[str, Any]) -> None:
+        """Write a shot that could not be read."""
+        self.writer.write(self._numbers[name], {}, report, FAILED)
+        self.end(self._numbers[name])
+
+    def end(self, index: int) -> None:
+        """Note the status of a shot that was written, and gather its columns."""
+        arrays = self.writer.arrays()
+        self._statuses[index] = int(arrays["status"][index])
+        report = dict(json.loads(str(arrays["report"][index]) or "{}"))
+        self.writer.write_columns(self._columns, [report], slice(index, index + 1))
 
     def close(self) -> None:
         """Give the arrays their final length, which programs may read that ignore the folder's."""
         with _as_store_errors(self.path):
-            for array in self._writer.arrays().values():
+            for array in self.writer.arrays().values():
                 if is_along_shots(array) and array.shape[0] != len(self):
                     array.resize((len(self), *array.shape[1:]))
-
-    def skip(self, names: Collection[str], *following: str) -> None:
-        """Mark shots that have not ended as skipped; they and those following get their numbers."""
-        if names or following:
-            self.append(*names, *following)
-        for name in names:
-            self._writer.skip(self._numbers[name])
-            self._statuses[self._numbers[name]] = SKIPPED
-
-    def reopen(self, index: int) -> None:
-        """Mark a shot as pending that is to be done again, and forget its fields."""
-        self._writer.reopen(index)
-        self._statuses[index] = PENDING
-
-    def write(
-        self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int = DONE
-    ) -> None:
-        """As `ShotWriter.write`; the shot's numbers are there as soon as it has its status."""
-        self._writer.write_columns(self._columns, [report], slice(index, index + 1))
-        self._writer.write(index, arrays, report, status)
-        self._statuses[index] = status

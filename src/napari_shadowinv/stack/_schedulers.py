@@ -27,12 +27,11 @@ from napari_shadowinv.errors import (
     InversionCancelled,
     RunInterruptedError,
 )
-from napari_shadowinv.stack._shots import BlockReference, Exposure, ImageReference
+from napari_shadowinv.stack._shots import BlockReference, Exposure, ImageReference, failure_text
 from napari_shadowinv.stack._worker import (
     Beam,
     ShotOutcome,
     TaskContext,
-    failure_text,
     run_shot,
     write_failure,
 )
@@ -56,7 +55,7 @@ class Scheduler:
         self.name, self.workers = name, workers
         self._get, self._pool = get, pool
         self._stop = threading.Event() if stop is None else stop
-        self._is_stopped = is_stopped or self._stop.is_set  # as the tasks ask
+        self._is_stopped = is_stopped  # as tasks ask that cannot ask here
 
     def outcomes(
         self,
@@ -66,7 +65,11 @@ class Scheduler:
         should_stop: ShouldStop | None,
     ) -> Iterator[ShotOutcome]:
         """Run shots by their numbers, and yield the outcome of each as it ends."""
-        tasks = _tasks(shots, beam, context, should_stop=self._is_stopped)
+
+        def is_stopped() -> bool:
+            return self._stop.is_set() or (should_stop is not None and should_stop())
+
+        tasks = _tasks(shots, beam, context, self._is_stopped or is_stopped)
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         note = (None, None, None, lambda key, value, *_: ended.put(value), None)
         dask: Any = import_module("dask")

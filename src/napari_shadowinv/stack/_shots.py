@@ -52,6 +52,12 @@ Value = TypeVar("Value")
 _MAX_SHAPE_READS = 3  # shots that are read for the shape of all
 
 
+class NoShotError(FileFormatError):
+    """None of the shots can be read; `reason` says why the first cannot."""
+
+    reason = ""
+
+
 class ImageReference:
     """An image, or several of one object, read on demand; it can be sent to a worker."""
 
@@ -63,6 +69,10 @@ class ImageReference:
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
         """Return the image and its ``sha256``, with ``warnings`` for the shot's report if any."""
         raise NotImplementedError
+
+    def stamp(self) -> dict[str, Any]:
+        """Return metadata that are known before the image is read."""
+        return {}
 
     def shape(self) -> tuple[int, ...]:
         """Return the shape of the image, which has to be read."""
@@ -129,17 +139,20 @@ class FileReference(ImageReference):
         values, _, metadata = self._read_masked()
         return values, metadata
 
+    def stamp(self) -> dict[str, Any]:
+        # Before the image: it may be written to while it is read.
+        return stamp(self.path) if self.page is None else {}
+
     def _read_masked(self) -> tuple[AnyArray, BoolArray | None, dict[str, Any]]:
         parts = {"page": self.page, "variable": self.variable}
         options: dict[str, Any] = {name: part for name, part in parts.items() if part is not None}
         warnings: list[Caution] = []
+        digest = sha256(self.path) if self.page is None else ""
         if "warnings" in inspect.signature(self.reader).parameters:
             options["warnings"] = warnings
         image, usable = unpack_array(self.reader(self.path, **options), "the shot")
         metadata: dict[str, Any] = {"warnings": warnings} if warnings else {}
-        if self.page is not None:
-            return image, usable, {"sha256": checksum(image), **metadata}
-        return image, usable, {**stamp(self.path), "sha256": sha256(self.path), **metadata}
+        return image, usable, {"sha256": digest or checksum(image), **metadata}
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare a file as in a table's rows, and a page by its checksum."""
@@ -454,13 +467,24 @@ def _read_first(
     for shot in items:
         try:
             values.append(read(shot))
-        except (OSError, ValueError) as error:
+        except Exception as error:
             first_error = first_error or error
         if len(values) == count:
             break
     if not values:
-        raise FileFormatError(f"none of {len(items)} shots can be read, the first: {first_error}")
+        refused = NoShotError(f"none of {len(items)} shots can be read, the first: {first_error}")
+        refused.reason = "" if first_error is None else failure_text(first_error)
+        raise refused
     return values
+
+
+def failure_text(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        return "there is not enough memory for this shot on its worker"
+    kind = type(error).__name__
+    if isinstance(error, InputError | OSError):
+        return str(error) or kind
+    return f"{kind}: {error}"
 
 
 def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:

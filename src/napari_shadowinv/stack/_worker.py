@@ -1,7 +1,7 @@
 """Tasks of a worker: `InvertTask` inverts one shot, `FitTask` fits one.
 
 - a shot inverted and written to the store: `run_shot`
-- its two parts: `try_shot`, `write_shot`
+- its first part: `try_shot`
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.variables import dataset_from_field, fit_labels, variable_labels
 from napari_shadowinv.io.store import DONE, FAILED
 from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, column_values
-from napari_shadowinv.io.store_writing import GrowingStore, ShotWriter
+from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache, Inputs, collect_inputs, run_fit, run_prepared
@@ -42,7 +42,7 @@ from napari_shadowinv.pipeline.inversion_run import same_array
 from napari_shadowinv.preprocessing import Estimate, Recipe, UniformEstimate
 from napari_shadowinv.provenance import MaskVariable, mask_variables
 from napari_shadowinv.shot import Shot
-from napari_shadowinv.stack._shots import ArrayReference, Exposure
+from napari_shadowinv.stack._shots import ArrayReference, Exposure, failure_text
 from napari_shadowinv.transport.sites import SitePlan
 
 _REFRESH_S = 10.0  # workers come and go, but asking takes milliseconds
@@ -509,6 +509,8 @@ class ShotOutcome:
         Why it failed, and whether the solver reached its tolerance, or the fit its end.
     warnings : int
         Number of warnings about its result.
+    result : Inversion, Fit or None
+        Its result, for a watched folder; do not keep a reference.
     """
 
     index: int
@@ -517,6 +519,7 @@ class ShotOutcome:
     reason: str = ""
     converged: bool = True
     warnings: int = 0
+    result: Inversion | Fit | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -526,6 +529,7 @@ class TaskContext:
     writer: ShotWriter
     task: AnyTask
     workers: int | None
+    keeps_results: bool = False  # in the outcomes
 
 
 def run_shot(
@@ -543,7 +547,8 @@ def run_shot(
     if block is not None:
         shot = replace(shot, images=ArrayReference(block[0]))
     attempt = try_shot(context.task, shot, beam, context.workers, should_stop)
-    return write_shot(context.writer, context.task, index, attempt)
+    outcome = _write_shot(context.writer, context.task, index, attempt)
+    return replace(outcome, result=attempt.result) if context.keeps_results else outcome
 
 
 @dataclass(frozen=True, eq=False)
@@ -569,7 +574,9 @@ def try_shot(
     origin: dict[str, Any] = {}
     result, failure = None, ""
     try:
-        images, origin = shot.images.load()
+        origin = shot.images.stamp()
+        images, loaded = shot.images.load()
+        origin |= loaded
         source = None
         if shot.source is not None:
             source, origin["source"] = shot.source.images.read()
@@ -582,9 +589,7 @@ def try_shot(
     return Attempt(began, time.perf_counter() - began, origin, result, failure)
 
 
-def write_shot(
-    writer: ShotWriter | GrowingStore, task: AnyTask, index: int, attempt: Attempt
-) -> ShotOutcome:
+def _write_shot(writer: ShotWriter, task: AnyTask, index: int, attempt: Attempt) -> ShotOutcome:
     result: Any = attempt.result
     cautions = [dataclasses.asdict(caution) for caution in attempt.origin.get("warnings", ())]
     if result is None:
@@ -604,12 +609,3 @@ def write_failure(writer: ShotWriter, index: int, reason: str) -> ShotOutcome:
     """Write a shot that could not be begun."""
     writer.write(index, {}, {"reason": reason}, FAILED)
     return ShotOutcome(index, FAILED, 0.0, reason)
-
-
-def failure_text(error: Exception) -> str:
-    if isinstance(error, MemoryError):
-        return "there is not enough memory for this shot on its worker"
-    kind = type(error).__name__
-    if isinstance(error, InputError | OSError):
-        return str(error) or kind
-    return f"{kind}: {error}"

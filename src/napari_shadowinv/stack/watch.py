@@ -6,14 +6,12 @@
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections import Counter
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,13 +21,18 @@ from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model
-from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.errors import FileFormatError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.frames import counts_text
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, SKIPPED, StackStore, check_store_path
-from napari_shadowinv.io.store_writing import GrowingStore, create_store, remove_unfinished
+from napari_shadowinv.io.store_writing import (
+    GrowingStore,
+    create_store,
+    remove_unfinished,
+    summarise,
+)
 from napari_shadowinv.pipeline.run_options import WatchOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._arrivals import Arrivals, checked_folder
@@ -48,59 +51,27 @@ from napari_shadowinv.stack._run import (
     match_store,
     stored_variables,
 )
+from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import (
     Exposure,
     FileReference,
-    ImageReference,
+    NoShotError,
     Reader,
     Shots,
     read_shot,
     stamp,
 )
 from napari_shadowinv.stack._status_file import status_file
-from napari_shadowinv.stack._worker import (
-    AnyTask,
-    Attempt,
-    ShotOutcome,
-    failure_text,
-    try_shot,
-    write_shot,
-)
+from napari_shadowinv.stack._worker import ShotOutcome, TaskContext, try_shot
 
 if TYPE_CHECKING:
     import xarray
 
-_LANES = 2  # simultaneous shots
 _CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
 
 
-def _is_unchanged(file: FileReference, report: dict[str, Any], stamp_now: dict[str, int]) -> bool:
-    # Within the resolution of file times it may have changed at the same time.
-    if time.time() - stamp_now["mtime_ns"] / 1e9 < _CLOCK_RESOLUTION_S and "sha256" in report:
-        return bool(sha256(file.path) == report["sha256"])
-    return file.unchanged(report)
-
-
-class _ShapeUnknownError(Exception):
-    """The shape is unknown until a shot has arrived."""
-
-
-class _NoImage(ImageReference):
-    """Placeholder before any shot has arrived."""
-
-    def shape(self) -> tuple[int, ...]:
-        raise _ShapeUnknownError
-
-
-@dataclass(frozen=True, eq=False)
-class _RunningShot:
-    name: str
-    stamp_before: dict[str, int]  # of its file, before it was read
-    attempt: Future[Attempt]
-
-
 class Watch:
-    """The loop: inverts two files simultaneously, and writes them in the order of arrival.
+    """The loop over a folder: files that are complete are run like the shots of any stack.
 
     With `latest`, the newest file is next, and all others that wait are skipped.
     """
@@ -118,19 +89,17 @@ class Watch:
         self._path, self._options, self._describe, self._reader = path, options, describe, reader
         self._arrivals, self._on_progress, self._should_stop = arrivals, on_progress, should_stop
         self.store: GrowingStore | None = None
-        # Failures before the first good shot, which creates the store or proves that it fits.
+        self._stack: Stack | None = None
+        self._is_ready = False  # whether the number of sites is known
+        # Reports of failures before the first good shot, which creates the store or fits it.
         self._early: dict[str, dict[str, Any]] = {}
         self._doubtful: set[str] = set()
         self._failures: dict[str, str] = {}
-        self._stack: Stack | None = None
-        self._task: AnyTask | None = None  # once the number of sites is known
-        self._pool = ThreadPoolExecutor(_LANES)
-        self._abandoned = Event()
-        self._running: deque[_RunningShot] = deque()
         self._redo: set[str] = set()
         self._skipped: dict[str, None] = {}  # not in the store yet, in order of arrival
+        self._running: dict[int, str] = {}
         self._ended = 0
-        self._last = self._busy_since = time.monotonic()
+        self._last = time.monotonic()
         self._busy_s = 0.0
         self._left_out: Counter[str] = Counter()  # as reported
 
@@ -145,7 +114,7 @@ class Watch:
             skipped=len(self._skipped) + (0 if store is None else store.count(SKIPPED)),
             waiting=len(self._arrivals.waiting) + len(self._running),
             ended=self._ended,
-            seconds=self._busy_s + (time.monotonic() - self._busy_since if self._running else 0.0),
+            seconds=self._busy_s,
             scheduler=WATCHING,
             failures=tuple(self._failures.items()),
         )
@@ -153,29 +122,27 @@ class Watch:
 
     def open(self) -> None:
         """Open or check the store before any shot arrives, as far as possible."""
-        with suppress(_ShapeUnknownError):  # until a shot has arrived
-            self._stack = self._stack_of([Exposure("", _NoImage())])
+        with suppress(NoShotError):  # the shape is unknown until a shot has arrived
+            self._stack = self._stack_of(())
         if self._options.overwrite or not self._path.exists():
             return
         store = StackStore(self._path)
+        if self._stack is not None:
+            self._stack, self._is_ready = match_store(store, self._stack), True
+        remove_unfinished(self._path)
+        summarise(store)  # the last watch may have been killed before it did
         again = (PENDING, SKIPPED, *([FAILED] if self._options.redo_failed else []))
         self._redo = {store.names[i] for i in np.flatnonzero(np.isin(store.statuses(), again))}
         for name, report in zip(store.names, store.reports(), strict=True):
-            self._note_report(name, report)
+            self._note_outcome(name, report.get("reason", ""), bool(report.get("warnings")))
         self.store = GrowingStore(store)
-        if self._stack is not None:
-            self._use_stack(match_store(store, self._stack))
 
-    def _stack_of(self, shots: Iterable[Exposure]) -> Stack:
-        """Return the stack of some shots, the first of which can be read."""
-        stack = self._describe(Shots(list(shots), (0, 0)))
-        return replace(stack, as_arrived=True, dtype=self._options.dtype)
-
-    def _file(self, name: str) -> FileReference:
-        return FileReference(self._arrivals.folder / name, self._reader)
+    def _stack_of(self, names: Iterable[str]) -> Stack:
+        stack = self._describe(Shots([self._shot(name) for name in names], (0, 0)))
+        return replace(stack, dtype=self._options.dtype)
 
     def _shot(self, name: str) -> Exposure:
-        return Exposure(text_of(name), self._file(name))
+        return Exposure(text_of(name), FileReference(self._arrivals.folder / name, self._reader))
 
     def run(self) -> None:
         """Invert existing and arriving files until the watch ends."""
@@ -185,28 +152,42 @@ class Watch:
             self._arrivals.look_again(name)
         self.report()
         try:
-            while not self._is_over():
-                if self._arrivals.left_out.keys() - self._left_out.keys():
-                    self._report_left_out()
-                self._advance()
+            with scheduler_for("threads") as scheduler:
+                while not self._is_over():
+                    if self._arrivals.left_out.keys() - self._left_out.keys():
+                        self._report_left_out()
+                    self._arrivals.look()
+                    if names := self._next(scheduler.workers):
+                        self._invert(names, scheduler)
+                    elif not self._arrivals.waiting:
+                        time.sleep(self._arrivals.poll_s)
             if self._arrivals.left_out != self._left_out:
                 self._report_left_out()
         except InversionCancelled:
             pass
         finally:
-            self._abandoned.set()
-            self._pool.shutdown(cancel_futures=True)
-            if self._options.latest:
-                names = [*(shot.name for shot in self._running), *self._arrivals.waiting]
-                self._running.clear()
-                self._arrivals.waiting.clear()
-                self._skip(names)
             if self.store is not None:
-                with suppress(OSError):  # a watch without this choice finds their files
-                    self._store_skipped(self.store)
                 with suppress(OSError):  # the folder's own copy has the length
-                    self.store.close()
+                    self._close(self.store)
+            elif self._options.latest:
+                self._skip(self._arrivals.waiting)
             self.report()
+
+    def _close(self, store: GrowingStore) -> None:
+        """Note the shots that were still running, and what was skipped."""
+        for index in self._running:
+            store.end(index)
+        names = self._running.values()
+        unfinished = [name for name in names if store.status(text_of(name)) == PENDING]
+        self._running.clear()
+        if self._options.latest:
+            self._skip([*unfinished, *self._arrivals.waiting])
+            self._arrivals.waiting.clear()
+        else:
+            self._arrivals.waiting[:0] = unfinished
+        store.skip(self._skipped)
+        self._skipped.clear()
+        store.close()
 
     def _report_left_out(self) -> None:
         """Count the files that are no shots in a sentence."""
@@ -216,117 +197,52 @@ class Watch:
 
     def _is_over(self) -> bool:
         idle, most = self._options.idle, self._options.max_shots
-        if (most is not None and self._ended >= most) or self._is_stopped():
+        if (most is not None and self._ended >= most) or (
+            self._should_stop and self._should_stop()
+        ):
             return True
         quiet = time.monotonic() - max(self._arrivals.last_change, self._last)
-        return idle is not None and quiet > idle and self._arrivals.is_quiet and not self._running
+        return idle is not None and quiet > idle and self._arrivals.is_quiet
 
-    def _is_stopped(self) -> bool:
-        requested = self._should_stop is not None and self._should_stop()
-        return requested or self._abandoned.is_set()
-
-    def _advance(self) -> None:
-        """Write the oldest shot once it is done, or start the next one, or wait."""
-        if self._running and self._running[0].attempt.done():
-            self._finish()
-            return
-        self._arrivals.look()
-        if self._begin_next():
-            self.report()
-        elif self._running:
-            wait([self._running[0].attempt], self._arrivals.poll_s)
-        else:
-            time.sleep(self._arrivals.poll_s)
-
-    def _begin_next(self) -> bool:
-        """Start the next shot that waits, if it can be now; return whether one waited."""
-        waiting, begun, most = self._arrivals.waiting, len(self._running), self._options.max_shots
-        is_full = begun == _LANES or (most is not None and self._ended + begun >= most)
-        name = waiting[-1 if self._options.latest else 0] if waiting and not is_full else None
-        # A file that was written again waits until its earlier version is in the store.
-        if name is None or any(name == shot.name for shot in self._running):
-            return False
-        waiting.remove(name)
+    def _next(self, most: int) -> list[str]:
+        """Take the next files that wait, as many as can be inverted at once."""
+        waiting, names = self._arrivals.waiting, list[str]()
         if self._options.latest:
-            self._skip(waiting)
-            waiting.clear()
-        self._begin(name)
-        return True
+            self._skip(waiting[:-1])
+            del waiting[:-1]
+        if self._options.latest or not self._is_ready:
+            most = 1
+        if self._options.max_shots is not None:
+            most = min(most, self._options.max_shots - self._ended)
+        while waiting and len(names) < most:
+            name = waiting.pop(0)
+            if self._has_changed(name):
+                names.append(name)
+        return names
 
     def _skip(self, names: Iterable[str]) -> None:
         """Note shots that are not inverted, unless an earlier version of them was."""
-        store, running = self.store, {text_of(shot.name) for shot in self._running}
         for name in map(text_of, names):
-            is_stored = store is not None and store.status(name) == SKIPPED
-            if not is_stored and name not in running and self._previous_report(name) is None:
+            is_stored = self.store is not None and self.store.status(name) == SKIPPED
+            if not is_stored and self._previous_report(name) is None:
                 self._skipped[name] = None
 
-    def _store_skipped(self, store: GrowingStore, *following: str) -> None:
-        """Number the skipped shots, and shots that follow them."""
-        store.skip(self._skipped, *following)
-        self._skipped.clear()
-
-    def _begin(self, name: str) -> None:
+    def _has_changed(self, name: str) -> bool:
+        """Return whether a file is new, or another than the one that was inverted."""
         self._skipped.pop(text_of(name), None)
-        file = self._file(name)
+        file = FileReference(self._arrivals.folder / name, self._reader)
         try:
-            stamp_now = stamp(file.path)
             report = self._previous_report(text_of(name))
-            if report is not None and _is_unchanged(file, report, stamp_now):
-                return
+            age_s = time.time() - file.path.stat().st_mtime
+            if report is None:
+                return True
+            # Within the resolution of file times it may have changed at the same time.
+            if age_s < _CLOCK_RESOLUTION_S and "sha256" in report:
+                return bool(sha256(file.path) != report["sha256"])
+            return not file.unchanged(report)
         except OSError:
             self._arrivals.check()
-            return  # removed before its turn
-        attempt = self._submit(name)
-        self._busy_since = self._busy_since if self._running else time.monotonic()
-        self._running.append(_RunningShot(name, stamp_now, attempt))
-        if self._options.latest and self.store is not None:
-            # Now, as the shot must not wait for it once it is done.
-            with defer_interrupts():
-                self._store_skipped(self.store, text_of(name))
-
-    def _finish(self) -> None:
-        """Take the oldest attempt, let the next one begin, and write the outcome."""
-        running = self._running.popleft()
-        attempt, stamp_before = running.attempt.result(), running.stamp_before
-        if not self._running:
-            self._busy_s += time.monotonic() - self._busy_since
-        origin = stamp_after = {**stamp_before, **attempt.origin}
-        if attempt.failure:
-            with suppress(OSError):
-                stamp_after = stamp(self._file(running.name).path)
-        if not stamp_before.items() <= stamp_after.items():
-            self._arrivals.look_again(running.name)  # it was written to while it was read
-            return
-        if attempt.failure:
-            self._arrivals.check()
-        self._ended += 1
-        try:
-            # The latest shot is numbered when it begins, and the first ones create the store.
-            is_numbered = not self._options.latest and self.store is not None
-            if is_numbered and self._task and running.name not in self._arrivals.waiting[:1]:
-                self._begin_next()
-        finally:
-            self._store_outcome(running.name, replace(attempt, origin=origin))
-
-    def _store_outcome(self, file: str, attempt: Attempt) -> None:
-        name = text_of(file)
-        again = self._previous_report(name) is not None
-        with defer_interrupts():
-            outcome = self._write(name, attempt)
-        self._redo.discard(name)
-        self._last = time.monotonic()
-        self._note_report(name, {"reason": outcome.reason, "warnings": outcome.warnings})
-        self.report(name=name, outcome=outcome, result=attempt.result, again=again)
-
-    def _note_report(self, name: str, report: Mapping[str, Any]) -> None:
-        """Note whether a shot has failed or is doubtful, instead of its earlier report."""
-        self._failures.pop(name, None)
-        self._doubtful.discard(name)
-        if reason := report.get("reason"):
-            self._failures[name] = reason
-        elif report.get("warnings"):
-            self._doubtful.add(name)
+            return False  # removed before its turn
 
     def _previous_report(self, name: str) -> dict[str, Any] | None:
         """Return the report of a shot that has ended before; None if it has not."""
@@ -336,78 +252,105 @@ class Watch:
             return self._early.get(name)
         return None if name in self._redo or status in (PENDING, SKIPPED) else store.report(name)
 
-    def _submit(self, name: str) -> Future[Attempt]:
-        shot = self._shot(name)
-        failed = self._prepare(name, shot) if self._task is None else None
-        if failed is not None:
-            done: Future[Attempt] = Future()
-            done.set_result(failed)
-            return done
+    def _invert(self, files: list[str], scheduler: Scheduler) -> None:
+        """Run some shots like those of any stack, and note their outcomes."""
+        began = time.monotonic()
+        if reason := self._prepare(files[0]):
+            self._fail_early(text_of(files[0]), reason)
+            return
         assert self._stack is not None
-        assert self._task is not None
-        beam = self._stack.beam
-        # Alone, it has all the cores.
-        workers = _LANES if self._running or self._arrivals.waiting else 1
-        return self._pool.submit(try_shot, self._task, shot, beam, workers, self._is_stopped)
+        shots = [self._shot(name) for name in files]
+        again = {shot.name for shot in shots if self._previous_report(shot.name) is not None}
+        store = self.store or self._create_store(shots[0].name)
+        with defer_interrupts():
+            store.skip(self._skipped, *self._early, *(shot.name for shot in shots))
+            self._skipped.clear()
+            numbered = {store.reopen(shot.name): shot for shot in shots}
+            for name, report in self._early.items():
+                if name not in again:  # else its file has changed since
+                    store.fail(name, report)
+            self._early.clear()
+        self._running = dict(zip(numbered, files, strict=True))
+        # Alone, a shot has all the cores.
+        workers = scheduler.workers if len(files) > 1 or self._arrivals.waiting else 1
+        context = TaskContext(store.writer, self._stack.shot_task, workers, keeps_results=True)
+        for outcome in scheduler.outcomes(numbered, self._stack.beam, context, self._should_stop):
+            if outcome.reason:
+                self._check_folder(store, outcome)
+            store.end(outcome.index)
+            del self._running[outcome.index]
+            self._ended += 1
+            self._last = time.monotonic()
+            self._busy_s += self._last - began
+            began = self._last
+            name = numbered[outcome.index].name
+            self._redo.discard(name)
+            self._note_outcome(name, outcome.reason, bool(outcome.warnings))
+            self.report(name=name, outcome=outcome, again=name in again)
 
-    def _prepare(self, name: str, shot: Exposure) -> Attempt | None:
-        """Describe the stack by its first shot; return a failed attempt if that is impossible."""
-        began = time.perf_counter()
-        waiting = [*reversed(self._skipped), *self._arrivals.waiting[:MAX_TRIED_SHOTS]]
-        names = [name, *waiting[: MAX_TRIED_SHOTS - 1]]
+    def _check_folder(self, store: GrowingStore, outcome: ShotOutcome) -> None:
+        """Raise an error if a shot failed because the folder disappeared; it stays pending."""
+        try:
+            self._arrivals.check()
+        except FileFormatError:
+            store.reopen(self._running[outcome.index])
+            raise
+
+    def _note_outcome(self, name: str, reason: str, is_doubtful: bool) -> None:
+        """Note whether a shot has failed or is doubtful, instead of its earlier outcome."""
+        self._failures.pop(name, None)
+        self._doubtful.discard(name)
+        if reason:
+            self._failures[name] = reason
+        elif is_doubtful:
+            self._doubtful.add(name)
+
+    def _fail_early(self, name: str, reason: str) -> None:
+        self._early[name] = {"reason": reason}
+        with suppress(OSError):  # it may be gone
+            self._early[name] |= stamp(self._arrivals.folder / name)
+        self._ended += 1
+        self._last = time.monotonic()
+        self._note_outcome(name, reason, is_doubtful=False)
+        self.report(name=name, outcome=ShotOutcome(len(self._early) - 1, FAILED, 0.0, reason))
+
+    def _prepare(self, name: str) -> str:
+        """Describe the stack by its first shots; return why that is impossible so far."""
+        names = [name, *self._arrivals.waiting, *self._skipped]
         stack = self._stack
+        if self._is_ready:
+            return ""
         if stack is None:
-            try:
-                shot.images.shape()
-            except Exception as error:
-                return Attempt(began, time.perf_counter() - began, {}, failure=failure_text(error))
-            store = self.store
-            if store is not None:
+            known: Iterable[str] = ()
+            if self.store is not None:
                 # Earlier shots are a better reference for the size of the images.
-                done = (name for name in store.done_names() if self._file(name).path.exists())
-                names = [*islice(done, MAX_TRIED_SHOTS), *names]
-            stack = self._stack_of(map(self._shot, names))
-            if store is not None:
-                self._use_stack(match_store(StackStore(self._path), stack))
-                return None
+                known = (done for done in self.store.names_of(DONE) if self._is_there(done))
+            try:
+                stack = self._stack_of([*islice(known, MAX_TRIED_SHOTS), *names[:MAX_TRIED_SHOTS]])
+            except NoShotError as error:
+                return error.reason
+            if self.store is not None:
+                stack = match_store(StackStore(self._path), stack)
         if stack.chooses_sites:
             self.report(stage="how many sites the first shots need")
-            shots = self._stack_of(map(self._shot, names)).shots
-            shares = needed_shares(replace(stack, shots=shots), self._should_stop)
+            tried = replace(stack, shots=self._stack_of(names[:MAX_TRIED_SHOTS]).shots)
+            shares = needed_shares(tried, self._should_stop)
             if not shares:
-                # It fails the same way, and a later shot decides.
-                return try_shot(stack.task, shot, stack.beam, 1, self._should_stop)
+                shot = self._shot(name)
+                return try_shot(stack.task, shot, stack.beam, 1, self._should_stop).failure
             stack = with_enough_sites(stack, shares)
-        self._use_stack(stack)
-        return None
+        self._stack, self._is_ready = stack, True
+        return ""
 
-    def _use_stack(self, stack: Stack) -> None:
-        self._stack = stack
-        self._task = stack.shot_task
+    def _is_there(self, name: str) -> bool:
+        return (self._arrivals.folder / name).exists()
 
-    def _write(self, name: str, attempt: Attempt) -> ShotOutcome:
-        early = self._early
-        if attempt.result is None and (self._task is None or self.store is None):
-            early[name] = {**attempt.origin, "reason": attempt.failure, "seconds": attempt.seconds}
-            return ShotOutcome(len(early) - 1, FAILED, attempt.seconds, attempt.failure)
-        store = self.store or self._create_store([*early, *self._skipped, name])
-        for early_name in list(early):
-            report = early.pop(early_name)
-            if early_name != name:
-                store.write(store.append(early_name), {}, report, FAILED)
-        if self._skipped:
-            self._store_skipped(store)
-        index = store.append(name)
-        if store.status(name) == DONE:
-            store.reopen(index)
-        assert self._task is not None
-        return write_shot(store, self._task, index, attempt)
-
-    def _create_store(self, names: Sequence[str]) -> GrowingStore:
+    def _create_store(self, name: str) -> GrowingStore:
         assert self._stack is not None
-        items = [Exposure(name, _NoImage()) for name in dict.fromkeys(names)]
-        stack = replace(self._stack, shots=replace(self._stack.shots, items=items))
-        created = create_store(self._path, contents_of(stack), overwrite=self._options.overwrite)
+        names = dict.fromkeys([*self._early, *self._skipped, name])
+        shots = replace(self._stack.shots, items=[self._shot(each) for each in names])
+        contents = contents_of(replace(self._stack, shots=shots))
+        created = create_store(self._path, contents, overwrite=self._options.overwrite)
         self.store = GrowingStore(created)
         return self.store
 
@@ -439,7 +382,7 @@ def watch_stack(
     folder : str or Path
         Folder in which the files appear. Its subfolders are ignored.
     out : str or Path
-        The store, ``name.shadowinv.zarr``, created when the first shot has been inverted.
+        The store, ``name.shadowinv.zarr``, created once a shot can be read.
     recipe, source, mask, source_mask, reader
         As for `run_stack`; one source for all shots. Without a number of sites, the first shots
         decide it for all: up to three that exist at the start, or the first that arrives.
@@ -455,7 +398,7 @@ def watch_stack(
     Returns
     -------
     xarray.Dataset or None
-        The store, opened lazily; None if no shot could be inverted.
+        The store, opened lazily; None if no shot could be read.
 
     Raises
     ------
@@ -489,6 +432,5 @@ def watch_stack(
             return None
         with clear_up_when_terminated(), locked(path):
             loop.open()
-            remove_unfinished(path)
             loop.run()
         return None if loop.store is None else read_stack(path)
