@@ -47,8 +47,6 @@ from napari_shadowinv.io.store_columns import ShotColumn
 from napari_shadowinv.io.store_damage import chunk_file, fields_of, is_along_shots
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
-# Attribute: the order of the shots does not follow from their names.
-NUMBERED_AS_ARRIVED = {"order": "as they arrived"}
 
 
 @contextmanager
@@ -366,7 +364,7 @@ class GrowingStore:
         if new:
             numbers = range(len(self), len(self) + len(new))
             values = {"shot": np.array(numbers), "name": np.array(new, dtype=object)}
-            grow_store(self.path, values, NUMBERED_AS_ARRIVED, self.writer.arrays(), room=64)
+            grow_store(self.path, values, {}, self.writer.arrays(), room=64)
             self._numbers.update(zip(new, numbers, strict=True))
             self._statuses.extend([PENDING] * len(new))
         for name in names:

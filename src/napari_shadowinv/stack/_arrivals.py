@@ -43,24 +43,20 @@ class Arrivals:
     def __init__(self, folder: Path, pattern: str, *, settle: float, existing: bool = True) -> None:
         self.folder = folder
         self.waiting: list[str] = []
+        self.left_out: Counter[str] = Counter()  # files that are no shots, by their endings
         self.last_change = time.monotonic()  # of any file
         self._pattern, self._settle, self._is_ignored = pattern, settle, not existing
         self._kind: tuple[str, ...] = ()  # endings of the shots, if the pattern has none
-        self._stamps: dict[str, tuple[int, int]] = {}  # size and time of each file
-        self._settling: dict[str, float] = {}  # files that changed, and when that was seen
-        self._others: set[str] = set()  # files that are no shots
+        # Size and time of each shot's file, and when they were seen first.
+        self._seen: dict[str, tuple[tuple[int, int], float]] = {}
+        self._complete: set[str] = set()
         self._folder_id = _identity(folder)
         self._next_look = 0.0
 
     @property
     def is_quiet(self) -> bool:
         """Whether no file is waiting or being written."""
-        return not (self.waiting or self._settling)
-
-    @property
-    def left_out(self) -> Counter[str]:
-        """Numbers of files that are no shots, by their endings."""
-        return count_endings(self._others)
+        return not self.waiting and len(self._complete) == len(self._seen)
 
     def matches(self, name: str) -> bool:
         """Return whether a name belongs to a shot."""
@@ -78,28 +74,36 @@ class Arrivals:
         try:
             if not self._kind and (images := images_in(self.folder)):
                 self._kind = spellings(images[0].suffix)
-            stamps = _stamps_in(self.folder)
+            files = _stamps_in(self.folder)
         except OSError as error:
             raise self._folder_error(error) from None
-        for name in self._stamps.keys() - stamps.keys():
-            self._forget(name)
+        stamps = {name: stamp for name, stamp in files.items() if self.matches(name)}
+        self.left_out = count_endings(files.keys() - stamps.keys())
+        before, self._seen = self._seen, {}
         for name, stamp in stamps.items():
-            if self._stamps.get(name) != stamp:
-                self._note_change(name, began)
-        self._stamps, self._is_ignored = stamps, False
-        ready = [name for name, since in self._settling.items() if began >= since + self._settle]
-        for name in map(str, in_counting_order(map(Path, ready))):
-            del self._settling[name]
+            earlier, since = before.get(name, (None, began))
+            self._seen[name] = stamp, since if earlier == stamp else began
+            if earlier != stamp:
+                self._complete.discard(name)
+                if self._is_ignored:
+                    self._complete.add(name)
+                else:
+                    self.last_change = began
+        self._complete &= stamps.keys()
+        self._is_ignored = False
+        self.waiting = [name for name in self.waiting if name in self._complete]
+        settled = [name for name, (_, since) in self._seen.items() if began >= since + self._settle]
+        ready = map(Path, set(settled) - self._complete)
+        for name in map(str, in_counting_order(ready)):
+            self._complete.add(name)
             self.waiting.append(name)
         # To look at very many files takes long, and must not take all the time.
         ended = time.monotonic()
         self._next_look = ended + max(self.poll_s, 5 * (ended - began))
 
     def look_again(self, name: str) -> None:
-        """Wait until a file no longer changes, such as one that changed while it was read."""
-        self._forget(name)
-        if name in self._stamps:
-            self._settling[name] = time.monotonic()
+        """Let a file wait once more."""
+        self._complete.discard(name)
 
     def check(self) -> None:
         """Raise an error if the folder no longer exists, or another is in its place."""
@@ -108,19 +112,6 @@ class Arrivals:
                 raise FileNotFoundError(2, "it was removed, or moved")
         except OSError as error:
             raise self._folder_error(error) from None
-
-    def _forget(self, name: str) -> None:
-        self._settling.pop(name, None)
-        self._others.discard(name)
-        if name in self.waiting:
-            self.waiting.remove(name)
-
-    def _note_change(self, name: str, now: float) -> None:
-        self._forget(name)
-        if not self.matches(name):
-            self._others.add(name)
-        elif not self._is_ignored:
-            self.last_change = self._settling[name] = now
 
     def _folder_error(self, error: OSError) -> FileFormatError:
         return FileFormatError(

@@ -87,7 +87,6 @@ class Stack:
     beam: Beam | None  # to invert, after all steps; None if shots have their own
     common: AnyArray | None = None  # measured source of rows to invert without one, as recorded
     reader: str = ""  # name of the reader of the files
-    as_arrived: bool = False  # whether its shots are numbered as they arrive in a folder
     dtype: str = "float64"  # of fields in a store
 
     @property

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
@@ -43,7 +42,6 @@ from napari_shadowinv.io.store import (
     check_store_path,
 )
 from napari_shadowinv.io.store_writing import (
-    NUMBERED_AS_ARRIVED,
     Contents,
     ShotWriter,
     StoreArray,
@@ -73,7 +71,6 @@ if TYPE_CHECKING:
 
 WATCHING = "watching"  # in place of the scheduler's name
 _CHOSEN_SITES = "chosen_sites"  # attribute: number of sites from the accuracy and the first shots
-_APPENDED = "appended_at"  # attribute: numbers of the first shots appended by later runs
 _ALTERNATIVES = "use the same, overwrite the store, or choose another name"
 
 
@@ -342,8 +339,6 @@ class _Run:
 def contents_of(stack: Stack) -> Contents:
     identity = {name: value for name, value in _identity(stack).items() if value}
     attributes: dict[str, Any] = {**attributes_of(stack), **identity}
-    if stack.as_arrived:
-        attributes |= NUMBERED_AS_ARRIVED
     if isinstance(stack.task, InvertTask) and stack.task.sites_chosen:
         attributes[_CHOSEN_SITES] = stack.task.recipe.options.n_sites
     return Contents(stack.sizes, _variables(stack), _coordinates(stack), attributes)
@@ -466,23 +461,12 @@ def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:
     places = {name: place for place, name in enumerate(names)}
     lost = [name for name in store.names if name not in places]
     if lost or len(places) < len(names):
-        missing = (
-            f"{count} there, {len(names)} given, without {lost[0]}" if lost else "different order"
-        )
+        missing = f"without {lost[0]}" if lost else "in a different order"
         raise InputError(
-            f"{store.path} was started with different shots ({missing}): {_ALTERNATIVES}"
+            f"{store.path} was started with different shots ({count} there, {len(names)} given, "
+            f"{missing}): {_ALTERNATIVES}"
         )
     known_places = [places[name] for name in store.names]
-    # Shots of a run keep their order; names of later runs may sort before them.
-    ends = [0, *store.attributes.get(_APPENDED, []), count]
-    as_arrived = NUMBERED_AS_ARRIVED.items() <= store.attributes.items()
-    for first, last in () if as_arrived else pairwise(ends):
-        for index in range(first + 1, last):
-            if known_places[index] < known_places[index - 1]:
-                raise InputError(
-                    f"{store.path} was started with the shots in a different order "
-                    f"({store.names[index - 1]} before {store.names[index]}): {_ALTERNATIVES}"
-                )
     return [*known_places, *sorted(set(range(len(names))) - set(known_places))]
 
 
@@ -498,7 +482,5 @@ def append_shots(store: StackStore, stack: Stack) -> StackStore:
     count, coordinates = len(store.names), _coordinates(stack).items()
     along_shots = {name: variable for name, variable in coordinates if variable.along_shots}
     values = {name: np.asarray(variable.values)[count:] for name, variable in along_shots.items()}
-    begins = [*store.attributes.get(_APPENDED, []), count]
-    attributes = {"source_image": stack.source_text(None), _APPENDED: begins}
-    grow_store(store.path, values, attributes)
+    grow_store(store.path, values, {"source_image": stack.source_text(None)})
     return StackStore(store.path)
