@@ -119,7 +119,7 @@ def test_slice_of_shots_holds_its_shots(kind, images, tmp_path):
     part = items[1:3]
     assert len(part) == 2
     for shot, image in zip(part, images[1:3], strict=True):
-        np.testing.assert_array_equal(shot.images.read()[0], image)
+        np.testing.assert_array_equal(shot.read()[0], image)
 
 
 def test_each_shot_has_the_mask_of_its_own_file(images: np.ndarray, tmp_path: Path) -> None:

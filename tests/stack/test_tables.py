@@ -237,7 +237,7 @@ def test_columns_for_fits_give_a_warning(pack: Path, out: Path) -> None:
     inverted(pack, out)
     (warning,) = StackStore(out).report(0)["warnings"]
     assert warning["text"] == (
-        "the table has psf, noise, which an inversion does not use: fit the image to use it"
+        "the row has psf, noise, which only fits use: fit the image to use it"
     )
 
 
@@ -352,7 +352,7 @@ def test_a_row_is_repeated_from_its_provenance(pack: Path) -> None:
         source_mask=None,
         reader=read_shot,
     )
-    images, _ = stack.shots.items[0].images.load()
+    images, _ = stack.shots.items[0].load()
     inversion = stack.task.run(images, stack.beam, workers=1)
     write("film0.shadowinv", inversion)
     assert rerun("film0.shadowinv").is_identical

@@ -191,8 +191,8 @@ def rows_by_shot(table: Path, shared: Mapping[str, Any]) -> dict[str, tuple[Shot
     return by_shot
 
 
-def rows_to_invert(table: Path | Sequence[ShotRow]) -> tuple[list[ShotRow], tuple[str, ...]]:
-    """Return the rows to invert one by one, and the columns that only fits use."""
+def rows_to_invert(table: Path | Sequence[ShotRow]) -> list[ShotRow]:
+    """Return the rows to invert one by one."""
     rows = _used_rows(table, {})
     place = f"{table}, line" if isinstance(table, Path) else "the table, row"
     for number, row in rows.items():
@@ -201,10 +201,7 @@ def rows_to_invert(table: Path | Sequence[ShotRow]) -> tuple[list[ShotRow], tupl
                 f"{place} {number} has the source 'unknown', which only a fit can "
                 "find: name an image, or leave the cell empty"
             )
-    used = list(rows.values())
-    of_fits = ("strength", "psf", "noise")
-    filled = (name for name in of_fits if any(getattr(row, name) is not None for row in used))
-    return used, tuple(filled)
+    return list(rows.values())
 
 
 def table_rows(table: Path) -> list[ShotRow]:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -31,13 +30,7 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
     values_of_beam,
 )
-from napari_shadowinv.stack._shots import (
-    ArrayReference,
-    Exposure,
-    ImageReference,
-    Reader,
-    read_shot,
-)
+from napari_shadowinv.stack._shots import ArrayExposure, Exposure, Reader, read_shot
 from napari_shadowinv.stack._worker import AnyTask, Beam
 
 if TYPE_CHECKING:
@@ -204,8 +197,8 @@ def _invert(
 ) -> dict[str, Any]:
     """Invert one shot, and return its variables."""
     try:
-        images, _ = (shot.images if block is None else ArrayReference(block[0])).load()
-        source = None if shot.source is None else shot.source.images.read()[0]
+        images, _ = (shot if block is None else ArrayExposure("", block)).load()
+        source = None if shot.source is None else shot.source.read()[0]
         inversion = task.run(images, beam, source)
     except InputError as error:
         raise error.about(label) from error
@@ -225,8 +218,8 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
     da: Any = import_module("dask.array")
     shots, array = stack.shots, stack.shots.array
     token = tokenize(
-        [shot.images for shot in shots.items] if array is None else array.name,
-        [shot.source and shot.source.images for shot in shots.items],
+        shots.items if array is None else array.name,
+        [shot.source for shot in shots.items],
         None if stack.beam is None else stack.beam.key,
         stack.source_text(None),
         stack.task.inputs.shot.mask,
@@ -241,7 +234,7 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
     for index, item in enumerate(shots.items):
         shot, block = item, None
         if array is not None:
-            shot, block = replace(item, images=ImageReference()), (array.name, index, 0, 0)
+            shot, block = Exposure(item.name, source=item.source), (array.name, index, 0, 0)
         inputs = (shots.label(index), shot, block, None if beam is None else beam.key)
         tasks[name, index] = (_invert, *inputs, task.key)
     graph = HighLevelGraph.from_collections(name, tasks, dependencies=dependencies)

@@ -43,10 +43,10 @@ from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, Uni
 from napari_shadowinv.provenance import Origin, index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
-    ArrayReference,
+    ArrayExposure,
     Exposure,
     Reader,
-    RowsReference,
+    RowsExposure,
     Shots,
     find_shots,
     find_source,
@@ -155,17 +155,17 @@ class Stack:
         shot, label = self.shots.items[index], self.shots.label(index)
         if self.task.by_row and (difference := _row_of(shot).difference(origin)):
             return f"the row of {label} ({difference})"
-        if not shot.images.unchanged(origin):
+        if not shot.unchanged(origin):
             return label
         # A common source is compared once, as a part of the store's identity.
         if shot.source is None or self.common is not None:
             return ""
-        return "" if shot.source.images.unchanged(origin["source"]) else f"the source of {label}"
+        return "" if shot.source.unchanged(origin["source"]) else f"the source of {label}"
 
 
-def _row_of(shot: Exposure) -> RowsReference:
-    assert isinstance(shot.images, RowsReference)
-    return shot.images
+def _row_of(shot: Exposure) -> RowsExposure:
+    assert isinstance(shot, RowsExposure)
+    return shot
 
 
 def choose_sites(stack: Stack, should_stop: ShouldStop | None = None) -> Stack:
@@ -239,7 +239,7 @@ def describe_stack(
     common = image if task.by_row else None
     own_sources = None if shot_sources is None else shot_sources.items
     if common is not None and beam is None:
-        own_sources = [Exposure("", ArrayReference(common))] * len(stack_shots)
+        own_sources = [ArrayExposure("", common[np.newaxis])] * len(stack_shots)
     if own_sources is not None:
         items = [
             # A row may name its own.

@@ -14,10 +14,11 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from typing import Any
+
+import numpy as np
 
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import ShouldStop
@@ -27,7 +28,7 @@ from napari_shadowinv.errors import (
     InversionCancelled,
     RunInterruptedError,
 )
-from napari_shadowinv.stack._shots import BlockReference, Exposure, ImageReference, failure_text
+from napari_shadowinv.stack._shots import ArrayExposure, Exposure, failure_text
 from napari_shadowinv.stack._worker import (
     Beam,
     ShotOutcome,
@@ -190,9 +191,9 @@ def _tasks(
     tasks = []
     for index, shot in shots.items():
         block = []
-        if blocks and isinstance(shot.images, BlockReference):
-            block = [shot.images.block.to_delayed().ravel()[0]]
-            shot = replace(shot, images=ImageReference())
+        if blocks and isinstance(shot, ArrayExposure) and not isinstance(shot.array, np.ndarray):
+            block = [shot.block.to_delayed().ravel()[0]]
+            shot = Exposure(shot.name, source=shot.source)
         key = f"{10**9 - index}-{name}"  # dask begins with the last
         run = partial(run_shot, shot, index, should_stop)
         task = delayed(run, name=f"run-{key}", traverse=False)

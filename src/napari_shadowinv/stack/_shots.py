@@ -1,6 +1,6 @@
 """Shots of a stack, each read on demand: `Exposure`, and where they come from.
 
-- one image, or several: `ArrayReference`, `BlockReference`, `FileReference`, `RowsReference`
+- in an array, in a file, in rows of a table: `ArrayExposure`, `FileExposure`, `RowsExposure`
 - all shots of an array, of files or of a list: `find_shots`; of a table: `table_shots`
 - their sources: `find_source`
 """
@@ -50,6 +50,7 @@ Reader = Callable[..., ArrayLike]
 Value = TypeVar("Value")
 
 _MAX_SHAPE_READS = 3  # shots that are read for the shape of all
+_OF_FITS = ("strength", "psf", "noise")
 
 
 class NoShotError(FileFormatError):
@@ -58,20 +59,28 @@ class NoShotError(FileFormatError):
     reason = ""
 
 
-class ImageReference:
-    """An image, or several of one object, read on demand; it can be sent to a worker."""
+@dataclass(frozen=True, eq=False)
+class Exposure:
+    """A shot of a stack, whose images are read on demand; it can be sent to a worker."""
+
+    name: str  # for messages and tables
+    source: Exposure | None = field(default=None, kw_only=True)  # unless shared or estimated
+    rows: tuple[ShotRow, ...] = field(default=(), kw_only=True)  # of a table, one for each image
 
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
-        """Return the images with all that is known of each, and metadata as `read` does."""
-        image, metadata = self.read()
-        return (Shot(image),), metadata
+        """Return the images with all that is known of each, and metadata for the shot's report.
 
-    def read(self) -> tuple[AnyArray, dict[str, Any]]:
-        """Return the image and its ``sha256``, with ``warnings`` for the shot's report if any."""
+        Of a single image these are ``sha256``, and ``warnings`` if there are any.
+        """
         raise NotImplementedError
 
+    def read(self) -> tuple[AnyArray, dict[str, Any]]:
+        """Return its only image, such as a source, and the metadata."""
+        (shot,), metadata = self.load()
+        return shot.image, metadata
+
     def stamp(self) -> dict[str, Any]:
-        """Return metadata that are known before the image is read."""
+        """Return metadata that are known before an image is read."""
         return {}
 
     def shape(self) -> tuple[int, ...]:
@@ -80,42 +89,41 @@ class ImageReference:
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Return whether the image still agrees with the metadata from `load`."""
-        return bool(self.read()[1]["sha256"] == origin.get("sha256"))
+        return bool(self.load()[1]["sha256"] == origin.get("sha256"))
 
 
 @dataclass(frozen=True, eq=False)
-class ArrayReference(ImageReference):
-    """An image in memory."""
-
-    image: AnyArray = field(repr=False)
-
-    def read(self) -> tuple[AnyArray, dict[str, Any]]:
-        return self.image, {"sha256": checksum(self.image)}
-
-
-@dataclass(frozen=True, eq=False)
-class BlockReference(ImageReference):
-    """An image of a dask array (shot, H, W), computed by dask's current scheduler."""
+class ArrayExposure(Exposure):
+    """An image in an array (shot, H, W), of numpy, or of dask, whose scheduler computes it."""
 
     array: Any = field(repr=False)
-    index: int
+    index: int = 0
 
     @property
     def block(self) -> Any:
         """The image as an array (1, H, W), without the tasks of other images."""
+        if isinstance(self.array, np.ndarray):
+            return self.array[self.index : self.index + 1]
         dask: Any = import_module("dask")
         return dask.optimize(self.array.blocks[self.index])[0]
 
-    def read(self) -> tuple[AnyArray, dict[str, Any]]:
-        return ArrayReference(_plain_image(self.block.compute()[0])).read()
+    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
+        block = self.block
+        plane = block[0] if isinstance(block, np.ndarray) else _plain_image(block.compute()[0])
+        return (Shot(plane),), {"sha256": checksum(plane)}
+
+    def __dask_tokenize__(self) -> Any:
+        from dask.base import normalize_token
+
+        return normalize_token(self.block)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Otherwise the tasks of all images would be sent with it.
-        return BlockReference, (self.block, 0)
+        # Otherwise all images, or their tasks, would be sent with it.
+        return functools.partial(ArrayExposure, source=self.source), (self.name, self.block)
 
 
-@dataclass(frozen=True)
-class FileReference(ImageReference):
+@dataclass(frozen=True, eq=False)
+class FileExposure(Exposure):
     """A file that holds one image, or a page of a TIFF or frame of an array that holds many."""
 
     path: Path  # absolute, so that a worker elsewhere finds it
@@ -131,19 +139,11 @@ class FileReference(ImageReference):
         part = (self.page, self.variable)
         return (str(self.path), normalize_token(self.reader), *part, *file_stamp.values())
 
-    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
-        values, usable, metadata = self._read_masked()
-        return (Shot(values, mask=usable),), metadata
-
-    def read(self) -> tuple[AnyArray, dict[str, Any]]:
-        values, _, metadata = self._read_masked()
-        return values, metadata
-
     def stamp(self) -> dict[str, Any]:
         # Before the image: it may be written to while it is read.
         return stamp(self.path) if self.page is None else {}
 
-    def _read_masked(self) -> tuple[AnyArray, BoolArray | None, dict[str, Any]]:
+    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         parts = {"page": self.page, "variable": self.variable}
         options: dict[str, Any] = {name: part for name, part in parts.items() if part is not None}
         warnings: list[Caution] = []
@@ -152,7 +152,8 @@ class FileReference(ImageReference):
             options["warnings"] = warnings
         image, usable = unpack_array(self.reader(self.path, **options), "the shot")
         metadata: dict[str, Any] = {"warnings": warnings} if warnings else {}
-        return image, usable, {"sha256": digest or checksum(image), **metadata}
+        metadata["sha256"] = digest or checksum(image)
+        return (Shot(image, mask=usable),), metadata
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare a file as in a table's rows, and a page by its checksum."""
@@ -160,16 +161,13 @@ class FileReference(ImageReference):
 
 
 @dataclass(frozen=True, eq=False)
-class RowsReference(ImageReference):
+class RowsExposure(Exposure):
     """Several images of one object to fit, or one image to invert, from rows of a table."""
 
-    rows: tuple[ShotRow, ...]
     recipe: Recipe
     channel: str | None = None
     variable: str | None = None
-    to_invert: bool = False
     setup: Setup | None = None  # of the image to invert as recorded
-    unused: tuple[str, ...] = ()  # columns that only fits use
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
         # A changed file is another input, so dask must not reuse its result.
@@ -188,15 +186,12 @@ class RowsReference(ImageReference):
             name: {**stamp(path), "sha256": sha256(path)} for name, path in self._files().items()
         }
         origin: dict[str, Any] = {"files": files, "rows": self._summaries()}
-        if not self.to_invert:
+        if self.recipe.fit is not None:
             return images, origin
         (image,) = images
         warnings = file_doubts(image)
-        if self.unused:
-            text = (
-                f"the table has {', '.join(self.unused)}, which an inversion does not use: fit the "
-                "image to use it"
-            )
+        if unused := [name for name in _OF_FITS if getattr(image, name) is not None]:
+            text = f"the row has {', '.join(unused)}, which only fits use: fit the image to use it"
             warnings.append(Caution("file", text))
         metadata = {**files["file 1"], **origin, "warnings": warnings}
         return (replace(image, setup=self.setup),), metadata
@@ -322,20 +317,6 @@ def _plain_image(image: Any) -> AnyArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Exposure:
-    """One exposure of a stack."""
-
-    name: str  # for messages and tables
-    images: ImageReference
-    source: Exposure | None = None  # as measured, unless it is shared or estimated
-
-    @property
-    def rows(self) -> tuple[ShotRow, ...]:
-        """Its rows of a table, one for each image."""
-        return self.images.rows if isinstance(self.images, RowsReference) else ()
-
-
-@dataclass(frozen=True, eq=False)
 class Shots:
     """The shots of a stack, in order."""
 
@@ -420,7 +401,7 @@ def _shots_at(path: str, reader: Reader) -> list[Exposure]:
 def _shots_of(frames: Sequence[FileFrame], reader: Reader) -> list[Exposure]:
     names = _distinct_names(frames)
     return [
-        Exposure(name, FileReference(frame.path.absolute(), reader, frame.number, frame.variable))
+        FileExposure(name, frame.path.absolute(), reader, frame.number, frame.variable)
         for name, frame in zip(names, frames, strict=True)
     ]
 
@@ -451,7 +432,7 @@ def _distinct_names(frames: Sequence[FileFrame]) -> tuple[str, ...]:
 
 def usual_shape(items: Sequence[Exposure]) -> tuple[int, int]:
     """Shape of most of the first few shots that can be read; bad ones fail later, by name."""
-    shapes = _read_first(items, lambda shot: shot.images.shape(), _MAX_SHAPE_READS)
+    shapes = _read_first(items, lambda shot: shot.shape(), _MAX_SHAPE_READS)
     usual = Counter(shapes).most_common(1)[0][0]
     if len(usual) != 2:
         raise InputError(f"shots have shape {usual}, expected (y, x): choose one channel or plane")
@@ -532,12 +513,10 @@ def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots
         array = values.rechunk((1, -1, -1))
     else:  # of numpy, h5py or zarr
         array = da.from_array(values, chunks=(1, -1, -1))
-    images: Sequence[ImageReference] = [BlockReference(array, index) for index in range(count)]
-    if is_in_memory:
-        images = [ArrayReference(plane) for plane in values]
     numbers = range(count) if coordinate is None else coordinate
     names = map(str, numbers if labels is None else labels)
-    items = [Exposure(name, image) for name, image in zip(names, images, strict=True)]
+    planes = values if is_in_memory else array
+    items = [ArrayExposure(name, planes, index) for index, name in enumerate(names)]
     return Shots(items, (shots.shape[1], shots.shape[2]), coordinate, array, mask)
 
 
@@ -567,11 +546,11 @@ def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots 
     if isinstance(source, (str, Path)):
         items = _shots_at(str(source), reader)
         if len(items) == 1:
-            return items[0].images.read()[0]
+            return items[0].read()[0]
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)
     sources = find_shots(source, reader=reader)
-    return sources.items[0].images.read()[0] if len(sources) == 1 else sources
+    return sources.items[0].read()[0] if len(sources) == 1 else sources
 
 
 def table_shots(
@@ -582,16 +561,15 @@ def table_shots(
         if not isinstance(table, Path):
             raise InputError("received rows of a table to fit, expected its file: write it first")
         return [
-            Exposure(name, RowsReference(_with_absolute_paths(rows), recipe, channel, variable))
+            RowsExposure(name, recipe, channel, variable, rows=_with_absolute_paths(rows))
             for name, rows in rows_by_shot(table, {}).items()
         ]
-    rows, unused = rows_to_invert(table)
-    shots = []
+    rows = rows_to_invert(table)
+    shots = list[Exposure]()
     files = [FileFrame(row.file, name_of(row.file)) for row in rows]
     for name, row in zip(_distinct_names(files), _with_absolute_paths(rows), strict=True):
         setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
-        images = RowsReference((row,), recipe, channel, variable, True, setup, unused)
-        shots.append(Exposure(name, images))
+        shots.append(RowsExposure(name, recipe, channel, variable, setup, rows=(row,)))
     return shots
 
 
@@ -612,9 +590,4 @@ def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> S
 
 def first_image(shots: Sequence[Exposure]) -> Shot:
     """Return the first image of the first shot of a table that can be read, to fit."""
-
-    def read(shot: Exposure) -> Shot:
-        assert isinstance(shot.images, RowsReference)
-        return replace(shot.images, rows=shot.rows[:1]).load()[0][0]
-
-    return _read_first(shots, read, 1)[0]
+    return _read_first(shots, lambda shot: replace(shot, rows=shot.rows[:1]).load()[0][0], 1)[0]

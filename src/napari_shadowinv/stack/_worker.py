@@ -42,7 +42,7 @@ from napari_shadowinv.pipeline.inversion_run import same_array
 from napari_shadowinv.preprocessing import Estimate, Recipe, UniformEstimate
 from napari_shadowinv.provenance import MaskVariable, mask_variables
 from napari_shadowinv.shot import Shot
-from napari_shadowinv.stack._shots import ArrayReference, Exposure, failure_text
+from napari_shadowinv.stack._shots import ArrayExposure, Exposure, failure_text
 from napari_shadowinv.transport.sites import SitePlan
 
 _REFRESH_S = 10.0  # workers come and go, but asking takes milliseconds
@@ -545,7 +545,7 @@ def run_shot(
     A shot is replaced by its block of a dask array if a cluster has computed that already.
     """
     if block is not None:
-        shot = replace(shot, images=ArrayReference(block[0]))
+        shot = ArrayExposure(shot.name, block, source=shot.source)
     attempt = try_shot(context.task, shot, beam, context.workers, should_stop)
     outcome = _write_shot(context.writer, context.task, index, attempt)
     return replace(outcome, result=attempt.result) if context.keeps_results else outcome
@@ -574,12 +574,12 @@ def try_shot(
     origin: dict[str, Any] = {}
     result, failure = None, ""
     try:
-        origin = shot.images.stamp()
-        images, loaded = shot.images.load()
+        origin = shot.stamp()
+        images, loaded = shot.load()
         origin |= loaded
         source = None
         if shot.source is not None:
-            source, origin["source"] = shot.source.images.read()
+            source, origin["source"] = shot.source.read()
         result = task.run(images, beam, source, workers=workers, should_stop=should_stop)
     except InversionCancelled:
         raise

@@ -53,8 +53,7 @@ from napari_shadowinv.stack._run import (
 )
 from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import (
-    Exposure,
-    FileReference,
+    FileExposure,
     NoShotError,
     Reader,
     Shots,
@@ -141,8 +140,8 @@ class Watch:
         stack = self._describe(Shots([self._shot(name) for name in names], (0, 0)))
         return replace(stack, dtype=self._options.dtype)
 
-    def _shot(self, name: str) -> Exposure:
-        return Exposure(text_of(name), FileReference(self._arrivals.folder / name, self._reader))
+    def _shot(self, name: str) -> FileExposure:
+        return FileExposure(text_of(name), self._arrivals.folder / name, self._reader)
 
     def run(self) -> None:
         """Invert existing and arriving files until the watch ends."""
@@ -230,7 +229,7 @@ class Watch:
     def _has_changed(self, name: str) -> bool:
         """Return whether a file is new, or another than the one that was inverted."""
         self._skipped.pop(text_of(name), None)
-        file = FileReference(self._arrivals.folder / name, self._reader)
+        file = self._shot(name)
         try:
             report = self._previous_report(text_of(name))
             age_s = time.time() - file.path.stat().st_mtime
