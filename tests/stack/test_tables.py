@@ -29,6 +29,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, StackStore, read_stack
+from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
@@ -378,3 +379,21 @@ def test_worker_processes_receive_all_of_a_row(pack: Path, out: Path) -> None:
     assert in_worker["status"].values.tolist() == [DONE, DONE]
     np.testing.assert_array_equal(in_worker["displacement"], in_process["displacement"])
     np.testing.assert_array_equal(in_worker["path_integrated_b"], in_process["path_integrated_b"])
+
+
+@pytest.mark.parametrize("fits", [False, True])
+def test_masks_of_a_shot_and_of_all_hold_both_but_for_a_file(fits: bool) -> None:
+    """The rule of a shot and its recipe."""
+    common, own = np.ones((2, *SHAPE), bool), np.ones((2, *SHAPE), bool)
+    common[:, :3], own[:, :, :5] = False, False
+    recipe = Recipe(
+        options=OPTIONS, source=PolynomialEstimate(), fit=FitChoices() if fits else None
+    )
+    images = np.ones((3, *SHAPE))
+    stack = describe_stack(images, recipe, None, common[0], common[1], read_shot, None)
+    joined = stack.task.with_masks(Shot(images[0], mask=own[0], source_mask=own[1]))
+    np.testing.assert_array_equal(joined.mask, common[0] & own[0])
+    np.testing.assert_array_equal(joined.source_mask, common[1] & own[1])
+    of_file = stack.task.with_masks(Shot(images[0], mask=Path("mask.png")))
+    assert of_file.mask == Path("mask.png")
+    np.testing.assert_array_equal(of_file.source_mask, common[1])

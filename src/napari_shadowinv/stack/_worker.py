@@ -14,7 +14,6 @@ import multiprocessing
 import sys
 import threading
 import time
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -46,7 +45,6 @@ from napari_shadowinv.stack._shots import ArrayExposure, Exposure, failure_text
 from napari_shadowinv.transport.sites import SitePlan
 
 _REFRESH_S = 10.0  # workers come and go, but asking takes milliseconds
-_MAX_PLANS = 2  # a worker that changes between two sources makes each once
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +67,8 @@ class Beam:
         return hashlib.sha256(f"{self.shape}{parts[0]}|{parts[1]}".encode()).hexdigest()
 
 
-@dataclass
-class _SharedPlan:
-    """A plan, complete or in preparation."""
-
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    plan: SitePlan | None = None
-
-
-_entries: OrderedDict[str, _SharedPlan] = OrderedDict()
-_entries_lock = threading.Lock()
+_plans: dict[str, SitePlan] = {}  # of this process: that of the last beam
+_plans_lock = threading.Lock()
 
 
 def shared_plan(
@@ -90,17 +80,13 @@ def shared_plan(
 ) -> SitePlan:
     """Return the sites for a beam; the first call in this process computes them."""
     key = f"{beam.key}{options.site_key()}{measured}"
-    with _entries_lock:
-        entry = _entries.setdefault(key, _SharedPlan())
-        _entries.move_to_end(key)
-        while len(_entries) > _MAX_PLANS:
-            _entries.popitem(last=False)
-    with entry.lock:
-        if entry.plan is None:
-            entry.plan = plan_sites(
+    with _plans_lock:
+        if key not in _plans:
+            _plans.clear()
+            _plans[key] = plan_sites(
                 beam.image, options, mask=beam.mask, measured=measured, should_stop=should_stop
             )
-        return entry.plan
+        return _plans[key]
 
 
 @dataclass
@@ -119,10 +105,10 @@ class _SharedSites(Cache):
         *,
         measured: bool = True,
     ) -> SitePlan:
-        beam = self.beam
-        if beam is None or not same_array(mask, beam.mask):
-            beam = Beam(source.shape, source, mask)  # the shot has unlit pixels of its own
-        return shared_plan(beam, options, measured=measured, should_stop=should_stop)
+        if self.beam is not None and same_array(mask, self.beam.mask):
+            return shared_plan(self.beam, options, measured=measured, should_stop=should_stop)
+        # The shot has a beam or unlit pixels of its own.
+        return plan_sites(source, options, mask=mask, measured=measured, should_stop=should_stop)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -164,6 +150,19 @@ class Task:
         provenance = provenance.model_copy(update={"setup": self.setup, "kind": self.kind})
         options = self.recipe.options.model_dump_json()
         return {"options": options, "provenance": provenance.to_json()}
+
+    def with_masks(self, shot: Shot) -> Shot:
+        """Return a shot with the masks of all shots, too, but that a mask's file precedes theirs.
+
+        That is the rule of `collect_inputs` for a shot and its recipe.
+        """
+        common = self.inputs.shot
+        is_file = isinstance(shot.mask, Path)
+        return replace(
+            shot,
+            mask=shot.mask if is_file else join_masks(common.mask, shot.mask),
+            source_mask=join_masks(common.source_mask, shot.source_mask),
+        )
 
     def arrays(self, result: Any) -> dict[str, AnyArray]:
         """Return the variables by name, fields in SI units among them."""
@@ -247,7 +246,7 @@ class InvertTask(Task):
             inputs = self._inputs_of_row(image, beam, source)
         else:
             values = np.asarray(image.image, dtype=np.float64)
-            usable = join_masks(self.inputs.shot.mask, image.mask)
+            usable = self.with_masks(image).mask
             shot = replace(self.inputs.shot, image=values, source=source, mask=usable)
             inputs = replace(self.inputs, shot=shot)
         recipe = inputs.recipe
@@ -280,13 +279,8 @@ class InvertTask(Task):
         recipe_source = self.estimate if beam is None else common.recipe.source
         changes = {"source": recipe_source, "setup": row.setup}
         has_source = row.source is not None and not row.has_own_source
-        shot = replace(
-            row,
-            source=row.source if has_source else source,
-            mask=row.mask if isinstance(row.mask, Path) else join_masks(common.shot.mask, row.mask),
-            source_mask=common.shot.source_mask,
-            warnings=(),
-        )
+        own = row.source if has_source else source
+        shot = self.with_masks(replace(row, source=own, warnings=()))
         inputs = collect_inputs(common.recipe.model_copy(update=changes), shot)
         if beam is None:
             inputs.recipe.check(inputs.shot)
@@ -385,17 +379,12 @@ class FitTask(Task):
         return self.requested.model_copy(update={"source": self.requested.estimate, **cleared})
 
     def _completed(self, shot: Shot, source: AnyArray | None) -> Shot:
-        common = self.inputs.shot
         keeps_source = source is None or not (shot.source is None or shot.has_own_source)
-        is_file = isinstance(shot.mask, Path)
-        bare = common.source_mask
         return replace(
-            shot,
+            self.with_masks(shot),
             image=np.asarray(shot.image, dtype=np.float64),
             setup=self.requested.setup if shot.setup is None else shot.setup,
             source=shot.source if keeps_source else source,
-            mask=shot.mask if is_file else join_masks(common.mask, shot.mask),
-            source_mask=bare if shot.source_mask is None else shot.source_mask,
         )
 
     def _planes(self, result: Fit) -> tuple[dict[str, AnyArray], Any]:
