@@ -216,9 +216,9 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
     from dask.highlevelgraph import HighLevelGraph
 
     da: Any = import_module("dask.array")
-    shots, array = stack.shots, stack.shots.array
+    shots = stack.shots
     token = tokenize(
-        shots.items if array is None else array.name,
+        shots.items,
         [shot.source for shot in shots.items],
         None if stack.beam is None else stack.beam.key,
         stack.source_text(None),
@@ -229,12 +229,15 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
     )
     name = f"invert-shot-{token}"
     task = delayed(stack.task, name=f"task-{token}", traverse=False)
-    dependencies = [node for node in (array, beam, task) if node is not None]
+    lazy = [item for item in shots.items if isinstance(item, ArrayExposure) and item.is_lazy]
+    arrays = {item.array.name: item.array for item in lazy}
+    dependencies = [*arrays.values(), task, *([] if beam is None else [beam])]
     tasks: dict[Any, Any] = {}
     for index, item in enumerate(shots.items):
         shot, block = item, None
-        if array is not None:
-            shot, block = Exposure(item.name, source=item.source), (array.name, index, 0, 0)
+        if isinstance(item, ArrayExposure) and item.is_lazy:
+            block = (item.array.name, item.index, 0, 0)
+            shot = Exposure(item.name, source=item.source)
         inputs = (shots.label(index), shot, block, None if beam is None else beam.key)
         tasks[name, index] = (_invert, *inputs, task.key)
     graph = HighLevelGraph.from_collections(name, tasks, dependencies=dependencies)

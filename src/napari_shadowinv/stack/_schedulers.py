@@ -18,8 +18,6 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
-import numpy as np
-
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import (
@@ -191,7 +189,7 @@ def _tasks(
     tasks = []
     for index, shot in shots.items():
         block = []
-        if blocks and isinstance(shot, ArrayExposure) and not isinstance(shot.array, np.ndarray):
+        if blocks and isinstance(shot, ArrayExposure) and shot.is_lazy:
             block = [shot.block.to_delayed().ravel()[0]]
             shot = Exposure(shot.name, source=shot.source)
         key = f"{10**9 - index}-{name}"  # dask begins with the last

@@ -100,22 +100,23 @@ class ArrayExposure(Exposure):
     index: int = 0
 
     @property
+    def is_lazy(self) -> bool:
+        return not isinstance(self.array, np.ndarray)
+
+    @property
     def block(self) -> Any:
         """The image as an array (1, H, W), without the tasks of other images."""
-        if isinstance(self.array, np.ndarray):
+        if not self.is_lazy:
             return self.array[self.index : self.index + 1]
         dask: Any = import_module("dask")
         return dask.optimize(self.array.blocks[self.index])[0]
 
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
-        block = self.block
-        plane = block[0] if isinstance(block, np.ndarray) else _plain_image(block.compute()[0])
+        plane = _plain_image(self.block.compute()[0]) if self.is_lazy else self.array[self.index]
         return (Shot(plane),), {"sha256": checksum(plane)}
 
     def __dask_tokenize__(self) -> Any:
-        from dask.base import normalize_token
-
-        return normalize_token(self.block)
+        return (self.array.name, self.index) if self.is_lazy else checksum(self.array[self.index])
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Otherwise all images, or their tasks, would be sent with it.
@@ -151,8 +152,10 @@ class FileExposure(Exposure):
         if "warnings" in inspect.signature(self.reader).parameters:
             options["warnings"] = warnings
         image, usable = unpack_array(self.reader(self.path, **options), "the shot")
-        metadata: dict[str, Any] = {"warnings": warnings} if warnings else {}
-        metadata["sha256"] = digest or checksum(image)
+        metadata = {
+            "sha256": digest or checksum(image),
+            **({"warnings": warnings} if warnings else {}),
+        }
         return (Shot(image, mask=usable),), metadata
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
@@ -323,7 +326,6 @@ class Shots:
     items: Sequence[Exposure]
     shape: tuple[int, int]  # that they should have
     coordinate: Any = None  # values of the coordinate ``shot`` of an xarray object
-    array: Any = None  # the same images as one dask array, chunks of one shot, if they came so
     mask: BoolArray | None = None  # pixels that can be used, if they came as masked arrays
 
     def __len__(self) -> int:
@@ -345,7 +347,6 @@ class Shots:
             self,
             items=[self.items[index] for index in order],
             coordinate=None if self.coordinate is None else self.coordinate[list(order)],
-            array=None if self.array is None else self.array[list(order)].rechunk((1, -1, -1)),
         )
 
 
@@ -507,17 +508,16 @@ def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots
             f"shots have the unknown shape {shots.shape}: call compute_chunk_sizes() first"
         )
     mask = _common_mask(shots)
-    is_in_memory = isinstance(shots, np.ndarray)
-    values = np.asarray(shots) if is_in_memory else shots
-    if isinstance(values, da.Array):
-        array = values.rechunk((1, -1, -1))
-    else:  # of numpy, h5py or zarr
-        array = da.from_array(values, chunks=(1, -1, -1))
+    if isinstance(shots, np.ndarray):
+        array = np.asarray(shots)
+    elif isinstance(shots, da.Array):
+        array = shots.rechunk((1, -1, -1))
+    else:  # of h5py or zarr
+        array = da.from_array(shots, chunks=(1, -1, -1))
     numbers = range(count) if coordinate is None else coordinate
     names = map(str, numbers if labels is None else labels)
-    planes = values if is_in_memory else array
-    items = [ArrayExposure(name, planes, index) for index, name in enumerate(names)]
-    return Shots(items, (shots.shape[1], shots.shape[2]), coordinate, array, mask)
+    items = [ArrayExposure(name, array, index) for index, name in enumerate(names)]
+    return Shots(items, (shots.shape[1], shots.shape[2]), coordinate, mask)
 
 
 def _common_mask(shots: Any) -> BoolArray | None:
