@@ -28,6 +28,7 @@ from napari_shadowinv import InversionOptions, invert, read, synthetic_image
 from napari_shadowinv.cli._batch import progress_columns
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.facts import Level, Verdict
+from napari_shadowinv.io import store_writing
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.provenance import Provenance
 
@@ -539,23 +540,23 @@ def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch
 @pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
 def test_ctrl_c_while_workers_start_gives_one_sentence(night, folder):
     starting = """
-        import distributed
+        from concurrent.futures import ProcessPoolExecutor
 
-        class Cluster(distributed.LocalCluster):
-            def __init__(self, *args, **kwargs):
+        class Pool(ProcessPoolExecutor):
+            def __init__(self, *arguments):
                 print("now")
-                super().__init__(*args, **kwargs)
+                super().__init__(*arguments)
 
-        distributed.LocalCluster = Cluster
+        from napari_shadowinv.stack import _schedulers
+        _schedulers.ProcessPoolExecutor = Pool
     """
-    before = sorted(folder.rglob("*"))
+    processes = ["--scheduler", "processes", "--workers", "1"]
     # When the workers are about to import their modules.
-    code, output = interrupted(folder, starting, [*BATCH, "--workers", "1"], 0.6)
+    code, output = interrupted(folder, starting, [*BATCH, *processes], 0.6)
     assert code == 130
     assert output.splitlines() == [
-        "Cancelled: nothing written. Repeat the command with --resume to continue."
+        "Cancelled: 0 done, 0 failed, 6 pending. Repeat the command with --resume to continue."
     ]
-    assert sorted(folder.rglob("*")) == before
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
@@ -642,3 +643,16 @@ def test_a_folder_says_which_files_it_leaves_out(night, folder):
         "--n-sites", 100, "--scheduler", "threads",
     )  # fmt: skip
     assert "left out 1 .txt" in flat(result.output)
+
+
+def test_a_run_that_the_disk_interrupts_names_the_flag_that_resumes_it(folder, monkeypatch):
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    assert batch().exit_code == 0
+    shutil.rmtree("n.shadowinv.zarr")
+    monkeypatch.setattr(store_writing, "_write_template", full)
+    result = batch()
+    assert result.exit_code == 2
+    words = "free some disk space or check the folder's permissions, then run again to resume"
+    assert f"{words} (--resume)" in flat(result.output)

@@ -57,7 +57,7 @@ def _as_store_errors(path: Path) -> Iterator[None]:
     except RunInterruptedError:
         raise
     except OSError as error:
-        if not (path / "zarr.json").exists():
+        if isinstance(error, FileNotFoundError) and not (path / "zarr.json").exists():
             raise RunInterruptedError(
                 f"{path} was removed or moved while it was being written: put it back and run "
                 "again to resume, or start again with another name"

@@ -37,6 +37,7 @@ from napari_shadowinv.stack._worker import (
 
 _CONNECT_TIMEOUT_S = 10.0
 _POLL_S = 0.25  # between two looks at `should_stop`
+_STOPPED = "stopped on request; run again to resume"
 
 
 class Scheduler:
@@ -46,15 +47,13 @@ class Scheduler:
         self,
         name: str,
         get: Any,
-        workers: int,
+        workers: int | None,
         pool: Executor | None = None,
         stop: Any = None,
-        is_stopped: ShouldStop | None = None,
     ) -> None:
         self.name, self.workers = name, workers
         self._get, self._pool = get, pool
         self._stop = threading.Event() if stop is None else stop
-        self._is_stopped = is_stopped  # as tasks ask that cannot ask here
 
     def outcomes(
         self,
@@ -68,19 +67,25 @@ class Scheduler:
         def is_stopped() -> bool:
             return self._stop.is_set() or (should_stop is not None and should_stop())
 
-        tasks = _tasks(shots, beam, context, self._is_stopped or is_stopped)
+        def note(key: Any, value: Any, *_: Any) -> None:
+            ended.put(value)
+            if self._stop.is_set():
+                raise InversionCancelled(_STOPPED)
+
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        note = (None, None, None, lambda key, value, *_: ended.put(value), None)
+        # Tasks elsewhere cannot ask here.
+        ways = {"threads": is_stopped, "synchronous": is_stopped, "processes": _is_worker_stopped}
+        tasks = _tasks(shots, beam, context, ways.get(self._get))
         dask: Any = import_module("dask")
         pending = set(shots)
-        with ThreadPoolExecutor(1, thread_name_prefix="dask") as caller:
+        with ThreadPoolExecutor(1, "dask", _block_interrupts) as caller:
             run = caller.submit(
                 dask.compute,
                 *tasks,
                 scheduler=self._get,
                 pool=self._pool,
                 chunksize=1,
-                callbacks=[note],
+                callbacks=[(None, None, None, note, None)],
             )
             run.add_done_callback(ended.put)
             try:
@@ -105,7 +110,7 @@ class _Cluster(Scheduler):
 
     def __init__(self, client: Any) -> None:
         address = getattr(client.scheduler, "address", "?") if client.scheduler else "?"
-        self.name, self.workers = f"the scheduler at {address}", None  # type: ignore[assignment]
+        super().__init__(f"the scheduler at {address}", None, None)
         self._client = client
 
     def outcomes(
@@ -207,7 +212,7 @@ def _next_of(
     """Wait for the next entry; look regularly whether to stop."""
     while True:
         if should_stop is not None and should_stop():
-            raise InversionCancelled("stopped on request; run again to resume")
+            raise InversionCancelled(_STOPPED)
         with suppress(queue.Empty):
             return ended.get(timeout=_POLL_S)
         check()
@@ -265,14 +270,14 @@ def _local(scheduler: Any, count: int) -> Iterator[Scheduler]:
         yield Scheduler("1 thread", scheduler, 1)
     elif scheduler == "threads":
         name = "1 thread" if count == 1 else f"{count} threads"
-        with _ended(ThreadPoolExecutor(count, thread_name_prefix="shot")) as pool:
+        with ThreadPoolExecutor(count, thread_name_prefix="shot") as pool:
             yield Scheduler(name, scheduler, count, pool)
     elif scheduler == "processes":
         name = "1 process" if count == 1 else f"{count} processes"
         spawn = multiprocessing.get_context("spawn")
         stop = spawn.Event()
-        with _ended(ProcessPoolExecutor(count, spawn, _begin_worker, (stop,))) as pool:
-            yield Scheduler(name, scheduler, count, pool, stop, _is_worker_stopped)
+        with ProcessPoolExecutor(count, spawn, _begin_worker, (stop,)) as pool:
+            yield Scheduler(name, scheduler, count, pool, stop)
     else:
         raise InputError(
             f"scheduler is {scheduler!r}: expected 'threads', 'processes', 'synchronous', an "
@@ -280,22 +285,20 @@ def _local(scheduler: Any, count: int) -> Iterator[Scheduler]:
         )
 
 
-@contextmanager
-def _ended(pool: Executor) -> Iterator[Executor]:
-    try:
-        yield pool
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
 _stop_of_worker: Any = None  # of a worker process: the event that ends its shot
+
+
+def _block_interrupts() -> None:
+    """Keep Ctrl-C, which a terminal sends to all, from processes that this thread starts."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 def _begin_worker(stop: Any) -> None:
     """Let a worker process end its shot with an event, and itself with the process above it."""
     global _stop_of_worker
     _stop_of_worker = stop
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent: Any = multiprocessing.parent_process()
 
     def end() -> None:

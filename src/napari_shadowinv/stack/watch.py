@@ -156,7 +156,7 @@ class Watch:
                     if self._arrivals.left_out.keys() - self._left_out.keys():
                         self._report_left_out()
                     self._arrivals.look()
-                    if names := self._next(scheduler.workers):
+                    if names := self._next(scheduler.workers or 1):
                         self._invert(names, scheduler)
                     elif not self._arrivals.waiting:
                         time.sleep(self._arrivals.poll_s)
