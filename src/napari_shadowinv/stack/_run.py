@@ -98,6 +98,8 @@ class RunStatus:
         Current stage of the preparation, before all shots.
     name, outcome : str, ShotOutcome or None
         The shot that has just ended, if any, and its outcome.
+    result : Inversion, Fit or None
+        Its result, for a watched folder; do not keep a reference.
     again : bool
         Whether the shot was inverted before and its file has changed since.
     failures : tuple of (str, str)
@@ -118,14 +120,10 @@ class RunStatus:
     stage: str = ""
     name: str = ""
     outcome: ShotOutcome | None = None
+    result: Inversion | Fit | None = None
     again: bool = False
     failures: tuple[tuple[str, str], ...] = ()
     note: str = ""
-
-    @property
-    def result(self) -> Inversion | Fit | None:
-        """The result of the shot that has just ended, for a watched folder."""
-        return None if self.outcome is None else self.outcome.result
 
     @property
     def rate(self) -> float:

@@ -498,8 +498,6 @@ class ShotOutcome:
         Why it failed, and whether the solver reached its tolerance, or the fit its end.
     warnings : int
         Number of warnings about its result.
-    result : Inversion, Fit or None
-        Its result, for a watched folder; do not keep a reference.
     """
 
     index: int
@@ -508,7 +506,6 @@ class ShotOutcome:
     reason: str = ""
     converged: bool = True
     warnings: int = 0
-    result: Inversion | Fit | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True)
@@ -518,7 +515,7 @@ class TaskContext:
     writer: ShotWriter
     task: AnyTask
     workers: int | None
-    keeps_results: bool = False  # in the outcomes
+    results: dict[int, Any] | None = None  # takes them, by the shots' numbers, in this process
 
 
 def run_shot(
@@ -536,8 +533,9 @@ def run_shot(
     if block is not None:
         shot = ArrayExposure(shot.name, block, source=shot.source)
     attempt = try_shot(context.task, shot, beam, context.workers, should_stop)
-    outcome = _write_shot(context.writer, context.task, index, attempt)
-    return replace(outcome, result=attempt.result) if context.keeps_results else outcome
+    if context.results is not None:
+        context.results[index] = attempt.result
+    return _write_shot(context.writer, context.task, index, attempt)
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,7 +156,7 @@ class Watch:
                     if self._arrivals.left_out.keys() - self._left_out.keys():
                         self._report_left_out()
                     self._arrivals.look()
-                    if names := self._next(scheduler.workers or 1):
+                    if names := self._next():
                         self._invert(names, scheduler)
                     elif not self._arrivals.waiting:
                         time.sleep(self._arrivals.poll_s)
@@ -203,8 +203,8 @@ class Watch:
         quiet = time.monotonic() - max(self._arrivals.last_change, self._last)
         return idle is not None and quiet > idle and self._arrivals.is_quiet
 
-    def _next(self, most: int) -> list[str]:
-        """Take the next files that wait, as many as can be inverted at once."""
+    def _next(self, most: int = 1000) -> list[str]:
+        """Take the next files that wait."""
         waiting, names = self._arrivals.waiting, list[str]()
         if self._options.latest:
             self._skip(waiting[:-1])
@@ -271,8 +271,9 @@ class Watch:
             self._early.clear()
         self._running = dict(zip(numbered, files, strict=True))
         # Alone, a shot has all the cores.
-        workers = scheduler.workers if len(files) > 1 or self._arrivals.waiting else 1
-        context = TaskContext(store.writer, self._stack.shot_task, workers, keeps_results=True)
+        workers = min(len(files), scheduler.workers or 1)
+        results: dict[int, Any] = {}
+        context = TaskContext(store.writer, self._stack.shot_task, workers, results)
         for outcome in scheduler.outcomes(numbered, self._stack.beam, context, self._should_stop):
             if outcome.reason:
                 self._check_folder(store, outcome)
@@ -285,7 +286,8 @@ class Watch:
             name = numbered[outcome.index].name
             self._redo.discard(name)
             self._note_outcome(name, outcome.reason, bool(outcome.warnings))
-            self.report(name=name, outcome=outcome, again=name in again)
+            result = results.pop(outcome.index)
+            self.report(name=name, outcome=outcome, result=result, again=name in again)
 
     def _check_folder(self, store: GrowingStore, outcome: ShotOutcome) -> None:
         """Raise an error if a shot failed because the folder disappeared; it stays pending."""
