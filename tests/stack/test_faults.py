@@ -275,18 +275,12 @@ def test_lazy_stack_plans_sites_once_in_each_worker(make_night, cluster):
     assert max(plans.values()) == 1
 
 
-def forget_workers() -> None:
-    from napari_shadowinv.stack import _worker
-
-    _worker._threads_on.cache_clear()
-
-
-def test_a_shot_on_a_worker_gets_its_share_of_the_cores(cluster):
+def test_shots_on_a_cluster_share_the_cores_of_its_machine(cluster):
     with Client(cluster, set_as_default=False) as client:
         client.wait_for_workers(2, timeout=PATIENCE)  # one may have died in the test before
-        client.run(forget_workers)
-        shares = client.gather([client.submit(threads_here, pure=False) for _ in range(4)])
-    assert shares == [max(1, available_threads(None) // 2)] * 4
+        with _schedulers.scheduler_for(client) as chosen:
+            assert chosen.workers == 2
+    assert threads_here(chosen.workers) == max(1, available_threads(None) // 2)
 
 
 def test_a_shot_whose_worker_always_dies_fails_with_this_reason(make_night, out, cluster):

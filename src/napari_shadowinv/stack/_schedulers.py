@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -17,6 +18,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from importlib import import_module
 from typing import Any
+from urllib.parse import urlsplit
 
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import ShouldStop
@@ -110,7 +112,12 @@ class _Cluster(Scheduler):
 
     def __init__(self, client: Any) -> None:
         address = getattr(client.scheduler, "address", "?") if client.scheduler else "?"
-        super().__init__(f"the scheduler at {address}", None, None)
+        threads: Counter[str | None] = Counter()
+        for worker, count in client.nthreads().items():
+            threads[urlsplit(worker).hostname] += count
+        # Of the fullest machine; an adaptive cluster may have none yet.
+        most = max(threads.values(), default=None)
+        super().__init__(f"the scheduler at {address}", None, most)
         self._client = client
 
     def outcomes(

@@ -7,11 +7,9 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import hashlib
 import json
 import multiprocessing
-import sys
 import threading
 import time
 from collections.abc import Sequence
@@ -43,8 +41,6 @@ from napari_shadowinv.provenance import MaskVariable, mask_variables
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import ArrayExposure, Exposure, failure_text
 from napari_shadowinv.transport.sites import SitePlan
-
-_REFRESH_S = 10.0  # workers come and go, but asking takes milliseconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -442,46 +438,18 @@ def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:
 
 
 def threads_here(workers: int | None = None) -> int:
-    """Return the number of threads of a shot with which all simultaneous shots fill the machine."""
-    # On a dask worker, workers default to the threads of all dask workers on this machine; in a
-    # pool of dask to its `num_workers`, or one for each core.
+    """Return the number of threads of a shot, of which so many are in work on this machine.
+
+    By default there is one for each thread of dask's pool, and one alone in the main thread.
+    """
     cores = available_threads(None)
     if workers is None:
-        workers = _threads_of_cluster() or _threads_of_pool(cores)
+        import dask
+
+        alone = threading.current_thread() is threading.main_thread()
+        alone = alone and multiprocessing.parent_process() is None
+        workers = 1 if alone else int(dask.config.get("num_workers", None) or cores)
     return max(1, cores // workers)
-
-
-def _threads_of_cluster() -> int | None:
-    """Threads of all dask workers on this machine; None elsewhere than on a worker."""
-    if "distributed" not in sys.modules:
-        return None
-    from distributed import get_worker
-    from distributed.comm.addressing import get_address_host
-
-    try:
-        host = get_address_host(get_worker().address)
-    except ValueError:
-        return None
-    return _threads_on(host, int(time.monotonic() / _REFRESH_S))
-
-
-@functools.lru_cache(maxsize=1)
-def _threads_on(host: str, _age: int) -> int:
-    from distributed import get_client
-    from distributed.comm.addressing import get_address_host
-
-    client: Any = get_client()
-    workers = client.nthreads()
-    return sum(count for address, count in workers.items() if get_address_host(address) == host)
-
-
-def _threads_of_pool(cores: int) -> int:
-    alone = threading.current_thread() is threading.main_thread()
-    if alone and multiprocessing.parent_process() is None:
-        return 1
-    import dask
-
-    return int(dask.config.get("num_workers", None) or cores)
 
 
 @dataclass(frozen=True)
