@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
@@ -325,8 +325,10 @@ class _Run:
         try:
             for first in range(0, len(self._todo), portion):
                 shots = {index: items[index] for index in self._todo[first : first + portion]}
-                for outcome in scheduler.outcomes(shots, stack.beam, context, self._should_stop):
-                    self.report(scheduler.name, outcome)
+                outcomes = scheduler.outcomes(shots, stack.beam, context, self._should_stop)
+                with closing(outcomes):  # at once, if a report raises an error
+                    for outcome in outcomes:
+                        self.report(scheduler.name, outcome)
         except BaseException:
             with suppress(OSError):
                 summarise(self._store)

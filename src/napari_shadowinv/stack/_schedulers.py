@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
@@ -63,7 +63,7 @@ class Scheduler:
         beam: Beam | None,
         context: TaskContext,
         should_stop: ShouldStop | None,
-    ) -> Iterator[ShotOutcome]:
+    ) -> Generator[ShotOutcome, None, None]:
         """Run shots by their numbers, and yield the outcome of each as it ends."""
 
         def is_stopped() -> bool:
@@ -126,7 +126,7 @@ class _Cluster(Scheduler):
         beam: Beam | None,
         context: TaskContext,
         should_stop: ShouldStop | None,
-    ) -> Iterator[ShotOutcome]:
+    ) -> Generator[ShotOutcome, None, None]:
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         with self._as_interruption():
             tasks = _tasks(shots, beam, context, blocks=True)

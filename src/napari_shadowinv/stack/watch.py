@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -274,20 +274,22 @@ class Watch:
         workers = min(len(files), scheduler.workers or 1)
         results: dict[int, Any] = {}
         context = TaskContext(store.writer, self._stack.shot_task, workers, results)
-        for outcome in scheduler.outcomes(numbered, self._stack.beam, context, self._should_stop):
-            if outcome.reason:
-                self._check_folder(store, outcome)
-            store.end(outcome.index)
-            del self._running[outcome.index]
-            self._ended += 1
-            self._last = time.monotonic()
-            self._busy_s += self._last - began
-            began = self._last
-            name = numbered[outcome.index].name
-            self._redo.discard(name)
-            self._note_outcome(name, outcome.reason, bool(outcome.warnings))
-            result = results.pop(outcome.index)
-            self.report(name=name, outcome=outcome, result=result, again=name in again)
+        outcomes = scheduler.outcomes(numbered, self._stack.beam, context, self._should_stop)
+        with closing(outcomes):
+            for outcome in outcomes:
+                if outcome.reason:
+                    self._check_folder(store, outcome)
+                store.end(outcome.index)
+                del self._running[outcome.index]
+                self._ended += 1
+                self._last = time.monotonic()
+                self._busy_s += self._last - began
+                began = self._last
+                name = numbered[outcome.index].name
+                self._redo.discard(name)
+                self._note_outcome(name, outcome.reason, bool(outcome.warnings))
+                result = results.pop(outcome.index)
+                self.report(name=name, outcome=outcome, result=result, again=name in again)
 
     def _check_folder(self, store: GrowingStore, outcome: ShotOutcome) -> None:
         """Raise an error if a shot failed because the folder disappeared; it stays pending."""
