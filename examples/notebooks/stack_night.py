@@ -53,8 +53,8 @@ for number in range(16):
 # ## The workers
 #
 # Here they are threads of this process. On a large machine write `Client()`, on a cluster
-# `Client("tcp://head:8786")`: nothing else changes. The dashboard (with bokeh installed)
-# shows what each worker does.
+# `Client("tcp://head:8786")`: nothing else changes. `distributed` comes with the extra
+# `cluster` of this package; its dashboard (with bokeh installed) shows what each worker does.
 
 # %%
 client = Client(processes=False, dashboard_address="127.0.0.1:0")

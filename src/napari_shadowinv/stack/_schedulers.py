@@ -253,11 +253,8 @@ def scheduler_for(scheduler: Any = None, workers: int | None = None) -> Iterator
 def is_local(scheduler: Any) -> bool:
     """Return whether `scheduler_for` finds a scheduler on this machine."""
     chosen = _resolve(scheduler)
-    return callable(chosen) or isinstance(chosen, Executor) or _is_name(chosen)
-
-
-def _is_name(scheduler: Any) -> bool:
-    return isinstance(scheduler, str) and "://" not in scheduler
+    is_name = isinstance(chosen, str) and "://" not in chosen
+    return is_name or callable(chosen) or isinstance(chosen, Executor)
 
 
 def _resolve(scheduler: Any) -> Any:
@@ -271,7 +268,7 @@ def _resolve(scheduler: Any) -> Any:
 
 @contextmanager
 def _local(scheduler: Any, count: int) -> Iterator[Scheduler]:
-    if not _is_name(scheduler):
+    if not isinstance(scheduler, str):
         yield Scheduler("the given scheduler", scheduler, count)
     elif scheduler == "synchronous":
         yield Scheduler("1 thread", scheduler, 1)
