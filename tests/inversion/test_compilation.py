@@ -1,6 +1,5 @@
 import os
 import shutil
-import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -147,91 +146,33 @@ print([name for name, _ in signatures() - compiled])
     assert printed.stdout.strip() == "[]"
 
 
-ONE_KERNEL = """
-import numpy as np
-from napari_shadowinv.preprocessing._total_variation import _smooth_row as kernel
-from napari_shadowinv.geometry.compiler import is_code_cached
-
-image = np.ones((3, 4))
-smooth = np.empty(4)
-kernel(image, 0 * image, 0 * image, 1, smooth)
-assert (smooth == 1).all()
-print(is_code_cached(), sum(kernel.stats.cache_hits.values()), kernel.stats.cache_path)
-"""
-
-
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of another kind")
-class TestReadOnlyInstallation:
+def test_a_kernel_runs_where_no_folder_keeps_its_code(tmp_path):
     """Neither the package nor the home can be written."""
+    if os.getuid() == 0 and not shutil.which("setpriv"):
+        pytest.skip("root may write everywhere")
+    import napari_shadowinv
 
-    @pytest.fixture
-    def printed(self, tmp_path):
-        """Run a script with another folder for temporary files."""
-        if os.getuid() == 0 and not shutil.which("setpriv"):
-            pytest.skip("root may write everywhere")
-        if "NUMBA_CACHE_DIR" in os.environ:
-            pytest.skip("the package's own folder holds no compiled code")
-        import napari_shadowinv
+    script = """
+from napari_shadowinv.geometry.compiler import is_code_cached
+from napari_shadowinv.geometry.density import _inside_share
 
-        exec(ONE_KERNEL, {})
-
-        place = tmp_path / "installed"
-        package = Path(napari_shadowinv.__file__).parent
-        shutil.copytree(package, place / package.name)
-        for folder in (place, *place.rglob("*")):
-            folder.chmod(0o555)
-
-        def run(temporary: Path) -> list[str]:
-            done = subprocess.run(
-                [
-                    *(WITHOUT_PRIVILEGES if os.getuid() == 0 else []),
-                    sys.executable,
-                    "-c",
-                    ONE_KERNEL,
-                ],
-                cwd=place,
-                env={
-                    "PYTHONPATH": str(place),
-                    "TMPDIR": str(temporary),
-                    "HOME": str(place / "home"),
-                },
-                capture_output=True,
-                text=True,
-            )
-            assert done.returncode == 0, done.stderr
-            return done.stdout.split()
-
-        yield run
-        for folder in (place, *place.rglob("*")):
-            folder.chmod(0o755)
-
-    @pytest.fixture
-    def temporary(self, tmp_path: Path) -> Path:
-        folder = tmp_path / "tmp"
-        folder.mkdir()
-        return folder
-
-    def test_compiled_code_of_the_package_is_used(self, printed, temporary):
-        is_kept, hits, folder = printed(temporary)
-        cache_folder = temporary / f"napari-shadowinv-{os.getuid()}"
-        assert (is_kept, hits) == ("True", "1")
-        assert Path(folder).parent == cache_folder
-        assert stat.S_IMODE(cache_folder.stat().st_mode) == 0o700
-
-    def test_a_folder_that_is_a_link_is_not_used(self, printed, temporary):
-        cache_folder, target = temporary / f"napari-shadowinv-{os.getuid()}", temporary / "other"
-        target.mkdir(mode=0o700)
-        cache_folder.symlink_to(target)
-        # Compiled anew, which ends as well.
-        assert printed(temporary) == ["False", "0", "None"]
-        assert list(target.iterdir()) == []
-
-    def test_a_folder_that_others_can_write_to_is_not_used(self, printed, temporary):
-        cache_folder = temporary / f"napari-shadowinv-{os.getuid()}"
-        cache_folder.mkdir()
-        cache_folder.chmod(0o770)
-        assert printed(temporary) == ["False", "0", "None"]
-        assert list(cache_folder.iterdir()) == []
+print(is_code_cached(), *_inside_share(0.5, 1.0, 1))
+"""
+    place = tmp_path / "installed"
+    shutil.copytree(Path(napari_shadowinv.__file__).parent, place / "napari_shadowinv")
+    for folder in (place, *place.rglob("*")):
+        folder.chmod(0o555)
+    done = subprocess.run(
+        [*(WITHOUT_PRIVILEGES if os.getuid() == 0 else []), sys.executable, "-c", script],
+        cwd=place,
+        env={"PYTHONPATH": str(place), "HOME": str(place / "home")},
+        capture_output=True,
+        text=True,
+    )
+    for folder in (place, *place.rglob("*")):
+        folder.chmod(0o755)
+    assert done.stdout.split() == ["False", "0.0", "0.5"], done.stderr
 
 
 def test_machine_code_of_an_earlier_process_is_recognised(monkeypatch, tmp_path):
