@@ -2,9 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from skimage.restoration import denoise_tv_chambolle
 
-from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
@@ -22,7 +20,6 @@ from napari_shadowinv.preprocessing import (
     uniform_source,
     uniform_warnings,
 )
-from napari_shadowinv.preprocessing._total_variation import least_variation
 from napari_shadowinv.preprocessing.estimates import point_distance
 
 SHAPE = (48, 60)
@@ -173,15 +170,6 @@ def test_total_variation_lowers_a_disc_by_twice_the_weight_over_its_radius():
         assert lowered == pytest.approx(2 * weight / 10 * image.mean(), rel=0.1)
 
 
-def test_total_variation_agrees_with_another_program():
-    image = 1 + 0.3 * np.random.default_rng(0).random((60, 48))
-    image[10:30, 10:20] += 1
-    expected = denoise_tv_chambolle(image, weight=2.0, eps=1e-9, max_num_iter=5000)
-    np.testing.assert_allclose(
-        least_variation(image, 2.0, 5000, Reporter()), expected, rtol=0, atol=1e-3
-    )
-
-
 def test_total_variation_keeps_an_edge_that_a_blur_washes_out():
     edge = np.where(np.arange(80) < 40, 1.0, 3.0) * np.ones((80, 1))
     edge[20:26, 20:26] *= 1.3
@@ -321,7 +309,7 @@ class Stop:
         (lambda image, mask, stop: gaussian_source(image, should_stop=stop), 8),
         (lambda image, mask, stop: polynomial_source(image, degree=10, should_stop=stop), 5),
         (lambda image, mask, stop: low_pass_source(image, 200.0, mask=mask, should_stop=stop), 2),
-        (lambda image, mask, stop: total_variation_source(image, should_stop=stop), 400),
+        (lambda image, mask, stop: total_variation_source(image, mask=mask, should_stop=stop), 40),
         (lambda image, mask, stop: interpolated_source(image, mask, should_stop=stop), 40),
         (lambda image, mask, stop: remove_background(image, 10, should_stop=stop), 5),
         (lambda image, mask, stop: remove_hot_pixels(image, should_stop=stop), 4),
