@@ -56,7 +56,7 @@ def test_gaussian_filters_attenuate_a_wave_by_the_textbook_factor(numbers):
     np.testing.assert_allclose(high_pass(image, 2.0), (1 - gain) * image, atol=1e-14)
 
 
-@pytest.mark.parametrize("order", [1, 2, 5, 400])
+@pytest.mark.parametrize("order", [1, 2, 5, 20])
 @pytest.mark.parametrize("kind", ["high", "low"])
 def test_butterworth_keeps_one_over_root_two_at_the_cutoff(order, kind):
     image, k = wave(6, 9)
@@ -67,8 +67,8 @@ def test_butterworth_keeps_one_over_root_two_at_the_cutoff(order, kind):
 def test_butterworth_falls_by_its_order_per_octave():
     slow, k = wave(2, 0)
     for order in (1, 2, 3):
-        gain = butterworth(slow, 2 * np.pi / (64 * k), order)[0, 0] / slow[0, 0]
-        assert gain == pytest.approx(64.0**-order, rel=1e-3)
+        gain = butterworth(slow, 2 * np.pi / (8 * k), order)[0, 0] / slow[0, 0]
+        assert gain == pytest.approx((1 + 8.0 ** (2 * order)) ** -0.5, rel=1e-9)
 
 
 def test_powers_of_the_two_butterworth_filters_add_up():
@@ -263,7 +263,9 @@ def test_arrays_that_are_no_images_are_refused(name, image, words):
         (lambda image: low_pass(image, 0), "width is 0"),
         (lambda image: high_pass(image, np.nan), "width is nan"),
         (lambda image: butterworth(image, -3), "cutoff is -3"),
+        (lambda image: butterworth(image, 2), "cutoff is 2"),
         (lambda image: butterworth(image, 3, 0), "order is 0"),
+        (lambda image: butterworth(image, 3, 21), "order is 21"),
         (lambda image: butterworth(image, 3, kind="band"), "kind is 'band'"),
         (lambda image: remove_background(image, 2.5), "degree is 2.5"),
         (lambda image: remove_background(image, 11), "from 0 to 10"),

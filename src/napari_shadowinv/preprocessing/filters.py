@@ -14,9 +14,10 @@ An inversion amplifies low frequencies: a source that is wrong by little on a la
 makes a large false potential. Filtering the image, the potential, or both is the simple
 remedy of Kasim et al., arXiv:1607.04179, section V.
 
-The linear filters multiply the image's discrete cosine transform (type II) by a gain that
-depends on the wave number k alone. That mirrors the image at its border, so nothing wraps
-around, and each cosine that fits the image is attenuated by exactly its gain.
+The linear filters multiply the image's discrete cosine transform (type II), or the Fourier
+transform of its mirrored double, by a gain that depends on the wave number k alone. That mirrors
+the image at its border, so nothing wraps around, and each cosine that fits the image is attenuated
+by exactly its gain.
 """
 
 from __future__ import annotations
@@ -167,9 +168,10 @@ def butterworth(
     ----------
     image : array_like, shape (H, W)
     cutoff : float
-        Wavelength in px at which the amplitude falls by 1/√2.
+        Wavelength in px, above 2, at which the amplitude falls by 1/√2.
     order : int, default 2
-        Order n; the amplitude falls as the n-th power of the wavelength. High orders ring.
+        Order n, up to 20; the amplitude falls as the n-th power of the wavelength. High orders
+        ring.
     kind : {"high", "low"}, default "high"
         Which wave numbers k pass, k_c being 2π / cutoff: "high" with a gain of
         (1 + (k_c/k)^2n)^-½, "low" with (1 + (k/k_c)^2n)^-½.
@@ -193,18 +195,20 @@ def butterworth(
     >>> float((butterworth(wave, 16.0, 3) / wave).mean())
     0.7071
     """
+    from skimage.filters import butterworth as passed_by_butterworth
+
     values, _ = pixels.checked_pixels(image)
-    cutoff = pixels.checked_number("cutoff", cutoff, above=0, unit="px")
-    order = pixels.checked_integer("order", order, least=1)
+    cutoff = pixels.checked_number("cutoff", cutoff, above=2, unit="px")
+    order = pixels.checked_integer("order", order, least=1, most=20)
     pixels.check_kind(kind, "high", "low")
-    wave_numbers = _wave_numbers(values.shape)
-    octaves = np.full(wave_numbers.shape, -np.inf)
-    np.log(wave_numbers * (cutoff / (2 * np.pi)), out=octaves, where=wave_numbers > 0)
-    # The logistic function gives 1 / (1 + x^2n) for any order without overflow.
-    gain = np.sqrt(scipy.special.expit(2 * order * (octaves if kind == "high" else -octaves)))
-    if kind == "high" and keep_mean:
-        gain[0, 0] = 1.0
-    return _apply_gain(values, gain)
+    # Doubled by its mirror image, as by a discrete cosine transform: nothing wraps around.
+    mirrored = np.pad(values, [(0, side) for side in values.shape], mode="symmetric")
+    frequency = 1 / min(cutoff, 1e6)  # of waves too long for any image
+    filtered: FloatArray = passed_by_butterworth(
+        mirrored, frequency, kind == "high", order, squared_butterworth=False
+    )
+    mean = values.mean() if kind == "high" and keep_mean else 0.0
+    return filtered[: values.shape[0], : values.shape[1]] + mean
 
 
 class ButterworthFilter(Filter):
@@ -217,10 +221,10 @@ class ButterworthFilter(Filter):
     step: Literal["butterworth"] = "butterworth"
     cutoff: float = Field(
         default=100.0,
-        gt=0,
+        gt=2,
         title="Cutoff (px)",
         description="Wavelength in px at which the amplitude drops to 1/√2.",
-        json_schema_extra={"slider": [2.0, 500.0]},
+        json_schema_extra={"slider": [3.0, 500.0]},
     )
     order: int = Field(
         default=2,

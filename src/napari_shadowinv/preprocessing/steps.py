@@ -11,6 +11,7 @@ import inspect
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -234,23 +235,21 @@ class Rotate(Step):
 
     def _interpolate(self, shot: Shot, least: float = 0.999) -> Shot:
         """Rotate by any angle; a pixel can be used if a least share of it has data."""
+        from skimage.transform import rotate
+
+        turn: Callable[[AnyArray], FloatArray] = partial(
+            rotate, angle=self.angle, order=1, preserve_range=True
+        )
         usable = shot.usable
-        share = self._move(usable.astype(np.float64))
+        share = turn(usable.astype(np.float64))
         mask = share > least
 
         def values(image: FloatArray) -> FloatArray:
-            moved = self._move(np.where(usable, image, 0.0))
+            moved = turn(np.where(usable, image, 0.0))
             return np.where(mask, moved / np.maximum(share, least), 0.0)
 
-        rotated = shot.map_planes(values, lambda bare: self._move(bare.astype(float)) > 0.5)
+        rotated = shot.map_planes(values, lambda bare: turn(bare.astype(np.float64)) > 0.5)
         return replace(rotated, mask=mask)
-
-    def _move(self, plane: FloatArray) -> FloatArray:
-        from scipy.ndimage import affine_transform
-
-        height, width = plane.shape
-        matrix = self.matrix((height, width))
-        return np.asarray(affine_transform(plane, matrix[:2, :2], matrix[:2, 2], order=1))
 
     def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
         return shape[::-1] if self._turns in (1, 3) else shape
