@@ -4,9 +4,7 @@
 - the variables of a file: `mat_variables`; the names of its images: `image_names`
 - MATLAB 7.3 or other HDF5: `is_matlab`
 
-scipy's reader of MATLAB's own layout asks for the memory that a damaged length names, and a damaged
-type crashes it together with the whole program; so planes of numbers, all that is needed, are read
-here.
+scipy reads MATLAB's own layout, h5py the other.
 
 References
 ----------
@@ -18,12 +16,11 @@ from __future__ import annotations
 import math
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum, IntFlag
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias
+from typing import Any
 
 import numpy as np
 
@@ -36,20 +33,14 @@ from napari_shadowinv.io.hdf5 import load_dataset, member, members, open_hdf5
 
 # Attributes of pradformat and of .shadowinv, which MATLAB's save does not write.
 _FOREIGN_MARKS = {"object_type", "format"}
-_HEADER = 128
-_Element = IntEnum("_Element", {"MATRIX": 14, "COMPRESSED": 15})
-_Flag = IntFlag("_Flag", {"LOGICAL": 0x0200, "COMPLEX": 0x0800})
-
-# By their number, from 1.
-_PLAIN = "cell struct object char sparse double single int8 uint8 int16 uint16 int32 uint32"
-_PLAIN += " int64 uint64"
-_CLASSES = {**dict(enumerate(_PLAIN.split(), start=1)), 16: "function handle"}
-_NUMERIC = {*_PLAIN.split()[5:], "logical"}
 _DTYPES = {"double": "f8", "single": "f4", "logical": "?"}
-# Types of the values as they are kept.
-_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
-_STORED |= {12: "i8", 13: "u8"}
-_Bytes: TypeAlias = bytes | memoryview
+_DTYPES |= {
+    f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
+}
+_MATRIX, _COMPRESSED = 14, 15  # elements of a file
+_STORED = {1, 2, 3, 4, 5, 6, 7, 9, 12, 13}  # types of numbers
+_NUMERIC_CLASSES, _LAST_CLASS = range(6, 16), 17
+_IS_COMPLEX = 0x0800  # among the flags
 
 
 @dataclass(frozen=True)
@@ -65,7 +56,7 @@ class MatlabArray:
     def is_image(self) -> bool:
         # Scalars and vectors beside the image do not count, nor do pictures in colour.
         is_colour = self.type == "uint8" and self.shape[2:] == (3,)
-        return self.type in _NUMERIC and min(self.shape[:2], default=0) >= 2 and not is_colour
+        return self.type in _DTYPES and min(self.shape[:2], default=0) >= 2 and not is_colour
 
     def __str__(self) -> str:
         return f"'{self.name}' ({'×'.join(map(str, self.shape))} {self.type})"
@@ -124,8 +115,7 @@ def mat_variables(path: Path) -> list[MatlabArray]:
         head = file.read(516)
         # MATLAB writes a text before the HDF5.
         if b"\x89HDF" not in (head[:4], head[512:]) and head[:10] != b"MATLAB 7.3":
-            file.seek(0)
-            return list(_variables_5(path, file))
+            return _variables_5(path)
     with open_hdf5(path) as content:
         # Names that begin with # are MATLAB's own.
         names = [name for name in content if not name.startswith("#")]
@@ -184,87 +174,72 @@ def _describe_variable(path: Path, name: str, item: Any) -> MatlabArray:
     return MatlabArray(name, item.shape[::-1], type_name, load)
 
 
-def _variables_5(path: Path, file: BinaryIO, preamble: int = 1024) -> Iterator[MatlabArray]:
-    """Variables of MATLAB's own layout: their headers are read, not yet their values.
+def _variables_5(path: Path) -> list[MatlabArray]:
+    """List the variables of MATLAB's own layout."""
+    from scipy.io import whosmat
 
-    Flags, dimensions and name of a variable are in the bytes of the preamble.
+    complex_names = _check_elements(path)
+    variables = []
+    for name, shape, type_name in whosmat(path):
+        prefix = "complex " if name in complex_names else ""
+        load = partial(_load_5, path, name, shape, type_name)
+        variables.append(MatlabArray(name, shape, prefix + type_name, load))
+    return variables
+
+
+def _check_elements(path: Path, preamble: int = 1024) -> set[str]:
+    """Refuse lengths beyond the file, and types that crash scipy; return the complex variables.
+
+    The flags, dimensions and name of a variable are in the bytes of the preamble.
     """
     size = path.stat().st_size
-    order = _byte_order(file)
-    start = _HEADER
-    while start < size:
-        file.seek(start)
-        kind, count = struct.unpack(f"{order}II", file.read(8))
-        check_promise(path, "MATLAB", start + 8 + count, size)
-        body = file.read(min(count, preamble))
-        if kind == _Element.COMPRESSED:
-            body = zlib.decompressobj().decompress(body, preamble)
-            kind, inner = struct.unpack(f"{order}II", body[:8])
-            check_promise(path, "MATLAB", inner, DEFLATE_RATIO * count)
-            body = body[8:]
-        if kind == _Element.MATRIX:
-            name, shape, type_name, _ = _read_preamble(body, order)
-            check_promise(path, "MATLAB", math.prod(shape), DEFLATE_RATIO * count)
-            if name:
-                yield MatlabArray(
-                    name, shape, type_name, partial(_load_5, path, start, count, shape)
-                )
-        start += 8 + count
-
-
-def _byte_order(file: BinaryIO) -> str:
-    order = {b"IM": "<", b"MI": ">"}.get(file.read(_HEADER)[126:])
-    if order is None:
-        raise ValueError("no byte order in its header")
-    return order
-
-
-def _read_preamble(body: _Bytes, order: str) -> tuple[str, tuple[int, ...], str, int]:
-    """Name, shape and class of a variable, and where its values begin."""
-    flags = struct.unpack_from(f"{order}I", body, 8)[0]
-    type_name = "logical" if flags & _Flag.LOGICAL else _CLASSES.get(flags & 0xFF, "object")
-    if type_name == "object":
-        # Opaque objects have no dimensions here.
-        return "an object", (), type_name, 0
-    if flags & _Flag.COMPLEX:
-        type_name = f"complex {type_name}"
-    _, dims, after = _read_field(body, 16, order)
-    shape = struct.unpack(f"{order}{len(dims) // 4}i", dims)
-    if len(shape) < 2 or min(shape) < 0:
-        raise ValueError("shape")
-    _, name, after = _read_field(body, after, order)
-    return bytes(name).decode("latin-1"), shape, type_name, after
-
-
-def _read_field(body: _Bytes, start: int, order: str) -> tuple[int, _Bytes, int]:
-    """Type and content of a data element, and where the next begins."""
-    (kind,) = struct.unpack_from(f"{order}I", body, start)
-    # Short elements share their tag.
-    short = kind >> 16
-    count = short or struct.unpack_from(f"{order}I", body, start + 4)[0]
-    start += 4 if short else 8
-    if (short > 4) or start + count > len(body):
-        raise ValueError("element beyond its place")
-    return kind & 0xFFFF, body[start : start + count], start + (4 if short else -(-count // 8) * 8)
-
-
-def _load_5(path: Path, start: int, count: int, shape: tuple[int, ...]) -> AnyArray:
-    check_size(path, 8 * math.prod(shape))
+    names = set()
     with path.open("rb") as file:
-        order = _byte_order(file)
-        file.seek(start)
-        (kind,) = struct.unpack(f"{order}I4x", file.read(8))
-        body = file.read(count)
-    if kind == _Element.COMPRESSED:
-        unpacker = zlib.decompressobj()
-        count = struct.unpack(f"{order}4xI", unpacker.decompress(body, 8))[0]
-        check_size(path, count)
-        body = unpacker.decompress(unpacker.unconsumed_tail, max(count, 1))
-        check_promise(path, "MATLAB", count, len(body))
-    # A plane of numbers, which MATLAB keeps column after column.
-    view = memoryview(body)
-    _, shape, type_name, start = _read_preamble(view, order)
-    kind, content, _ = _read_field(view, start, order)
-    stored = np.frombuffer(content, dtype=np.dtype(f"{order}{_STORED[kind]}"))
-    # Whole numbers are kept in as few bytes as they need.
-    return stored.reshape(shape, order="F").astype(_DTYPES.get(type_name, type_name), copy=False)
+        order = {b"IM": "<", b"MI": ">"}.get(file.read(128)[126:])
+        if order is None:
+            raise ValueError("no byte order in its header")
+        while head := file.read(8):
+            kind, count = struct.unpack(f"{order}II", head)
+            end = file.tell() + count
+            check_promise(path, "MATLAB", end, size)
+            body = file.read(min(count, preamble))
+            if kind == _COMPRESSED:
+                body = zlib.decompressobj().decompress(body, preamble)
+                kind, unpacked = struct.unpack_from(f"{order}II", body)
+                check_promise(path, "MATLAB", unpacked, DEFLATE_RATIO * count)
+                body, count = body[8:], unpacked
+            if kind == _MATRIX:
+                names.add(_check_numbers(path, body, count, order))
+            file.seek(end)
+    return names
+
+
+def _check_numbers(path: Path, body: bytes, count: int, order: str) -> str:
+    """Return the name of a complex variable, an empty one of another kind."""
+    (flags,) = struct.unpack_from(f"{order}I", body, 8)
+    if flags & 0xFF > _LAST_CLASS:
+        raise ValueError(f"unknown class {flags & 0xFF}")
+    if flags & 0xFF not in _NUMERIC_CLASSES:
+        return ""
+    start, tag, fields = 16, 0, []
+    for _ in ("dimensions", "name", "values"):
+        tag, length = struct.unpack_from(f"{order}II", body, start)
+        # Short elements share their tag; others are filled up to 8 bytes.
+        first, length = (start + 4, tag >> 16) if tag >> 16 else (start + 8, length)
+        fields.append(body[first : first + length])
+        check_promise(path, "MATLAB", first + length, count)
+        start = -(-(first + length) // 8) * 8
+    if tag & 0xFFFF not in _STORED:
+        raise ValueError(f"unknown type {tag & 0xFFFF} of numbers")
+    return fields[1].decode("latin-1") if flags & _IS_COMPLEX else ""
+
+
+def _load_5(path: Path, name: str, shape: tuple[int, ...], type_name: str) -> AnyArray:
+    from scipy.io import loadmat
+
+    promised = 8 * math.prod(shape)
+    check_promise(path, "MATLAB", promised, 8 * DEFLATE_RATIO * path.stat().st_size)
+    check_size(path, promised)
+    values = np.asarray(loadmat(path, variable_names=[name])[name])
+    # Whole numbers are stored in as few bytes as they need; sparse ones are refused later.
+    return values if values.dtype == object else values.astype(_DTYPES[type_name], copy=False)
