@@ -216,9 +216,7 @@ def test_tiff_whose_strip_unpacks_to_far_more_is_refused(here: Path) -> None:
     with Path("bomb.tif").open("ab") as file:
         file.write(bomb)
 
-    with pytest.raises(
-        FileFormatError, match="unpacks to more than 50000000 bytes, expected 20000"
-    ):
+    with pytest.raises(FileFormatError, match="is damaged or truncated"):
         read("bomb.tif")
 
 

@@ -11,13 +11,10 @@ transparent or without data become NaN.
 from __future__ import annotations
 
 import logging
-import lzma
 import math
-import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -45,10 +42,6 @@ from napari_shadowinv.io.images import (
 from napari_shadowinv.io.text import LENGTHS
 
 _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
-_UNPACKERS: dict[int, Callable[[], Any]] = {
-    **dict.fromkeys((8, 32946), zlib.decompressobj),
-    34925: lzma.LZMADecompressor,
-}
 _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
 
 _JPEG = {6, 7}
@@ -245,42 +238,6 @@ def _check_complete(path: Path, page: Any) -> None:
     check_promise(path, "TIFF", page.size * bits // 8, packing * packed_bytes)
     # One tile may be far larger than what is used of it.
     check_size(path, max(page.size, math.prod(page.chunks)) * max(8, page.dtype.itemsize))
-    _check_strips(path, page)
-
-
-def _check_strips(path: Path, page: Any, small: int = 50_000_000) -> None:
-    """Refuse a strip or tile that unpacks to far more than its pixels; the decoder accepts it.
-
-    `small` strips (bytes) do not matter.
-    """
-    pixels = math.prod(page.chunks) * page.dtype.itemsize
-    most = max(2 * pixels, small)
-    with path.open("rb") as file:
-        for offset, count in zip(page.dataoffsets, page.databytecounts, strict=True):
-            file.seek(offset)
-            if page.compression in _PICTURE_CODECS:
-                unpacked = _promised_bytes(file.read(count))
-            elif page.compression in _UNPACKERS and count * _TIFF_RATIO > most:
-                unpacker = _UNPACKERS[page.compression]()
-                unpacked = len(unpacker.decompress(file.read(count), most + 1))
-            else:
-                continue
-            if unpacked > most:
-                raise FileFormatError(
-                    f"{path} is damaged: a strip of {count} bytes unpacks to more than {most} "
-                    f"bytes, expected {pixels}; save it again"
-                )
-
-
-def _promised_bytes(strip: bytes) -> int:
-    """Return the size of a picture in a strip by its own header; 0 if it cannot be known."""
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(BytesIO(strip)) as picture:
-            return math.prod(picture.size) * len(picture.getbands())
-    except (UnidentifiedImageError, OSError, SyntaxError):
-        return 0
 
 
 def _without_alpha(page: Any, array: AnyArray) -> AnyArray:
