@@ -26,7 +26,6 @@ the columns (y) that can be used.
 
 from __future__ import annotations
 
-import itertools
 import math
 import re
 from collections.abc import Iterator
@@ -65,38 +64,31 @@ _BLOCK = re.compile(r"^[#%]\s*(flux2D|flux2D_ref|mask)\s*(?:\(\s*(\d+)\s*,\s*(\d
 _SELECTED = re.compile(r"^[#%]\s*([xy])-mask\s+([\d.]+)\s*%?\s*-\s*([\d.]+)")
 
 
-# Of a column or row that counts: noise and slopes of light have no such steps.
-
-
 def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
     """Read an image with its ``geometry`` (m, MeV), and ``source`` and ``mask`` if present."""
-    # Once to find mistakes, once to keep: a bad file never fills the memory.
-    height = 0
-    width: int | None = None
+    # A number takes two characters at least, and eight bytes in memory.
+    check_size(path, 4 * path.stat().st_size)
+    rows: list[str] = []
     geometry: dict[str, float] = {}
     blocks: dict[str, tuple[int, int]] = {}
     selected: dict[str, tuple[float, float]] = {}
-    for number, line in _read_lines(path):
-        if line[0] in "#%":
+    for number, line in enumerate(_read_lines(path), 1):
+        if line[:1] in {"#", "%"}:
             geometry |= _parse_geometry(path, number, line)
             if block := _BLOCK.match(line):
                 first_shape = next(iter(blocks.values()), (0, 0))
                 blocks[block[1]] = (int(block[2]), int(block[3])) if block[2] else first_shape
             if part := _SELECTED.match(line):
                 selected[part[1]] = float(part[2]), float(part[3])
-        else:
-            width = _parse_row(path, number, line, width).size
-            height += 1
-            if not height % 1000:
-                check_size(path, 8 * height * width)
-    width = width or 0
+        elif line:
+            rows.append(line)
+    image = _parse_rows(path, rows)
+    height, width = image.shape
     if "flux2D" in blocks:
         if selected and "mask" not in blocks and height == 3 * blocks["flux2D"][0]:
             # Some versions write the mask without its shape.
             blocks["mask"] = blocks["flux2D"]
         _check_blocks(path, blocks, (height, width))
-    check_size(path, 8 * height * width)
-    image = _read_rows(path, height, width)
     metadata: dict[str, Any] = {"bits": 64, "geometry": _complete_distances(geometry)}
     if "flux2D" not in blocks:
         _check_no_coordinates(path, image)
@@ -176,64 +168,42 @@ def _is_axis(numbers: FloatArray, least_steps: int = 4, deviation: float = 0.3) 
     return usual != 0 and bool((np.abs(steps / usual - 1) < deviation).all())
 
 
-def _read_rows(path: Path, height: int, width: int) -> FloatArray:
-    if not height:
-        raise FileFormatError(
-            f"{path} holds no numbers: expected one row of pixels per line; export the image again"
-        )
-    if min(height, width) < 2:
-        raise FileFormatError(
-            f"{path} holds {height} rows of {width} numbers: expected an image with at least two "
-            "rows and two columns; export the image again"
-        )
-    image = np.empty((height, width))
-    rows = ((number, line) for number, line in _read_lines(path) if line[0] not in "#%")
-    for row, (number, line) in zip(image, rows, strict=True):
-        row[:] = _parse_row(path, number, line, width)
-    return image
-
-
-def _read_lines(path: Path, most_bytes: int = 4_000_000) -> Iterator[tuple[int, str]]:
-    """Yield the lines that are not blank, with numbers from 1; 100,000 pixels have 2.5 MB."""
+def _read_lines(path: Path) -> Iterator[str]:
     with path.open("rb") as file:
-        for number in itertools.count(1):
-            raw = file.readline(most_bytes)
-            if not raw:
-                return
-            if len(raw) == most_bytes and not raw.endswith(b"\n"):
-                raise FileFormatError(
-                    f"{path}, line {number} is longer than {most_bytes} bytes: expected one "
-                    "row of pixels per line; split it"
-                )
-            raw = raw.removeprefix(b"\xef\xbb\xbf") if number == 1 else raw
+        for raw in file:
             try:
-                text = raw.decode("utf-8").strip()
+                yield raw.decode("utf-8-sig").strip()
             except UnicodeDecodeError:
                 # Comments that Windows wrote; numbers look the same in both.
-                text = raw.decode("latin-1").strip()
-            if text:
-                yield number, text
+                yield raw.decode("latin-1").strip()
 
 
-def _parse_row(path: Path, number: int, line: str, width: int | None) -> FloatArray:
-    if ";" in line:
-        words = line.rstrip(";").replace(",", ".").split(";")
-    else:
-        words = line.rstrip(",").split("," if "," in line else None)
-    if width is not None and len(words) != width:
+def _parse_rows(path: Path, rows: list[str]) -> FloatArray:
+    if len(rows) < 2:
         raise FileFormatError(
-            f"{path}, line {number} has {len(words)} numbers, but the first row has {width}: "
-            "expected rows of equal length; export the image again"
+            f"{path} holds {len(rows)} rows of numbers: expected at least two, one row of pixels "
+            "per line; export the image again"
         )
+    separator = next((sign for sign in ";," if sign in rows[0]), None)
+    if separator == ";":
+        rows = [row.replace(",", ".") for row in rows]
     try:
-        return np.fromiter(map(float, words), dtype=np.float64, count=len(words))
-    except ValueError:
-        word = next(word for word in words if not is_number(word)).strip()
-        excerpt = word if len(word) <= 30 else f"{word[:30]}…"
+        image = np.loadtxt(
+            [row.rstrip(separator) for row in rows], delimiter=separator, comments=None, ndmin=2
+        )
+    except ValueError as error:
+        reason = str(error).partition(";")[0][:120]
         raise FileFormatError(
-            f"{path}, line {number} has {excerpt!r}: expected numbers with a decimal point, "
-            "separated by spaces, commas or semicolons; start lines of text with #"
+            f"{path} is no table of numbers ({reason}): expected rows of equal length, numbers "
+            "with a decimal point, separated by spaces, commas or semicolons; start lines of text "
+            "with #"
         ) from None
+    if image.shape[1] < 2:
+        raise FileFormatError(
+            f"{path} holds one number a row: expected an image with at least two columns; export "
+            "the image again"
+        )
+    return image
 
 
 def _parse_geometry(path: Path, number: int, line: str, most: int = 200) -> dict[str, float]:
