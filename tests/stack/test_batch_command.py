@@ -459,16 +459,14 @@ def test_masked_pixels_leave_a_film_as_it_is(store):
 
 
 def test_a_gif_keeps_the_colours_of_its_scale(store):
-    from matplotlib import colormaps
+    from napari_shadowinv.plotting import stack_frames
 
-    from napari_shadowinv.plotting import in_few_colours, stack_frames
-
-    scale = colormaps["viridis"](np.linspace(0, 1, 1000), bytes=True)[None, :, :3]
-    # Half of the way to the next of 200 colours.
-    assert np.abs(in_few_colours(scale).astype(int) - scale).max() <= 3
     assert shadowinv("movie", store, "-o", "film.gif").exit_code == 0
-    frames = [in_few_colours(frame) for frame in stack_frames(read(store))]
-    np.testing.assert_array_equal(iio.imread("film.gif"), frames)
+    drawn = np.array(list(stack_frames(read(store))), dtype=int)
+    # A palette of 256 colours for each frame; antialiased letters are not in it.
+    difference = np.abs(iio.imread("film.gif") - drawn)
+    assert difference.mean() < 0.5
+    assert np.quantile(difference, 0.999) <= 12
 
 
 def test_without_its_package_mp4_is_refused_in_one_sentence(store, monkeypatch):

@@ -15,7 +15,7 @@ disturb the figures of a notebook.
 
 from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure
-from napari_shadowinv.plotting._movie import in_few_colours, stack_frames, write_film
+from napari_shadowinv.plotting._movie import stack_frames, write_film
 from napari_shadowinv.plotting._panels import own_style
 from napari_shadowinv.plotting._plan_figure import plan_figure, sweep_figure
 from napari_shadowinv.plotting._product_figure import make_logarithmic, products_figure
@@ -29,7 +29,6 @@ from napari_shadowinv.plotting.figures import (
 __all__ = [
     "comparison_figure",
     "fit_figure",
-    "in_few_colours",
     "left_out_figure",
     "make_logarithmic",
     "own_style",

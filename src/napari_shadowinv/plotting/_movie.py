@@ -137,28 +137,6 @@ def _draw_frames(
         yield np.ascontiguousarray(pixels[:rows, :columns])
 
 
-def in_few_colours(frame: NDArray[np.uint8], *, n_greys: int = 56) -> NDArray[np.uint8]:
-    """Reduce the colours to a fixed palette that suits a GIF.
-
-    A palette of the 256 most frequent colours would leave few for the bright parts.
-
-    Takes and returns an ndarray of uint8, shape (rows, columns, 3); the colours are the nearest of
-    the colour scale, and the greys that are reserved for text.
-    """
-    from matplotlib import colormaps
-    from scipy.spatial import cKDTree
-
-    scale = colormaps[_COLOUR_MAP](np.linspace(0, 1, 256 - n_greys))[:, :3]
-    greys = np.repeat(np.linspace(0, 1, n_greys), 3).reshape(-1, 3)
-    palette = (255 * np.concatenate([scale, greys])).round().astype(np.uint8)
-    rows = frame.reshape(-1, 3)
-    # A frame has few thousand different colours, and most pixels share some.
-    packed = rows @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
-    _, first, indices = np.unique(packed, return_index=True, return_inverse=True)
-    nearest: NDArray[np.uint8] = palette[cKDTree(palette).query(rows[first])[1]]
-    return nearest[indices].reshape(frame.shape)
-
-
 def write_film(
     path: Path, frames: Iterable[NDArray[np.uint8]], rate: float, *, overwrite: bool = False
 ) -> int:
@@ -203,7 +181,7 @@ def _encode(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int
     film: Any = iio.get_writer(path, mode="I", **form)
     with film:
         for frame in frames:
-            film.append_data(in_few_colours(frame) if is_gif else frame)
+            film.append_data(frame)
             count += 1
     if not is_gif:
         from imageio_ffmpeg import count_frames_and_secs
