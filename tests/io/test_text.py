@@ -174,9 +174,7 @@ def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
         (("# pixel size: 3 apples", "1 2"), r"line 1 has '3 apples' for pixel_size"),
     ],
 )
-def test_mistakes_are_named(
-    tmp_path: Path, rows: tuple[str, ...], message: str
-) -> None:
+def test_mistakes_are_named(tmp_path: Path, rows: tuple[str, ...], message: str) -> None:
     with pytest.raises(FileFormatError, match=message):
         read_radiograph(lines(tmp_path / "shot.csv", *rows))
 
