@@ -279,19 +279,12 @@ def _spacing(array: Any, dim: str, name: str, uneven: float) -> float | None:
 
 def block_sums(planes: FloatArray | BoolArray, side: int) -> FloatArray:
     """Return sums over square blocks of a plane, or of each of several, without incomplete ones."""
-    *count, height, width = planes.shape
-    rows, columns = height // side, width // side
-    whole = planes[..., : rows * side, : columns * side]
-    blocks = whole.reshape(*count, rows, side, columns, side)
-    # Line by line, because numpy takes many times as long for sums over short axes.
-    kind = planes.dtype if planes.dtype.kind == "f" else np.float64
-    lines: FloatArray = blocks[..., 0].astype(kind)
-    for k in range(1, side):
-        lines += blocks[..., k]
-    sums: FloatArray = lines[..., 0, :].copy()
-    for k in range(1, side):
-        sums += lines[..., k, :]
-    return sums
+    from skimage.measure import block_reduce
+
+    height, width = (length // side * side for length in planes.shape[-2:])
+    block = (*(1 for _ in planes.shape[:-2]), side, side)
+    sums: AnyArray = block_reduce(planes[..., :height, :width], block, np.sum)
+    return sums if sums.dtype.kind == "f" else sums.astype(np.float64)
 
 
 def complete_block_means(planes: FloatArray | BoolArray, side: int) -> FloatArray:
