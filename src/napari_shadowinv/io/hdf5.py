@@ -2,7 +2,6 @@
 
 - `open_hdf5`; an item, `member`, or all of a group, `members`; its values, `load_dataset`
 - refuse a file whose arrays are elsewhere or too large: `check_arrays`
-- a NetCDF4 file, for xarray: `opened_netcdf`
 - write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
 
 An HDF5 file can point to others: by external links, external storage and virtual arrays. No
@@ -15,7 +14,6 @@ import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
@@ -152,34 +150,6 @@ def _iterate_datasets(path: Path, group: Any) -> Iterator[Any]:
             yield item
         elif isinstance(item, h5py.Group):
             yield from _iterate_datasets(path, item)
-
-
-@contextmanager
-def opened_netcdf(path: Path) -> Iterator[Any]:
-    """Open a NetCDF4 file as a store from which xarray loads in less than half of its time."""
-    import h5netcdf
-    from xarray.backends import H5NetCDFStore
-
-    with (
-        _remembering_file()(path.absolute(), "r") as content,
-        h5netcdf.File(content, "r", decode_vlen_strings=True) as file,
-    ):
-        yield H5NetCDFStore(file)
-
-
-@cache
-def _remembering_file() -> Any:
-    """A kind of HDF5 file that looks each name up once; h5netcdf asks for it sixty times."""
-    import h5py
-
-    class RememberingFile(h5py.File):  # type: ignore[misc]
-        def __getitem__(self, name: Any) -> Any:
-            known = self.__dict__.setdefault("_known", {})
-            if name not in known:
-                known[name] = super().__getitem__(name)
-            return known[name]
-
-    return RememberingFile
 
 
 @contextmanager

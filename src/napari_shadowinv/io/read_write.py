@@ -36,7 +36,6 @@ from napari_shadowinv.io.hdf5 import (
     check_arrays,
     check_hdf5_seal,
     hdf5_in_memory,
-    opened_netcdf,
 )
 from napari_shadowinv.io.images import film_warnings, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
@@ -281,8 +280,7 @@ def read_result(path: Path) -> xarray.Dataset:
     check_hdf5_seal(path)
     check_arrays(path)
     # Nothing in it is a time, whatever its units look like.
-    with opened_netcdf(path) as store:
-        return xr.load_dataset(store, decode_times=False)
+    return xr.load_dataset(path, engine="h5netcdf", decode_times=False)
 
 
 def write_sites(path: Path, dataset: xarray.Dataset) -> None:
