@@ -441,9 +441,8 @@ def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Repo
 
     def fitted(start: FloatArray, loss: str, scale: float) -> FloatArray:
         fit = scipy.optimize.least_squares(
-            excess, start, lambda p: _gaussian_slopes(p, y, x), bounds,
-            loss=loss, f_scale=scale, x_scale="jac", max_nfev=200,
-        )  # fmt: skip
+            excess, start, bounds=bounds, loss=loss, f_scale=scale, x_scale="jac", max_nfev=200
+        )
         return np.asarray(fit.x)
 
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
@@ -480,24 +479,6 @@ def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArra
     u = a * (y - centre_y) + b * (x - centre_x)
     v = c * (x - centre_x)
     return np.asarray(height * np.exp(-0.5 * (u**2 + v**2)) + constant)
-
-
-def _gaussian_slopes(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
-    """Return the derivatives of `_gaussian` by its parameters, shape (samples, 7)."""
-    height, _, centre_y, centre_x, a, b, c = parameters
-    dy, dx = y - centre_y, x - centre_x
-    u, v = a * dy + b * dx, c * dx
-    bell = np.exp(-0.5 * (u**2 + v**2))
-    slopes = [
-        bell,
-        np.ones_like(bell),
-        height * bell * u * a,
-        height * bell * (u * b + v * c),
-        -height * bell * u * dy,
-        -height * bell * u * dx,
-        -height * bell * v * dx,
-    ]
-    return np.stack(slopes, axis=1)
 
 
 def centre_within(
