@@ -216,7 +216,7 @@ def test_tiff_whose_strip_unpacks_to_far_more_is_refused(here: Path) -> None:
     with Path("bomb.tif").open("ab") as file:
         file.write(bomb)
 
-    with pytest.raises(FileFormatError, match="is damaged or truncated"):
+    with pytest.raises(FileFormatError, match="could not be read"):
         read("bomb.tif")
 
 

@@ -419,7 +419,7 @@ def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved:
 def test_a_damaged_store_is_one_sentence(store: Path) -> None:
     shutil.rmtree(store / "displacement")
     (store / "zarr.json").unlink()
-    with pytest.raises(FileFormatError, match=r"is damaged or truncated|not a store"):
+    with pytest.raises(FileFormatError, match=r"could not be read|not a store"):
         read_paths(str(store))
     with pytest.raises(FileFormatError, match="does not exist"):
         read_paths(str(store.with_name("gone.shadowinv.zarr")))
@@ -468,7 +468,7 @@ def test_damage_within_a_result_is_one_sentence(tmp_path: Path, inversion: Inver
     path = write(tmp_path / "shot.shadowinv", inversion)
     with h5py.File(path, "r+") as file:
         file.attrs["report"] = '{"converged": '
-    with pytest.raises(FileFormatError, match=r"shot\.shadowinv is damaged or truncated") as error:
+    with pytest.raises(FileFormatError, match=r"shot\.shadowinv could not be read") as error:
         read_paths(str(path))
     assert error.value.__cause__ is not None
     assert "\n" not in str(error.value)

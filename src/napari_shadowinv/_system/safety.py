@@ -11,13 +11,9 @@
 from __future__ import annotations
 
 import functools
-import lzma
 import math
 import os
-import re
 import stat
-import struct
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,18 +29,6 @@ LIMIT_VARIABLE = "SHADOWINV_MAX_GB"
 
 # Reading needs a few copies of the image, and other programs some memory too.
 _ALWAYS_FITS = 1_000_000
-
-_DECODING_ERRORS: tuple[type[Exception], ...] = (OSError, EOFError, SyntaxError, UnicodeError)
-_DECODING_ERRORS += (struct.error, zlib.error, lzma.LZMAError)
-_NOT_SUPPORTED = re.compile(
-    r"not (available|implemented|installed|supported)|unsupported|unknown|requires the ", re.I
-)
-_NEEDS_DECODER = re.compile(r"requires the .* package|not (available|installed)")
-_WRONG_BYTES = re.compile(
-    r"truncat|corrupt|damaged|incomplete|broken|checksum|\bCRC|end of|EOF|signature|magic|"
-    r"greater than file size|cannot reshape|^(Unable to|Can't) ",
-    re.I,
-)
 
 P = ParamSpec("P")
 Content = TypeVar("Content")
@@ -64,7 +48,7 @@ def as_file_errors(
         try:
             return read(Path(path), *args, **kwargs)
         except _DamagedContentError as error:
-            raise _reading_error(path, error.__cause__ or error, is_damage=True) from error
+            raise _reading_error(path, error.__cause__ or error) from error
         except (FileFormatError, InputError, InversionCancelled, NameError):
             raise  # the last is a mistake in a program, which no file can cause
         except ModuleNotFoundError as error:
@@ -86,34 +70,11 @@ def as_file_errors(
     return cast("Callable[Concatenate[str | Path, P], Content]", guarded)
 
 
-def _reading_error(
-    path: str | Path, cause: BaseException, is_damage: bool = False
-) -> FileFormatError:
-    reason = _error_reason(cause)
-    if is_damage or _is_damage(cause):
-        return FileFormatError(
-            f"{path} is damaged or truncated ({reason}): expected a complete file; copy or export "
-            "it again"
-        )
-    if isinstance(cause, ImportError) or _NEEDS_DECODER.search(reason):
-        return FileFormatError(
-            f"{path} needs a decoder that is not installed ({reason}): install that package, or "
-            "save the file without compression"
-        )
+def _reading_error(path: str | Path, cause: BaseException) -> FileFormatError:
     return FileFormatError(
-        f"{path} could not be read ({reason}): expected a file that follows its format; export it "
-        "again, an image as 16-bit TIFF"
+        f"{path} could not be read ({_error_reason(cause)}): it is damaged, incomplete, or in a "
+        "form that needs another reader; copy it again, or export it, an image as 16-bit TIFF"
     )
-
-
-def _is_damage(cause: BaseException) -> bool:
-    """Return whether an error of a reader says that bytes are missing or wrong."""
-    text, package = str(cause), type(cause).__module__.partition(".")[0]
-    if isinstance(cause, ImportError | NotImplementedError) or _NOT_SUPPORTED.search(text):
-        return False
-    # h5py and pillow raise these without a number where the system raises none.
-    is_decoding = isinstance(cause, _DECODING_ERRORS) or package in ("tifffile", "imagecodecs")
-    return is_decoding or bool(_WRONG_BYTES.search(text))
 
 
 def _error_reason(error: BaseException) -> str:
