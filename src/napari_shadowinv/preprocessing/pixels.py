@@ -95,12 +95,14 @@ def _spline(
     weighted: FloatArray, share: FloatArray, width: float, power: int, report: Reporter
 ) -> FloatArray:
     """Minimise ∑ share·(u - value)² + width^2p ∑ u(-Δ)ᵖu, `weighted` being share·value."""
+    from skimage.transform import resize
+
     if min(weighted.shape) < 32:
         start = np.full(weighted.shape, weighted.sum() / share.sum())
     else:  # from pixels twice as large
         coarse = _spline(block_means(weighted, 2), block_means(share, 2), width / 2, power, report)
-        start = _double_rows(coarse, weighted.shape[0]).T
-        start = _double_rows(start, weighted.shape[1]).T
+        doubled = resize(coarse, [2 * side for side in coarse.shape], order=1, mode="edge")
+        start = doubled[: weighted.shape[0], : weighted.shape[1]]
     squares = [4 * np.sin(0.5 * np.pi * np.arange(side) / side) ** 2 for side in weighted.shape]
     roughness = (width**2 * np.add.outer(*squares)) ** power
 
@@ -126,14 +128,6 @@ def _spline(
         maxiter=500,
     )
     return np.asarray(solution.reshape(weighted.shape))
-
-
-def _double_rows(coarse: FloatArray, side: int) -> FloatArray:
-    """Interpolate to twice as many rows, cut to `side`, linearly between the coarse ones."""
-    padded = np.pad(coarse, [(1, 1), (0, 0)], mode="edge")
-    near, before, after = padded[1:-1], padded[:-2], padded[2:]
-    rows = np.stack([0.75 * near + 0.25 * before, 0.75 * near + 0.25 * after], axis=1)
-    return np.asarray(rows.reshape(-1, coarse.shape[1])[:side])
 
 
 MAX_EXTRAPOLATION = 10.0  # times the brightest pixel seen
