@@ -3,7 +3,8 @@
 - the cells of a table: `read_table`; its rows as models: `read_rows`; to a file: `write_cells`
 - whether a file begins with column names: `has_column_names`
 
-Semicolons and tabs separate cells, too. Empty lines and lines that begin with ``#`` are skipped.
+The cells are the standard library's: pandas does not know the lines of its rows. Semicolons and
+tabs separate cells, too. Empty lines and lines that begin with ``#`` are skipped.
 Capitals in column names do not matter.
 """
 

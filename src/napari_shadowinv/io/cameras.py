@@ -1,5 +1,8 @@
 """Raw frames of cameras: PCO's ``.b16``, and ``.spe`` 2.x and 3.0 of Princeton Instruments.
 
+imageio reads ``.spe``, too, but takes the times between the frames of 3.0 for pixels, and knows
+neither doubles nor bytes.
+
 References
 ----------
 pco.edge User Manual, appendix A4, Image File Formats.
