@@ -283,7 +283,9 @@ def block_sums(planes: FloatArray | BoolArray, side: int) -> FloatArray:
 
     height, width = (length // side * side for length in planes.shape[-2:])
     block = (*(1 for _ in planes.shape[:-2]), side, side)
-    sums: AnyArray = block_reduce(planes[..., :height, :width], block, np.sum)
+    sums: AnyArray = block_reduce(  # type: ignore[no-untyped-call]
+        planes[..., :height, :width], block, np.sum
+    )
     return sums if sums.dtype.kind == "f" else sums.astype(np.float64)
 
 

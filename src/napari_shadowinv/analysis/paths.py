@@ -205,7 +205,8 @@ def circle_path(center: tuple[float, float], radius: float, *, corners: int = 72
 def interpolate_cubic(plane: FloatArray, points: FloatArray) -> FloatArray:
     """Return values of a plane at points (..., 2) in px, by cubic polynomials through 4 × 4 pixels.
 
-    Points in the outermost half pixel are extrapolated.
+    Points in the outermost half pixel are extrapolated. scipy's splines would filter the whole
+    plane first, for each sample of a band.
     """
     values = np.empty(points[..., 0].size)
     _interpolate_points(plane, points.reshape(-1, 2), values)

@@ -101,7 +101,8 @@ def _spline(
         start = np.full(weighted.shape, weighted.sum() / share.sum())
     else:  # from pixels twice as large
         coarse = _spline(block_means(weighted, 2), block_means(share, 2), width / 2, power, report)
-        doubled = resize(coarse, [2 * side for side in coarse.shape], order=1, mode="edge")
+        sides = [2 * side for side in coarse.shape]
+        doubled = resize(coarse, sides, order=1, mode="edge")  # type: ignore[no-untyped-call]
         start = doubled[: weighted.shape[0], : weighted.shape[1]]
     squares = [4 * np.sin(0.5 * np.pi * np.arange(side) / side) ** 2 for side in weighted.shape]
     roughness = (width**2 * np.add.outer(*squares)) ** power
