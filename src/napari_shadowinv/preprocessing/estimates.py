@@ -271,7 +271,9 @@ def total_variation_source(
     report("source", 0)
     relative = (complete / mean).astype(np.float32)
     # By scikit-image's own tolerance, fields would change by 17 to 64 times their noise error.
-    smooth: FloatArray = denoise_tv_chambolle(relative, weight, eps=1e-7, max_num_iter=iterations)
+    smooth: FloatArray = denoise_tv_chambolle(  # type: ignore[no-untyped-call]
+        relative, weight, eps=1e-7, max_num_iter=iterations
+    )
     return pixels.with_flux_of(mean * smooth.astype(np.float64), values, usable)
 
 

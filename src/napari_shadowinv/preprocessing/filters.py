@@ -204,7 +204,7 @@ def butterworth(
     # Doubled by its mirror image, as by a discrete cosine transform: nothing wraps around.
     mirrored = np.pad(values, [(0, side) for side in values.shape], mode="symmetric")
     frequency = 1 / min(cutoff, 1e6)  # of waves too long for any image
-    filtered: FloatArray = passed_by_butterworth(
+    filtered: FloatArray = passed_by_butterworth(  # type: ignore[no-untyped-call]
         mirrored, frequency, kind == "high", order, squared_butterworth=False
     )
     mean = values.mean() if kind == "high" and keep_mean else 0.0
