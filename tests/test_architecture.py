@@ -31,6 +31,7 @@ ROOMS = (
     ("physics",),
     ("options",),
     ("shot",),
+    ("instrument",),
     ("preprocessing",),
     ("film",),
     ("provenance",),

@@ -14,8 +14,9 @@ from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import solve
 from napari_shadowinv.fitting.descent import Preconditioner, coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import Imperfect, beam_shapes
+from napari_shadowinv.fitting.instrument import FITTED_VARIANCE, Imperfect
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
+from napari_shadowinv.instrument.shapes import beam_shapes
 from napari_shadowinv.options import BeamPrior
 
 SIZE, PAD = (48, 64), 16
@@ -311,8 +312,8 @@ def steps_of_solution(scene: Scene) -> int:
 
 
 def with_unknown_beam(scene: Scene) -> Scene:
-    height, width = scene.images.shape[1:]
-    shapes = beam_shapes(BeamPrior(rms=0.1), np.ones((height, width), bool), ((PAD, PAD),) * 2)
+    used = np.ones(scene.images.shape[1:])
+    shapes = beam_shapes(BeamPrior(rms=0.1), used, FITTED_VARIANCE).pad(((PAD, PAD),) * 2)
     return replace(scene, imperfect=Imperfect(shapes=(shapes,)))
 
 

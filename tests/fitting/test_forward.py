@@ -11,9 +11,10 @@ from helpers.fit_images import hessian_times
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.forward import Scene, blurred
-from napari_shadowinv.fitting.instrument import EXACT, Imperfect, Shapes
+from napari_shadowinv.fitting.instrument import EXACT, Imperfect
 from napari_shadowinv.fitting.rays import at_rest
 from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Unknowns
+from napari_shadowinv.instrument.shapes import Shapes
 from napari_shadowinv.options import FitOptions
 
 SIZE, PAD = (32, 40), 8
@@ -71,13 +72,12 @@ def scene() -> Scene:
         threads=1,
         added=(Stripes(),),
         imperfect=Imperfect(
-            gamma=0.1,
+            {"gamma": 0.1, "background": 0.05},
             blur=0.5,
-            background=0.05,
             other_strengths=0.2 * np.array([[1.0, 1.0], [0.8, 0.5]]),
             shapes=(
-                Shapes("beam", 0.1 * beams),
-                Shapes("between", 0.05 * beams[::-1], is_common=False),
+                Shapes.of_planes("beam", 0.1 * beams),
+                Shapes.of_planes("between", 0.05 * beams[::-1], is_common=False),
             ),
         ),
     )

@@ -13,10 +13,11 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.descent import coarser, descend, settle
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import Imperfect, Shapes
+from napari_shadowinv.fitting.instrument import Imperfect
 from napari_shadowinv.fitting.posterior import Posterior, Sample, compare_samples, draw_variations
 from napari_shadowinv.fitting.search import Minimum, estimate_smoothness
 from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.instrument.shapes import Shapes
 
 DRAWS = 160
 
@@ -61,7 +62,7 @@ def imperfect_scene() -> tuple[Scene, Unknowns]:
         psf=[1.0, 1.0],
         free_brightness=False,
         free_frames=np.zeros(6, bool),
-        imperfect=Imperfect(blur=0.5, background=0.1),
+        imperfect=Imperfect({"background": 0.1}, blur=0.5),
         held=frozenset({"blur", "background"}),
     )
     unknowns = scene.nothing()
@@ -334,7 +335,8 @@ def test_beams_of_their_own_are_told_from_fields_by_the_finest_structure(is_comm
     scene, _ = imperfect_scene()
     line = np.cos(np.arange(scene.beams.shape[1]) / 9)
     planes = 0.05 * np.multiply.outer(line, np.ones(scene.beams.shape[2]))[None]
-    beams = Shapes("beam" if is_common else "beam_between", planes, is_common=is_common)
+    key = "beam" if is_common else "beam_between"
+    beams = Shapes.of_planes(key, planes, is_common=is_common)
     scene = replace(scene, imperfect=Imperfect(shapes=(beams,)), held=frozenset())
     coarse = coarser(scene, 2)
     start = Minimum("far", coarse.nothing(), np.inf, coarse.displacement(coarse.nothing()))

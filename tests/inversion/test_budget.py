@@ -21,10 +21,10 @@ from napari_shadowinv import (
     synthetic_image,
 )
 from napari_shadowinv.facts import Verdict
+from napari_shadowinv.instrument.effects import motions
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.budget import Budget, discretisation_share
 from napari_shadowinv.inversion.error_budget import ErrorEstimate
-from napari_shadowinv.inversion.imperfections import motions
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import LinearResponse

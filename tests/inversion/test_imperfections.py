@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import gaussian_filter, shift, zoom
 
 from napari_shadowinv import InputError, Instrument, InversionOptions, OpticalSetup, invert
+from napari_shadowinv.instrument.effects import EFFECTS
 from napari_shadowinv.inversion import plan_sites
-from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
 from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
@@ -159,17 +159,16 @@ def test_a_stated_instrument_changes_the_errors_alone():
 def test_errors_are_proportional_to_what_is_stated():
     image = lens(0.006)
     source = uneven_source()
-    for imperfection in IMPERFECTIONS:
-        if imperfection.key == "blur":  # grows with the square
+    for each in EFFECTS:
+        if each.is_even:  # grows with the square
             continue
-        title = imperfection.title
         small, large = (
-            invert(image, source=source, options=OPTIONS, instrument={imperfection.key: size})
+            invert(image, source=source, options=OPTIONS, instrument={each.key: size})
             for size in (0.01, 0.03)
         )
         effects = [
-            next(e for name, e in each.errors.effects.items() if name.startswith(title))
-            for each in (small, large)
+            next(e for name, e in result.errors.effects.items() if name.startswith(each.key))
+            for result in (small, large)
         ]
         np.testing.assert_allclose(effects[1], 3 * np.array(effects[0]), rtol=1e-9)
 

@@ -7,16 +7,10 @@ import pytest
 from scipy import ndimage
 
 from napari_shadowinv import InputError, Instrument, InversionOptions, invert, synthetic_image
+from napari_shadowinv.instrument.effects import EFFECTS, InstrumentDraws, RecordedShot
 from napari_shadowinv.inversion import Maximum, plan_sites, uncertainty
 from napari_shadowinv.inversion import samples as sampling
 from napari_shadowinv.inversion.error_bars import Quantity
-from napari_shadowinv.inversion.imperfections import (
-    IMPERFECTIONS,
-    InstrumentDraws,
-    LitObject,
-    RecordedShot,
-    SmoothField,
-)
 from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
@@ -63,22 +57,6 @@ def sample(image, source, instrument, n=60, **choices):
         **{"source": source, "noise": NOISE, "options": OPTIONS, **choices},
         instrument=instrument,
     )
-
-
-def test_a_smooth_field_has_the_correlation_of_its_length():
-    """A Gaussian of the distance, less the mean over the image, which is removed."""
-    length, weights = 5.0, np.ones((40, 30))
-    field = SmoothField(length, weights)
-    modes = np.array([field.of(unit) for unit in np.eye(field.count)]).reshape(field.count, -1)
-    covariance = modes.T @ modes
-    places = np.indices(weights.shape).reshape(2, -1).T
-    squares = ((places[:, None] - places) ** 2).sum(axis=2)
-    kernel = np.exp(-squares / (2 * length**2))
-    centred = kernel - kernel.mean(axis=0) - kernel.mean(axis=1)[:, None] + kernel.mean()
-    centred /= np.diag(centred).mean()
-    assert np.diag(covariance).mean() == pytest.approx(1)
-    assert np.abs(covariance - centred).max() < 0.03
-    np.testing.assert_allclose(modes.mean(axis=1), 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("exact", [Instrument(**EXACT), None])
@@ -269,12 +247,12 @@ def test_linear_samples_follow_a_mask_and_a_margin(image, source, kind):
 def test_the_order_of_the_imperfections_is_that_of_light_and_detector(image, source, blob):
     """A dark level was added after the response; a blur has spread what the object absorbs."""
     mask = np.ones(SHAPE, bool)
-    shot = RecordedShot(image, source, LitObject(blob.displacement, source, mask))
+    shot = RecordedShot(image=image, source=source, displacement=blob.displacement, mask=mask)
     draws = InstrumentDraws(shot, EVERYTHING, BeamPrior(rms=0.02))
     assert [name.split(",")[0] for name in draws.names] == [
         "other field",
         "beam",
-        *reversed([each.title for each in IMPERFECTIONS]),
+        *reversed([each.key for each in EFFECTS]),
     ]
     both = InstrumentDraws(shot, Instrument(background=0.1, gamma=0.1), BeamPrior(rms=0.0))
     light = image - 0.1 * image.mean()
@@ -288,7 +266,8 @@ def test_beams_vary_in_the_shapes_of_their_references(image, source, blob):
     tilt = np.linspace(-1, 1, SHAPE[1]) * np.ones(SHAPE)
     references = [source * (1 + 0.02 * z * tilt) for z in rng.normal(size=8)]
     beam = BeamPrior.from_references(references)
-    shot = RecordedShot(image, source, LitObject(blob.displacement, source, np.ones(SHAPE, bool)))
+    mask = np.ones(SHAPE, bool)
+    shot = RecordedShot(image=image, source=source, displacement=blob.displacement, mask=mask)
     draws = InstrumentDraws(shot, Instrument(), beam)
     ratios = np.array(
         [source / draws.shot(rng.normal(size=draws.count)).source - 1 for _ in range(200)]

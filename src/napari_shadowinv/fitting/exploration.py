@@ -33,7 +33,7 @@ from napari_shadowinv.fitting.search import (
     settle_minimum,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
+from napari_shadowinv.instrument.effects import EFFECTS, RESPONSES
 from napari_shadowinv.inversion.samples import Pairs
 from napari_shadowinv.options import FitOptions
 
@@ -169,14 +169,10 @@ def explore(
 
 def _tested_instrument(data: FitData, minimum: Minimum) -> Imperfect:
     """Return the imperfections to which each fit states its sensitivity."""
-    sizes = {each.key: each.tested for each in IMPERFECTIONS if each.tested}
-    shapes = transmission_of(data, minimum, sizes.pop("absorption"))
-    return Imperfect(
-        gamma=sizes["gamma"],
-        blur=sizes["blur"] ** 2,
-        background=sizes["background"],
-        shapes=(shapes,),
-    )
+    sizes = {each.key: each.tested for each in EFFECTS if each.tested}
+    shapes = transmission_of(data, minimum, sizes["absorption"])
+    responses = {each.key: each.tested for each in RESPONSES}
+    return Imperfect(responses, blur=sizes["blur"] ** 2, shapes=(shapes,))
 
 
 def adapt(minimum: Minimum, imperfect: Imperfect, before: Imperfect) -> Minimum:

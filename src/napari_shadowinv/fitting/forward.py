@@ -21,9 +21,10 @@ from scipy.sparse import csr_array
 from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
-from napari_shadowinv.fitting.instrument import DARKEST, EXACT, Imperfect, Part, widen, widening
+from napari_shadowinv.fitting.instrument import EXACT, Imperfect, Part
 from napari_shadowinv.fitting.rays import Pulls, RayModel, TracedBeam, at_rest
 from napari_shadowinv.fitting.unknowns import Prior, PriorTerms, Unknowns
+from napari_shadowinv.instrument.effects import DARKEST, RESPONSES, widen, widening
 
 _T = TypeVar("_T")
 
@@ -237,7 +238,7 @@ class Scene(PriorTerms):
         """
         changes = np.empty_like(self.images)
         for k, shot in enumerate(self._shots(unknowns, counts)):
-            slope = self._seen(unknowns, shot).slope if self.imperfect.gamma else 1.0
+            slope = self._seen(unknowns, shot).slope if self.imperfect.responses else 1.0
             changed = shot.traced._replace(beam=variations[k] * shot.traced.beam)
             bare = slope * self._spread(k, self.rays.image(changed), unknowns)
             changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.brightness[k]) * bare
@@ -277,7 +278,7 @@ class Scene(PriorTerms):
     def _frees_light(self) -> bool:
         """Whether the light that enters may change, or depends on the detector."""
         shapes = any(part.key not in self.held for part, _ in self.imperfect.shape_parts())
-        return shapes or bool(self.imperfect.gamma or self.imperfect.background)
+        return shapes or bool(self.imperfect.responses)
 
     def response_units(self) -> list[Unknowns]:
         """Return a change by each number on which the response to fields depends: by 1."""
@@ -309,11 +310,12 @@ class Scene(PriorTerms):
         separate = np.tile(separate, (len(weights), 1))
         images = np.maximum(self.images, DARKEST)
         changes = {
-            "gamma": imperfect.gamma * images * np.log(images),
             "blur": imperfect.blur / 2 * laplace(gaussian_filter(images, (0, 1, 1))),
             "other_field": 0.1 * (images - 1),
-            "background": np.full(weights.shape, imperfect.background),
         }
+        for each in RESPONSES:
+            if size := imperfect.responses.get(each.key):
+                _, _, changes[each.key] = each.record(images, size, 0.0)
         shapes = {each.key: each for each in imperfect.shapes}
         sides = zip(self.beams.shape[1:], weights.shape[1:], strict=True)
         around = [(self.pad, beams - self.pad - image) for beams, image in sides]
@@ -351,10 +353,9 @@ class Scene(PriorTerms):
         waves = [np.empty((0, len(lines[0]), len(lines[1])))]
         places, images = [np.empty(0, np.int64)], [np.empty((0, count))]
         for part, shapes in self.imperfect.shape_parts():
-            products = shapes.products
-            if part.key in self.held or products is None or products.envelope is not None:
+            if part.key in self.held or not len(shapes.means) or shapes.envelope is not None:
                 continue
-            cosines = products.cosines(lines, knots)[:most]
+            cosines = shapes.cosines(lines, knots)[:most]
             rows = np.atleast_2d(part.of(numbers.common, numbers.separate))
             members = np.ones((1, count)) if part.is_common else np.eye(count)
             for row, seen in zip(rows, members, strict=True):
@@ -373,7 +374,7 @@ class Scene(PriorTerms):
         """The light that enters for each image."""
         common, separate = unknowns.common, unknowns.separate
         light = [
-            self.imperfect.entering(beam, common, numbers)
+            self.imperfect.entering(beam, common, numbers)[0]
             for beam, numbers in zip(self.beams, separate, strict=True)
         ]
         return np.stack(light) * np.exp(self.imperfect.shape_changes(common, separate))
@@ -383,21 +384,16 @@ class Scene(PriorTerms):
         imperfect, k = self.imperfect, shot.number
         rays = self.rays.image(shot.traced)
         image, slope = self._spread(k, rays, unknowns), np.ones(())
-        derivatives = {}
-        if imperfect.gamma:
-            exponent = imperfect.exponent(unknowns.common)
-            light = np.maximum(image, DARKEST)
-            power = light ** (exponent - 1)
-            image, slope = light * power, exponent * power
-            derivatives["gamma"] = imperfect.gamma * image * np.log(light)
+        derivatives: dict[str, FloatArray] = {}
+        for part, each, size, number in imperfect.detector(unknowns.common, unknowns.separate[k]):
+            image, of_light, of_number = each.record(image, size, number)
+            derivatives = {key: of_light * change for key, change in derivatives.items()}
+            derivatives[part.key], slope = of_number, np.asarray(of_light * slope)
         if imperfect.blur:
             variance, extra = self._variance(k), imperfect.variance(unknowns.common)
             spread = rays if isinstance(self.psf[k], float) else _spread(rays, self.psf[k])
             wider = self._inner(widening(spread, variance + extra))
             derivatives["blur"] = imperfect.blur * slope * wider
-        if imperfect.background:
-            image = image + imperfect.offset(unknowns.separate[k])
-            derivatives["background"] = np.full(image.shape, imperfect.background)
         effects = _Effects(
             (part, derivatives[part.key]) for part in imperfect.parts if part.key in derivatives
         )
@@ -428,11 +424,12 @@ class Scene(PriorTerms):
 
     def _entering(self, unknowns: Unknowns, lights: Sequence[FloatArray]) -> list[_Entering]:
         """The light of each image's beam, and its relative changes by the instrument's numbers."""
-        common, changes = unknowns.common, self.imperfect.entering_changes
-        planes = zip(lights, self.beams, unknowns.separate, strict=True)
+        changes = (
+            self.imperfect.entering(beam, unknowns.common, numbers)[1]
+            for beam, numbers in zip(self.beams, unknowns.separate, strict=True)
+        )
         return [
-            _Entering(light, _Effects(changes(beam, common, numbers)))
-            for light, beam, numbers in planes
+            _Entering(light, _Effects(each)) for light, each in zip(lights, changes, strict=True)
         ]
 
     def _add_beam_pulls(

@@ -31,7 +31,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import Around, imperfect_instrument
+from napari_shadowinv.fitting.instrument import imperfect_instrument
 from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.fitting.references import smooth_references
 from napari_shadowinv.fitting.shots import (
@@ -44,6 +44,7 @@ from napari_shadowinv.fitting.shots import (
     values_of,
 )
 from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
+from napari_shadowinv.instrument.shapes import Around
 from napari_shadowinv.inversion.noise import estimated_noise, measure_correlation
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,

@@ -35,7 +35,7 @@ from napari_shadowinv.facts import (
 )
 from napari_shadowinv.fitting.instrument import ASSUMED, TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
-from napari_shadowinv.inversion.imperfections import IMPERFECTIONS, Imperfection
+from napari_shadowinv.instrument.effects import EFFECTS, Effect
 from napari_shadowinv.inversion.variables import FIT_VARIABLES, belongs, dataset_from_field
 from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
@@ -218,7 +218,7 @@ class FitReport:
         deviation, for all images or for each; see `numbers_in_units`.
     sensitivities : dict of str to float
         R.m.s. change of the displacement, as a share of it, by imperfections of the instrument of
-        the tested sizes in `IMPERFECTIONS`.
+        the tested sizes in `EFFECTS`.
     sampling : {"linear", "resolve"}
         Whether the samples of the error bars respond to first order, or were fitted.
     nonlinearity, spread_ratio : float
@@ -287,10 +287,10 @@ class FitReport:
         return [titles[key] for key, part in self.parts.items() if part > 0]
 
     @property
-    def assumed(self) -> list[tuple[Imperfection, float]]:
+    def assumed(self) -> list[tuple[Effect, float]]:
         """Imperfections of tested sizes, and their parts, where no detector was stated."""
         keys = (self.parts.keys() & ASSUMED) - self.numbers.keys()
-        return [(each, self.parts[each.key]) for each in IMPERFECTIONS if each.key in keys]
+        return [(each, self.parts[each.key]) for each in EFFECTS if each.key in keys]
 
 
 @dataclass(frozen=True, repr=False)
@@ -417,7 +417,7 @@ class Fit(Summarised):
             unmeasured = report.beam.assumed and not report.recorded
             origin = "the beam was assumed to be the source or uniform: " if unmeasured else ""
             yield error_fact("beam", f"{origin}{report.beam.text}")
-        names = {each.key: each.name(each.tested) for each in IMPERFECTIONS}
+        names = {each.key: each.name(each.tested) for each in EFFECTS}
         effects = ", ".join(
             f"{percent(share)} ({names[key]})"
             for key, share in report.sensitivities.items()
@@ -550,7 +550,7 @@ class Fit(Summarised):
         elif "beam" in report.parts and self.instrument.beam_rms is None and not beam_unknown:
             of_beam = [("%", 100 * report.beam_rms, *2 * (report.parts["beam"],))]
         of_detector = [
-            (f"{each.unit} of {each.title}".strip(), each.factor * each.tested, *2 * (part,))
+            (f"{each.unit} of {each.key}".strip(), each.factor * each.tested, *2 * (part,))
             for each, part in report.assumed
         ]
         subjects = {

@@ -20,7 +20,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.descent import Preconditioner
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import Imperfect, Shapes, absorption_shapes, beam_shapes
+from napari_shadowinv.fitting.instrument import FITTED_VARIANCE, Imperfect
 from napari_shadowinv.fitting.measurements import FitData, strengths_of
 from napari_shadowinv.fitting.search import (
     FIRST_SMOOTHNESS,
@@ -30,6 +30,8 @@ from napari_shadowinv.fitting.search import (
     settle_minimum,
 )
 from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.instrument.effects import Absorption, LitObject
+from napari_shadowinv.instrument.shapes import Shapes, beam_shapes, shapes_between
 from napari_shadowinv.options import UNKNOWN_BEAM_RMS, BeamPrior
 
 _CAUSES = {
@@ -172,7 +174,8 @@ def transmission_of(data: FitData, minimum: Minimum, rms: float) -> Shapes:
     blocks = np.ones((1, minimum.bin, minimum.bin))
     displacement = np.kron(minimum.displacement.sum(axis=0), blocks)[:, :height, :width]
     used = np.asarray((data.scene.weights[:, :height, :width] > 0).any(axis=0))
-    return absorption_shapes(rms, displacement, used, data.around)
+    lit = LitObject(displacement=displacement, source=used.astype(np.float64), mask=used)
+    return Absorption().shapes(lit, rms, FITTED_VARIANCE).pad(data.around)
 
 
 def _rivals(data: FitData, scene: Scene, best: Minimum, names: Sequence[str]) -> Iterator[Rival]:
@@ -207,12 +210,13 @@ def _with_imperfections(data: FitData, scene: Scene, best: Minimum) -> Iterator[
         others = tuple(each for each in imperfect.shapes if each.key != shapes.key)
         return rival(frees, replace(imperfect, shapes=(*others, shapes)))
 
-    if not imperfect.background:
-        yield rival(("brightness", "background"), replace(imperfect, background=0.2))
+    priors = {"background": 0.2} if data.single else {"background": 0.2, "gamma": 0.3}
+    for key, size in priors.items():
+        if key not in imperfect.keys:
+            responses = {**imperfect.responses, key: size}
+            yield rival(("brightness", key), replace(imperfect, responses=responses))
     if data.single:
         return
-    if not imperfect.gamma:
-        yield rival(("brightness", "gamma"), replace(imperfect, gamma=0.3))
     if imperfect.other_strengths is None:
         # A trend of the displacement with the energy.
         sizes = np.abs(scene.strengths)
@@ -220,10 +224,10 @@ def _with_imperfections(data: FitData, scene: Scene, best: Minimum) -> Iterator[
         yield rival(("energy",), replace(imperfect, other_strengths=0.3 * trend))
     wide = BeamPrior(rms=UNKNOWN_BEAM_RMS, length=data.beam.length, between=0.1)
     if not data.unknown:
-        yield with_shapes(("brightness", "beam"), beam_shapes(wide, used, data.around))
-    yield with_shapes(
-        ("brightness", "beam", "beam_between"), beam_shapes(wide, used, data.around, between=True)
-    )
+        shapes = beam_shapes(wide, used, FITTED_VARIANCE).pad(data.around)
+        yield with_shapes(("brightness", "beam"), shapes)
+    between = shapes_between(wide, used, FITTED_VARIANCE).pad(data.around)
+    yield with_shapes(("brightness", "beam", "beam_between"), between)
     if "absorption" not in imperfect.keys:
         yield with_shapes(("brightness", "absorption"), transmission_of(data, best, 0.3))
 

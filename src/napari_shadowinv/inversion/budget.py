@@ -30,18 +30,14 @@ from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.facts import percent
+from napari_shadowinv.instrument.effects import EFFECTS, SolvedShot, motions
+from napari_shadowinv.instrument.shapes import random_waves
 from napari_shadowinv.inversion.error_budget import (
     SHARE_OF_NOISE,
     ErrorEstimate,
     Errors,
     root_of,
     share_of,
-)
-from napari_shadowinv.inversion.imperfections import (
-    IMPERFECTIONS,
-    SolvedShot,
-    motions,
-    random_waves,
 )
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared, lit_pixels
@@ -212,9 +208,7 @@ class Budget:
             weights = _near(peak, self._places.T, spacing)
             discretisation = root_of(squares.mean(), (squares * weights).sum() / 2)
         lengths = ErrorEstimate(float(np.sqrt(np.mean(length[lit] ** 2))), float(length.max()))
-        effects, sensitivities, sizes, assumed = self._by_imperfections(
-            response, displacement, estimate
-        )
+        effects, sensitivities, sizes, assumed = self._by_effects(response, displacement, estimate)
         if not lit.all():
             beside = _beside_dark(length, lit, solved[-1].level.spacing)
             effects["edges of dark areas"] = ErrorEstimate(
@@ -255,29 +249,39 @@ class Budget:
             assumed=assumed,
         )
 
-    def _by_imperfections(
+    def _by_effects(
         self, response: LinearResponse, displacement: FloatArray, estimate: _Estimator
     ) -> tuple[dict[str, ErrorEstimate], dict[str, ErrorEstimate], dict[str, float], str]:
         """Return stated effects, sensitivities, sizes, and the name of an assumed effect.
 
-        Effects, sensitivities and sizes are by the names of the imperfections.
+        Effects, sensitivities and sizes are by the names of the effects.
         """
-        shot = SolvedShot(self._prepared.in_units(), displacement, response, self.options.seed)
+        prepared = self._prepared.in_units()
+        shot = SolvedShot(
+            displacement=displacement,
+            source=prepared.source,
+            mask=prepared.mask,
+            sites=response.sites,
+            fluxes=(response.flux, response.level.mass),
+            areas=response.areas(prepared.mask),
+            diffused=response.diffusion(),
+            flux_of_source=response.flux_of_source,
+            seed=self.options.seed,
+        )
         effects: dict[str, ErrorEstimate] = {}
         sensitivities: dict[str, ErrorEstimate] = {}
         sizes: dict[str, float] = {}
         assumed = ""
         tests: list[tuple[dict[str, ErrorEstimate], str, FloatArray]] = []
-        for imperfection in IMPERFECTIONS:
-            stated = imperfection.stated(self.instrument)
-            for size, errors in ((imperfection.tested, sensitivities), (stated, effects)):
+        for each in EFFECTS:
+            stated = each.stated(self.instrument)
+            for size, errors in ((each.tested, sensitivities), (stated, effects)):
                 if size:
-                    pattern = imperfection.pattern(shot, size)
-                    tests.append((errors, imperfection.name(size), pattern))
+                    tests.append((errors, each.name(size), each.pattern(shot, size)))
             if stated:
-                sizes[imperfection.name(stated)] = stated
-                if imperfection.key == "registration" and self._is_shift_assumed:
-                    assumed = imperfection.name(stated)
+                sizes[each.name(stated)] = stated
+                if each.key == "registration" and self._is_shift_assumed:
+                    assumed = each.name(stated)
         # All at once, because the solver needs as long for one as for several.
         moves = response.to(np.concatenate([pattern for *_, pattern in tests]))
         ends = np.cumsum([len(pattern) for *_, pattern in tests])

@@ -47,8 +47,8 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Summarised, percent, to_figures
 from napari_shadowinv.geometry.interpolation import WIDTH
+from napari_shadowinv.instrument.effects import InstrumentDraws, RecordedShot
 from napari_shadowinv.inversion._invert import invert, plan_sites
-from napari_shadowinv.inversion.imperfections import InstrumentDraws, LitObject, RecordedShot
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, prepare
 from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.inversion.samples import (
@@ -688,7 +688,8 @@ def _draws(image: ArrayLike, inversion: Inversion, plan: SitePlan) -> Instrument
     shot = RecordedShot(
         image=np.where(mask, unpack_array(image, "image")[0], 0.0),
         source=inversion.source,
-        scene=LitObject(inversion.displacement, inversion.source, mask),
+        displacement=inversion.displacement,
+        mask=mask,
     )
     draws = InstrumentDraws(shot, instrument, beam)
     return draws if draws.names else None

@@ -10,7 +10,7 @@ import numpy as np
 
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent, round_down, to_figures
-from napari_shadowinv.inversion.imperfections import IMPERFECTIONS
+from napari_shadowinv.instrument.effects import EFFECTS
 from napari_shadowinv.physics.edge import edge_doubt
 from napari_shadowinv.physics.units import Condition, PeakError
 
@@ -68,7 +68,7 @@ class Errors:
         Scatter by the noise of image and source.
     effects : dict of str to ErrorEstimate
         Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`, and of the
-        instrument's imperfections.
+        instrument's effects.
     edge : ErrorEstimate
         Effect of an object beyond the image's edge, with the share of the other errors there.
     sides : tuple of str
@@ -79,7 +79,7 @@ class Errors:
     beam_sensitivity : ErrorEstimate
         Effect of a beam that differs from the source by 1 %.
     sensitivities : dict of str to ErrorEstimate
-        Effects of imperfections of the instrument, by their names with a size, such as
+        Effects of the instrument of tested sizes, by their names with a size, such as
         "background, 5 %".
     sizes : dict of str to float
         Standard deviations of the instrument that `effects` stand for, by their names.
@@ -289,7 +289,7 @@ class Errors:
         if not is_beam and name not in self.sizes:
             return f"{factor:.1g} times the {title} error", factor
         size = self.beam_variation if is_beam else self.sizes[name]
-        known = {each.title: each for each in IMPERFECTIONS}.get(title)
+        known = {each.key: each for each in EFFECTS}.get(title)
         unit, scale, power = "%", 100.0, 1.0
         if known is not None:
             unit, scale, power = known.unit, known.factor, 2.0 if known.is_even else 1.0

@@ -30,7 +30,7 @@ from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.power_diagram import PowerDiagram, pixel_shares
-from napari_shadowinv.inversion.imperfections import InstrumentDraws
+from napari_shadowinv.instrument.effects import InstrumentDraws
 from napari_shadowinv.inversion.normalise import flooring_for, masked_source, power_of_two
 from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.options import InversionOptions
