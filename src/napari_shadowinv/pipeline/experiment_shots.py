@@ -2,9 +2,10 @@
 
 - the object and the stated quality of the experiment: `ExperimentInputs`
 
-The chain from the beam to the counts has its own imperfections, drawn from the stated instrument;
-none of it uses the models by which inversions and fits judge them. Rays start at nine samples a
-pixel, and each sample is cut into nine tiles; light that enters from beyond the edge is in it.
+The chain from the beam to the counts has its own imperfections, drawn from the stated instrument.
+Of the models by which inversions and fits judge them it has only how places move, and the exponent.
+Rays start at nine samples a pixel, and each sample is cut into nine tiles; light that enters from
+beyond the edge is in it.
 
 Order: beam, transmission of the object, displacement, misalignment, blur, response, background,
 Poisson noise. Each imperfection has random numbers of its own, so that the others stay the same if
@@ -21,6 +22,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.shots import point_spread
+from napari_shadowinv.instrument.effects import Gamma, motion
 from napari_shadowinv.options import BeamPrior, Instrument
 from napari_shadowinv.physics.projection import displacement_ratio
 from napari_shadowinv.physics.setup import Setup
@@ -33,7 +35,6 @@ _BEYOND_PX = 4  # more than rays are displaced
 _DIMMEST = 0.02  # of the mean, for a beam or a transmission
 _EDGE = 0.1  # of the largest displacement, where the object ends
 _STEEPNESS = 2.0
-_LEAST_EXPONENT = 0.2
 
 # Streams of random numbers.
 _STREAMS = (
@@ -138,7 +139,7 @@ class ShotSimulator:
         common = common * (1 + self._absorption(streams["absorption"]))
         admixture = instrument.other_field * streams["other_field"].normal()
         width = instrument.blur * abs(streams["blur"].normal())
-        exponent = max(1 + instrument.gamma * streams["gamma"].normal(), _LEAST_EXPONENT)
+        exponent = Gamma.exponent(instrument.gamma * streams["gamma"].normal())
 
         def counts(flux: FloatArray, image: int, mean: float, noise: str) -> FloatArray:
             flux = gaussian_filter(flux, math.hypot(inputs.psf[image], width), mode="nearest")
@@ -152,9 +153,10 @@ class ShotSimulator:
             light = np.maximum(light, _DIMMEST) * self._open_share
             scale = self._energy_factor(setup, energy) + admixture * self._other_ratio(setup)
             displacement = self._nominal[image] * scale
-            if image and instrument.registration:  # onto a misaligned detector
+            if image and (shift := instrument.registration):  # onto a misaligned detector
                 landing = displacement + grid.places()
-                displacement = displacement + self._motion(landing, streams["alignment"])
+                numbers = shift * streams["alignment"].normal(size=4)
+                displacement = displacement + motion(landing, inputs.shape, numbers)
             flux = self._object.image(light, displacement, grid)
             images.append(counts(flux, image, options.counts, "counts"))
         source, noise = None, 0.0
@@ -232,19 +234,10 @@ class ShotSimulator:
 
     def _moved(self, reference: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Reference in pixels, out of register with the image."""
-        if not self.inputs.instrument.registration:
+        shift, places = self.inputs.instrument.registration, self._grid.places()
+        if not shift:
             return self._grid.in_pixels(reference)
-        places = self._grid.places()
-        moved = places + self._motion(places, rng)
+        moved = places + motion(places, self._grid.shape, shift * rng.normal(size=4))
         indices = (moved + 0.5 + self._grid.margin) * self._grid.factor - 0.5
         shifted = map_coordinates(reference, indices, order=3, mode="nearest")
         return self._grid.in_pixels(np.maximum(shifted, 0))
-
-    def _motion(self, places: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Random shift, rotation and change of scale, in px, the latter two at the corners."""
-        height, width = self._grid.shape
-        corner = np.hypot(height, width) / 2
-        y, x = (places[0] - (height - 1) / 2) / corner, (places[1] - (width - 1) / 2) / corner
-        size = self.inputs.instrument.registration or 0.0
-        down, right, turn, scale = size * rng.normal(size=4)
-        return np.stack([down + turn * x + scale * y, right - turn * y + scale * x])
