@@ -248,7 +248,7 @@ class Headline:
     Attributes
     ----------
     level : Level
-        Failed if the solver did not converge, doubtful with a warning, else that of the verdict.
+        Failed if the solver did not converge, doubtful with a warning, else by the verdict.
     text : str
         The peak of the main field with its error, its limit, the next step, and the first warning
         in a few words.

@@ -37,12 +37,12 @@ def measure(image: FloatArray) -> CorrelatedNoise:
 @pytest.mark.parametrize("width", [1.5, 2.0, 3.0])
 def test_correlated_noise_is_seen_between_structures(width: float) -> None:
     """Its deviation before the blur, which is its power on long waves."""
-    found = []
+    estimate = []
     for seed in range(8):
         image = spots() + 0.2 * blurred(np.random.default_rng(seed), width)
-        found.append(measure(image).white_variance ** 0.5)
-    assert np.median(found) == pytest.approx(0.2, rel=0.35)
-    assert min(found) > 0.07
+        estimate.append(measure(image).white_variance ** 0.5)
+    assert np.median(estimate) == pytest.approx(0.2, rel=0.35)
+    assert min(estimate) > 0.07
 
 
 def waves(seed: int) -> FloatArray:
@@ -61,8 +61,8 @@ def test_structure_that_fills_the_frame_is_no_difference_of_beams() -> None:
     """It grows with the distance, as blurred noise does not beyond its width."""
     for seed in (0, 2, 3, 4):
         image = waves(seed)
-        found = measure(image)
-        assert found.is_bound or found.clumping == 1
+        estimate = measure(image)
+        assert estimate.is_bound or estimate.clumping == 1
         errors = invert(image, source=np.ones(image.shape), options={"n_sites": 900}).errors
         assert errors is not None
         assert errors.beam is None
@@ -71,31 +71,31 @@ def test_structure_that_fills_the_frame_is_no_difference_of_beams() -> None:
         for width in (1.0, 1.5, 2.0)
         for seed in range(4)
     ]
-    assert np.mean([found.is_bound for found in quiet]) < 0.3
+    assert np.mean([estimate.is_bound for estimate in quiet]) < 0.3
 
 
 @pytest.mark.parametrize("factor", [1.4, 2.0])
 def test_resampled_counts_are_not_white(factor: float) -> None:
     side = round(SIDE / factor)
     counts = np.random.default_rng(4).poisson(400 * spots(side)) / 400
-    found = measure(zoom(counts, factor, order=3, mode="nearest", grid_mode=True))
+    estimate = measure(zoom(counts, factor, order=3, mode="nearest", grid_mode=True))
     # Of each recorded pixel there are factor² now.
-    assert found.white_variance**0.5 == pytest.approx(factor * 0.05, rel=0.5)
+    assert estimate.white_variance**0.5 == pytest.approx(factor * 0.05, rel=0.5)
 
 
 @pytest.mark.parametrize("level", [0.02, 0.1])
 def test_white_noise_between_structures_stays_white(level: float) -> None:
     for seed in range(8):
-        found = measure(spots() + level * np.random.default_rng(seed).normal(size=(SIDE, SIDE)))
-        assert found.clumping == 1
-        assert found.white**0.5 == pytest.approx(level, rel=0.2)
+        estimate = measure(spots() + level * np.random.default_rng(seed).normal(size=(SIDE, SIDE)))
+        assert estimate.clumping == 1
+        assert estimate.white**0.5 == pytest.approx(level, rel=0.2)
 
 
 def test_structure_without_calm_parts_is_not_called_white_noise() -> None:
     y, x = np.indices((SIDE, SIDE))
-    found = measure(1 + 0.3 * np.sin(y / 2) * np.sin(x / 2))
-    assert found.is_bound
-    assert found.white_variance**0.5 > 0.3
+    estimate = measure(1 + 0.3 * np.sin(y / 2) * np.sin(x / 2))
+    assert estimate.is_bound
+    assert estimate.white_variance**0.5 > 0.3
 
 
 def test_an_image_without_a_whole_block_has_no_correlation_to_measure() -> None:

@@ -89,6 +89,18 @@ class RingSpectrum:
         """Width of a ring in rad/px."""
         return float(self.k[0])
 
+    def rings_between(
+        self, ends: tuple[int, int], longest: float | None, shortest: float | None
+    ) -> BoolArray:
+        """Return the rings from a first to a last one, within wavelengths in px if set."""
+        number = np.arange(1, len(self.k) + 1)
+        rings = (number >= ends[0]) & (number <= ends[1])
+        if longest is not None:
+            rings &= self.k >= 2 * np.pi / longest * (1 - 1e-9)
+        if shortest is not None:
+            rings &= self.k <= 2 * np.pi / shortest * (1 + 1e-9)
+        return np.asarray(rings)
+
 
 def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
     """Return the spectrum of the displacement d = -∇φ in a window.

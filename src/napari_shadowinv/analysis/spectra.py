@@ -75,6 +75,81 @@ class TrustedRings:
     spacings: float = 4.0  # of the sites in a wavelength
 
 
+@dataclass(frozen=True, eq=False)
+class CorrectedSpectrum:
+    """Power of a field without the noise, over the response of the inversion.
+
+    Attributes
+    ----------
+    rings : RingSpectrum
+        As retrieved.
+    noise, response, spread : ndarray, shape (n,)
+        Of each ring: power of the noise, retrieved over true power, and its standard error; empty
+        if they are not known.
+    resolution : float
+        Spacing of the sites in px; 0 without sites.
+    limits : TrustedRings
+    """
+
+    rings: RingSpectrum
+    noise: FloatArray
+    response: FloatArray
+    spread: FloatArray
+    resolution: float
+    limits: TrustedRings
+
+    @property
+    def signal(self) -> FloatArray:
+        """Power without the noise."""
+        return self.rings.power - (self.noise if self.noise.size else 0.0)
+
+    @property
+    def power(self) -> FloatArray:
+        """Power without the noise, over the response where it is measured."""
+        if not self.response.size:
+            return self.signal
+        low, high = self.limits.response
+        return np.asarray(self.signal / np.clip(self.response, low / 2, 2 * high))
+
+    @property
+    def contrast(self) -> float:
+        """R.m.s. divergence of the displacement."""
+        power = np.where(self.resolved, self.power, 0.0)
+        return float(np.sqrt(max((power * self.rings.k**2).sum(), 0.0) * self.rings.width))
+
+    @property
+    def resolved(self) -> BoolArray:
+        """The rings above the noise and within the resolution."""
+        k, limits = self.rings.k, self.limits
+        rings = k <= limits.nyquist * np.pi
+        if self.resolution:
+            rings &= k <= 2 * np.pi / (limits.spacings * self.resolution)
+        if self.noise.size:
+            rings &= self.noise <= limits.noise * self.rings.power
+        return np.asarray(rings)
+
+    @property
+    def trusted(self) -> BoolArray:
+        """The rings whose response is near 1, too: the longest range without a gap."""
+        rings = self.resolved
+        if self.response.size:
+            low, high = self.limits.response
+            rings &= (self.response >= low) & (self.response <= high)
+        if self.spread.size:
+            rings &= self.spread <= self.limits.response_spread
+        rings[: self.limits.first - 1] = False
+        return _longest_run(rings)
+
+    def power_in(self, window: RingSpectrum) -> FloatArray:
+        """Return the power of a part of the image, corrected as in the whole image."""
+        power = window.power
+        if self.noise.size:
+            power = power - np.interp(window.k, self.rings.k, self.noise)
+        if self.response.size:
+            power = power / np.interp(window.k, self.rings.k, self.response)
+        return np.asarray(power)
+
+
 class TurbulenceSpectrum(Product):
     """Power spectrum of the field, its slope, and energy spectrum and r.m.s. field of turbulence.
 
@@ -208,7 +283,7 @@ class TurbulenceSpectrum(Product):
         product = self.model_copy(update=changes)
         is_inversion, phantom_contrast = product.resolution > 0, 0.0
         if self.phantoms and is_inversion and not self.response:
-            less_noise = RingSpectrum(spectrum.k, product._signal(spectrum), spectrum.modes)
+            less_noise = RingSpectrum(spectrum.k, product._correct(spectrum).signal, spectrum.modes)
             response = measure_response(
                 less_noise,
                 weights,
@@ -221,85 +296,30 @@ class TurbulenceSpectrum(Product):
             changes["response"] = tuple(map(float, response.ratio))
             changes["response_spread"] = tuple(map(float, response.spread))
             product = self.model_copy(update=changes)
-        contrast = max(product._contrast(spectrum), phantom_contrast)
+        contrast = max(product._correct(spectrum).contrast, phantom_contrast)
         most = self.limits.contrast if product.response else self.limits.raw_contrast
-        if self.slope and is_inversion and contrast > most:
-            raise InputError(
-                f"the contrast of the image is {to_figures(contrast)}, expected at most {most:g} "
-                "for a slope from one image: rays cross so often that the inversion returns a "
-                "false one; fit several images, or ask for the spectrum without a slope"
-            )
-        trusted = np.flatnonzero(product._trusted(spectrum)) + 1
+        if self.slope and is_inversion:
+            _check_contrast(contrast, most)
+        trusted = np.flatnonzero(product._correct(spectrum).trusted) + 1
         ends = (int(trusted[0]), int(trusted[-1])) if len(trusted) else (0, 0)
         product = product.model_copy(update={"rings": ends})
-        count = int(product._range(spectrum).sum())
-        if self.slope and count < MIN_RINGS:
-            raise InputError(
-                f"the range has {count} trusted rings of wavenumbers, expected at least "
-                f"{MIN_RINGS} for a slope: noise, a spacing of the sites of "
-                f"{to_figures(product.resolution)} px and crossed rays end the range; ask for the "
-                "spectrum without a slope"
-            )
+        if self.slope:
+            _check_rings(int(product._range(spectrum).sum()), product.resolution)
         return product
 
-    def _signal(self, spectrum: RingSpectrum) -> FloatArray:
-        """Return the power without the noise."""
-        return spectrum.power - (np.array(self.noise_power) if self.noise_power else 0.0)
-
-    def _corrected(self, spectrum: RingSpectrum) -> FloatArray:
-        """Return the power without the noise, over the response where it is measured."""
-        signal = self._signal(spectrum)
-        if not self.response:
-            return signal
-        response = np.array(self.response)
-        low, high = self.limits.response
-        return np.asarray(signal / np.clip(response, low / 2, 2 * high))
-
-    def _contrast(self, spectrum: RingSpectrum) -> float:
-        """Return the r.m.s. divergence of the displacement."""
-        power = np.where(self._resolved(spectrum), self._corrected(spectrum), 0.0)
-        return float(np.sqrt(max((power * spectrum.k**2).sum(), 0.0) * spectrum.width))
-
-    def _resolved(self, spectrum: RingSpectrum) -> BoolArray:
-        """Return the rings above the noise and within the resolution."""
-        k = spectrum.k
-        rings = k <= self.limits.nyquist * np.pi
-        if self.resolution:
-            rings &= k <= 2 * np.pi / (self.limits.spacings * self.resolution)
-        if self.noise_power:
-            rings &= np.array(self.noise_power) <= self.limits.noise * spectrum.power
-        return np.asarray(rings)
-
-    def _trusted(self, spectrum: RingSpectrum) -> BoolArray:
-        """Return the rings whose response is near 1, too: the longest range without a gap."""
-        rings = self._resolved(spectrum)
-        if self.response:
-            response, (low, high) = np.array(self.response), self.limits.response
-            rings &= (response >= low) & (response <= high)
-        if self.response_spread:
-            rings &= np.array(self.response_spread) <= self.limits.response_spread
-        rings[: self.limits.first - 1] = False
-        return _longest_run(rings)
+    def _correct(self, spectrum: RingSpectrum) -> CorrectedSpectrum:
+        return CorrectedSpectrum(
+            spectrum,
+            noise=np.array(self.noise_power),
+            response=np.array(self.response),
+            spread=np.array(self.response_spread),
+            resolution=self.resolution,
+            limits=self.limits,
+        )
 
     def _range(self, spectrum: RingSpectrum) -> BoolArray:
-        """Return the rings of slope and r.m.s. field: trusted, and within the chosen limits."""
         assert self.rings is not None  # by `adapt`
-        k, number = spectrum.k, np.arange(1, len(spectrum.k) + 1)
-        rings = (number >= self.rings[0]) & (number <= self.rings[1])
-        if self.longest is not None:
-            rings &= k >= 2 * np.pi / self.longest * (1 - 1e-9)
-        if self.shortest is not None:
-            rings &= k <= 2 * np.pi / self.shortest * (1 + 1e-9)
-        return rings
-
-    def _in_si(self, spectrum: RingSpectrum, power: FloatArray, frame: FieldFrame) -> FloatArray:
-        """Convert the power of the displacement, for rad/px, to the field's, for rad/m."""
-        # The field by a displacement of 1 px; of a plane, by a potential of 1 px · m instead.
-        scale = float(np.abs(frame.field(np.ones(1), np.ones((2, 1)))).max())
-        if frame.unit.field not in _PLANES:
-            return np.asarray(scale**2 * frame.pixel * power)
-        in_si = (scale / frame.pixel) ** 2 * frame.pixel * power
-        return np.asarray(in_si / (spectrum.k / frame.pixel) ** 2)
+        return spectrum.rings_between(self.rings, self.longest, self.shortest)
 
     def variables(self, frame: FieldFrame) -> dict[str, Measurand]:
         dims, unit, name = ("k",), frame.si_unit, frame.long_name.lower()
@@ -342,7 +362,7 @@ class TurbulenceSpectrum(Product):
         return variables
 
     def coordinates(self, frame: FieldFrame) -> dict[str, Coordinate]:
-        k = self._empty(frame).k
+        k = _without_power(frame, self.taper).k
         unit = "rad/m" if frame.setup is not None else f"rad/{PIXEL}"
         return {"k": Coordinate(k / frame.pixel, unit, "Wavenumber k = 2π / wavelength")}
 
@@ -353,7 +373,8 @@ class TurbulenceSpectrum(Product):
     def _measure(self, spectrum: RingSpectrum, frame: FieldFrame) -> Values:
         rings = self._range(spectrum)
         k, width = spectrum.k / frame.pixel, spectrum.width / frame.pixel
-        power = self._in_si(spectrum, self._corrected(spectrum), frame)
+        corrected = self._correct(spectrum)
+        power = _in_si(spectrum, corrected.power, frame)
         total = max(float(power[rings].sum()) * width, 0.0)
         weighted = max(float((k * power)[rings].sum()) * width, 0.0)
         correlation = math.pi / 2 * total / weighted if weighted else math.nan
@@ -362,7 +383,7 @@ class TurbulenceSpectrum(Product):
             "density": power / (2 * np.pi * k),
             "trusted": rings.astype(np.float64),
             "rms": np.asarray(math.sqrt(total)),
-            "contrast": np.asarray(self._contrast(spectrum)),
+            "contrast": np.asarray(corrected.contrast),
             "correlation_length": np.asarray(correlation),
         }
         if self.slope:
@@ -370,31 +391,20 @@ class TurbulenceSpectrum(Product):
             values["slope_power"] = np.asarray(exponent)
             values["slope"] = np.asarray(exponent + 1)
         if self.path_length is not None:
-            field, path = frame.unit.field, self.path_length
-            energy = k * power / (_ENERGY_FACTORS[field] * path)
-            mean_square = _RMS_FACTORS[field] * weighted / (_ENERGY_FACTORS[field] * path)
-            # ⟨B²⟩ = ⟨|b|²⟩ / (l_z ℓ): the same with the correlation length of the spectrum.
             length = self.correlation_length or correlation
-            by_length = total / (path * length) * _RMS_FACTORS[field] * math.pi / 2
-            values["energy"] = energy
-            values["rms_field"] = np.asarray(math.sqrt(mean_square))
-            values["rms_by_correlation"] = np.asarray(
-                math.sqrt(by_length / _ENERGY_FACTORS[field]) if by_length >= 0 else math.nan
-            )
+            field, path = frame.unit.field, self.path_length
+            values["energy"] = k * power / (_ENERGY_FACTORS[field] * path)
+            values |= _rms_fields(field, path, length, total, weighted)
         return values
 
     def constants(self, frame: FieldFrame) -> Values:
         constants = {}
         if self.noise_power:
             noise_power = np.array(self.noise_power)
-            constants["noise"] = self._in_si(self._empty(frame), noise_power, frame)
+            constants["noise"] = _in_si(_without_power(frame, self.taper), noise_power, frame)
         if self.response:
             constants["ratio"] = np.array(self.response)
         return constants
-
-    def _empty(self, frame: FieldFrame) -> RingSpectrum:
-        """Return the rings of the window, without power."""
-        return ring_spectrum(np.zeros(frame.shape), window_weights(frame.mask, self.taper))
 
     def systematic(
         self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame
@@ -415,50 +425,9 @@ class TurbulenceSpectrum(Product):
                 relative = np.linalg.norm(part * share[rings]) / part.sum() / 2
                 errors[name] = np.abs(values[name]) * relative
         if self.slope:
-            error = np.asarray(self._slope_error(potential, spectrum, frame))
+            error = np.asarray(_slope_error(potential, self._correct(spectrum), rings, frame.mask))
             errors |= {"slope": error, "slope_power": error}
         return errors
-
-    def _slope_error(
-        self, potential: FloatArray, spectrum: RingSpectrum, frame: FieldFrame, parts: int = 3
-    ) -> float:
-        """Return the standard error of the slope, by its scatter over parts of 64 px or more."""
-        rings = self._range(spectrum)
-        k_range = spectrum.k[rings][[0, -1]]
-        size = [count // 2 for count in potential.shape]
-        slopes, modes = [], 0.0
-        steps = [np.linspace(0, count - side, parts).astype(int)
-                 for count, side in zip(potential.shape, size, strict=True)]  # fmt: skip
-        for row, column in itertools.product(*steps):
-            part = np.s_[row : row + size[0], column : column + size[1]]
-            if min(size) < 64 or not frame.mask[part].all():
-                continue
-            window = ring_spectrum(potential[part], window_weights(frame.mask[part], 0.5))
-            inside = (window.k >= k_range[0]) & (window.k <= k_range[1])
-            inside[: self.limits.first - 1] = False
-            if inside.sum() < MIN_RINGS:
-                continue
-            power = self._interpolated(window, spectrum)
-            slopes.append(fit_exponent(window.k[inside], power[inside], window.modes[inside]))
-            modes = float(window.modes[inside].sum())
-        # Of an exponent by maximum likelihood, for Gaussian modes
-        logarithm, weights = np.log(spectrum.k[rings]), spectrum.modes[rings]
-        mean = np.average(logarithm, weights=weights)
-        expected = float(1 / np.sqrt(np.sum(weights * (logarithm - mean) ** 2)))
-        if len(slopes) < parts:
-            return expected
-        # The parts hold fewer modes than the window as a whole.
-        ratio = modes / float(weights.sum())
-        return max(float(np.std(slopes, ddof=1)) * math.sqrt(ratio), expected)
-
-    def _interpolated(self, window: RingSpectrum, spectrum: RingSpectrum) -> FloatArray:
-        """Return the power of a part of the image, corrected as in the whole image."""
-        power = window.power
-        if self.noise_power:
-            power = power - np.interp(window.k, spectrum.k, self.noise_power)
-        if self.response:
-            power = power / np.interp(window.k, spectrum.k, self.response)
-        return np.asarray(power)
 
     def facts(self, quantities: Mapping[str, Quantity], frame: FieldFrame) -> Iterator[Fact]:
         arrays = {name for name, each in self.variables(frame).items() if each.dims}
@@ -503,6 +472,95 @@ class TurbulenceSpectrum(Product):
             "Bands of slope and r.m.s. field hold the scatter between parts of the image, as the "
             "window has a finite number of structures."
         )
+
+
+def _without_power(frame: FieldFrame, taper: float) -> RingSpectrum:
+    """Return the rings of the window, without power."""
+    return ring_spectrum(np.zeros(frame.shape), window_weights(frame.mask, taper))
+
+
+def _check_contrast(contrast: float, most: float) -> None:
+    """Refuse a slope from an image in which rays cross too often."""
+    if contrast > most:
+        raise InputError(
+            f"the contrast of the image is {to_figures(contrast)}, expected at most {most:g} "
+            "for a slope from one image: rays cross so often that the inversion returns a "
+            "false one; fit several images, or ask for the spectrum without a slope"
+        )
+
+
+def _check_rings(count: int, resolution: float) -> None:
+    """Refuse a slope from too few rings."""
+    if count < MIN_RINGS:
+        raise InputError(
+            f"the range has {count} trusted rings of wavenumbers, expected at least "
+            f"{MIN_RINGS} for a slope: noise, a spacing of the sites of "
+            f"{to_figures(resolution)} px and crossed rays end the range; ask for the "
+            "spectrum without a slope"
+        )
+
+
+def _rms_fields(
+    field: str, path: float, length: float, total: float, weighted: float
+) -> dict[str, FloatArray]:
+    """Return the r.m.s. field by its spectrum, and by a correlation length.
+
+    `total` and `weighted` are the integrals of the power and of k times it; ⟨B²⟩ = ⟨|b|²⟩ / (l_z ℓ)
+    is the same with the correlation length of the spectrum.
+    """
+    factor = _RMS_FACTORS[field] / (_ENERGY_FACTORS[field] * path)
+    by_length = factor * math.pi / 2 * total / length
+    return {
+        "rms_field": np.asarray(math.sqrt(factor * weighted)),
+        "rms_by_correlation": np.asarray(math.sqrt(by_length) if by_length >= 0 else math.nan),
+    }
+
+
+def _in_si(spectrum: RingSpectrum, power: FloatArray, frame: FieldFrame) -> FloatArray:
+    """Convert the power of the displacement, for rad/px, to the field's, for rad/m."""
+    # The field by a displacement of 1 px; of a plane, by a potential of 1 px · m instead.
+    scale = float(np.abs(frame.field(np.ones(1), np.ones((2, 1)))).max())
+    if frame.unit.field not in _PLANES:
+        return np.asarray(scale**2 * frame.pixel * power)
+    in_si = (scale / frame.pixel) ** 2 * frame.pixel * power
+    return np.asarray(in_si / (spectrum.k / frame.pixel) ** 2)
+
+
+def _slope_error(
+    potential: FloatArray,
+    corrected: CorrectedSpectrum,
+    rings: BoolArray,
+    mask: BoolArray,
+    parts: int = 3,
+) -> float:
+    """Return the standard error of the slope, by its scatter over parts of 64 px or more."""
+    spectrum = corrected.rings
+    k_range = spectrum.k[rings][[0, -1]]
+    size = [count // 2 for count in potential.shape]
+    slopes, modes = [], 0.0
+    steps = [np.linspace(0, count - side, parts).astype(int)
+             for count, side in zip(potential.shape, size, strict=True)]  # fmt: skip
+    for row, column in itertools.product(*steps):
+        part = np.s_[row : row + size[0], column : column + size[1]]
+        if min(size) < 64 or not mask[part].all():
+            continue
+        window = ring_spectrum(potential[part], window_weights(mask[part], 0.5))
+        inside = (window.k >= k_range[0]) & (window.k <= k_range[1])
+        inside[: corrected.limits.first - 1] = False
+        if inside.sum() < MIN_RINGS:
+            continue
+        power = corrected.power_in(window)
+        slopes.append(fit_exponent(window.k[inside], power[inside], window.modes[inside]))
+        modes = float(window.modes[inside].sum())
+    # Of an exponent by maximum likelihood, for Gaussian modes
+    logarithm, weights = np.log(spectrum.k[rings]), spectrum.modes[rings]
+    mean = np.average(logarithm, weights=weights)
+    expected = float(1 / np.sqrt(np.sum(weights * (logarithm - mean) ** 2)))
+    if len(slopes) < parts:
+        return expected
+    # The parts hold fewer modes than the window as a whole.
+    ratio = modes / float(weights.sum())
+    return max(float(np.std(slopes, ddof=1)) * math.sqrt(ratio), expected)
 
 
 def _longest_run(rings: BoolArray) -> BoolArray:

@@ -459,8 +459,10 @@ class Fit(Summarised):
     @property
     def headline(self) -> Headline:
         """The peaks of the fields, the verdict and the warnings in one line."""
-        shown = (self._shown_peak(field, self.setup) for field in self.fields)
-        peaks = [peak.short_peak_text(error) for peak, error in shown]
+        peaks = [
+            peak.short_peak_text(error)
+            for peak, error in (self._shown_peak(field, self.setup) for field in self.fields)
+        ]
         converged = self.report.converged
         return Headline.of(peaks, self.assessment, self.warnings, converged=converged)
 
@@ -487,8 +489,8 @@ class Fit(Summarised):
             *self._error_facts(),
             Fact("residual", "Residual", f"χ² {numbers}, where 1 is expected"),
             *self._significance_facts(),
-            *self._image_facts(names),
-            *self._solution_facts(),
+            *_image_facts(self, names),
+            *_solution_facts(self),
             time_fact(self.report.seconds),
         )
         return folded(facts, (*(f"field_{field.name}" for field in self.fields), *_REPORT))
@@ -573,25 +575,6 @@ class Fit(Summarised):
     def _origins(self) -> tuple[ImageOrigin, ...]:
         return () if self.provenance is None else self.provenance.images
 
-    def _image_facts(self, names: Sequence[str]) -> Iterator[Fact]:
-        for k, chi2 in enumerate(self.chi2):
-            parts = [names[k]] if names and names[k] else []
-            parts += [self.setups[k].probe] if self.setups else []
-            strengths = ", ".join(f"{strength:.3g}" for strength in self.strengths[k])
-            parts += [
-                f"χ² {to_figures(chi2, 3)}",
-                f"strength {strengths}",
-                f"brightness {self.brightness[k]:.4g}",
-            ]
-            if k and self.options.align != "none":
-                dy, dx = self.frames[k][[0, 3]]
-                parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
-            for title, rows in self.report.added.items():
-                light = ", ".join(with_error(value, error) for value, error in rows[k])
-                parts.append(f"{title} {light}")
-            text = ", ".join(parts)
-            yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {to_figures(chi2, 3)}")
-
     def _shown_peak(
         self, field: FittedField, frame: Setup | None
     ) -> tuple[ShownField, PeakError | None]:
@@ -606,24 +589,6 @@ class Fit(Summarised):
         peaks = peak_facts(field.displacement, setup, deflector, mask=self.used, **errors)
         for key, peak in zip(("field", "displacement"), peaks, strict=False):
             yield Fact(f"{key}_{field.name}", f"{key.capitalize()} {field.name}", peak.text)
-
-    def _solution_facts(self) -> Iterator[Fact]:
-        best, *alternatives = self.basins
-        for solution in alternatives:
-            excess = solution.objective / best.objective - 1
-            text = (
-                f"{solution.start}: objective {100 * excess:+.2g} %, displacement "
-                f"{percent(solution.distance)} away"
-            )
-            yield Fact("alternative", "Alternative", text)
-        yield from masked_fact(self.mask)
-        if self.folded:
-            yield Fact("crossed_rays", "Crossed rays", f"{percent(self.folded)} of the pixels")
-        if self.report.converged:
-            yield Fact("converged", "Converged", f"in {self.report.iterations} iterations")
-        else:
-            text = f"NO, not in {self.report.iterations} iterations: allow more"
-            yield Fact("converged", "Converged", text, Level.FAILED, short="NOT converged")
 
     def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.
@@ -729,6 +694,45 @@ class Fit(Summarised):
             provenance=Provenance.of(attributes, dataset.variables),
             noise=noise_in(dataset, "noise"),
         )
+
+
+def _image_facts(fit: Fit, names: Sequence[str]) -> Iterator[Fact]:
+    for k, chi2 in enumerate(fit.chi2):
+        parts = [names[k]] if names and names[k] else []
+        parts += [fit.setups[k].probe] if fit.setups else []
+        strengths = ", ".join(f"{strength:.3g}" for strength in fit.strengths[k])
+        parts += [
+            f"χ² {to_figures(chi2, 3)}",
+            f"strength {strengths}",
+            f"brightness {fit.brightness[k]:.4g}",
+        ]
+        if k and fit.options.align != "none":
+            dy, dx = fit.frames[k][[0, 3]]
+            parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
+        for title, rows in fit.report.added.items():
+            light = ", ".join(with_error(value, error) for value, error in rows[k])
+            parts.append(f"{title} {light}")
+        text = ", ".join(parts)
+        yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {to_figures(chi2, 3)}")
+
+
+def _solution_facts(fit: Fit) -> Iterator[Fact]:
+    best, *alternatives = fit.basins
+    for solution in alternatives:
+        excess = solution.objective / best.objective - 1
+        text = (
+            f"{solution.start}: objective {100 * excess:+.2g} %, displacement "
+            f"{percent(solution.distance)} away"
+        )
+        yield Fact("alternative", "Alternative", text)
+    yield from masked_fact(fit.mask)
+    if fit.folded:
+        yield Fact("crossed_rays", "Crossed rays", f"{percent(fit.folded)} of the pixels")
+    if fit.report.converged:
+        yield Fact("converged", "Converged", f"in {fit.report.iterations} iterations")
+    else:
+        text = f"NO, not in {fit.report.iterations} iterations: allow more"
+        yield Fact("converged", "Converged", text, Level.FAILED, short="NOT converged")
 
 
 def normalise_residual(residual: FloatArray, mask: BoolArray, noise: FloatArray) -> FloatArray:

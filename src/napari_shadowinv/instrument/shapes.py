@@ -29,7 +29,7 @@ Around = tuple[tuple[int, int], tuple[int, int]]
 class Shapes:
     """Relative changes of a beam by one standard deviation of each number.
 
-    Those of the first numbers are planes, those of the others (a_i(y) b_j(x) - c) e(y, x).
+    The first numbers change planes, the others products (a_i(y) b_j(x) - c) e(y, x).
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ def beam_shapes(
 ) -> Shapes:
     """Return the differences of beams and sources: the shapes of a prior, and a smooth rest.
 
-    The `weights` (H, W) of pixels and the `share` of the variance are those of a smooth field.
+    A smooth field has the `weights` (H, W) of pixels and the `share` of the variance.
     """
     rest = beam.rms if beam.components is None else beam.components.rest
     shapes = Shapes.of_length("beam", beam.length * min(weights.shape), weights, rest, share)
@@ -203,7 +203,7 @@ def beam_shapes(
 
 
 def shapes_between(beam: BeamPrior, weights: FloatArray | BoolArray, share: float) -> Shapes:
-    """Return the differences of each image's beam and that of all, as `beam_shapes`."""
+    """Return the differences of each image's beam and the common one, as `beam_shapes`."""
     between = beam_shapes(BeamPrior(rms=beam.between, length=beam.length), weights, share)
     return replace(between, key="beam_between", is_common=False)
 

@@ -438,7 +438,7 @@ def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:
 
 
 def threads_here(workers: int | None = None) -> int:
-    """Return the number of threads of a shot, of which so many are in work on this machine.
+    """Return the number of threads of a shot beside others that are in work on this machine.
 
     By default there is one for each thread of dask's pool, and one alone in the main thread.
     """
