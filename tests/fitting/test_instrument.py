@@ -182,7 +182,7 @@ def test_fitted_samples_are_compared_with_those_to_first_order() -> None:
 
     skewed = replace(linear, nonlinearity=0.6)
     (caution,) = (c for c in replace(fits[0], report=skewed).cautions if c.code == "samples")
-    assert "differ from fitted ones by 60% of their change" in caution.text
+    assert "differ from fitted ones by 60 % of their change" in caution.text
     assert "use the sampling 'resolve'" in caution.text
     assert not replace(fits[1], report=replace(skewed, sampling="resolve")).warnings
 

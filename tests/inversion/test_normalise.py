@@ -83,7 +83,7 @@ def test_a_mask_over_much_of_the_image_is_reported(rows, said):
     mask[:rows] = False
     warnings = prepare(np.ones((20, 30)), None, InversionOptions(), mask).warnings
     assert [caution.code for caution in warnings] == (["mask"] if said else [])
-    assert all("excludes 25.0% of the pixels" in caution.text for caution in warnings)
+    assert all("excludes 25 % of the pixels" in caution.text for caution in warnings)
 
 
 @pytest.mark.parametrize(("factor", "codes"), [(0.9, ["flux"]), (1.0, []), (1.1, ["flux"])])

@@ -230,16 +230,20 @@ class Errors:
         )
 
     @property
+    def limit(self) -> str:
+        """The largest part, with the total, such as "limited by beam (errors 4 %)"."""
+        return f"limited by {self._title(next(iter(self.parts)))} (errors {self.share_text})"
+
+    @property
     def reason(self) -> str:
         """The largest measured part, and the largest of all if that was assumed."""
         measured = self._measured
         if measured.parts.get("edge") != self.parts.get("edge"):  # the beam explains some of it
             measured = self
-        first, largest = (next(iter(each.parts)) for each in (measured, self))
-        text = f"limited by {self._title(first)} (errors {measured.share_text}"
-        if first == largest:
-            return f"{text})"
-        return f"{text}) and {self._title(largest)} (assumed, {self.share_text})"
+        largest = next(iter(self.parts))
+        if next(iter(measured.parts)) == largest:
+            return measured.limit
+        return f"{measured.limit} and {self._title(largest)} (assumed, {self.share_text})"
 
     def measure_next(self, share: float) -> str:
         """Return what has to be known better for a total of at most `share`, and that total.

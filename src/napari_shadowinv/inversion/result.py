@@ -426,7 +426,7 @@ class InversionInUnits:
         if not errors.rms > 0:
             return Assessment(Verdict.UNCERTAIN, "there is no displacement to compare errors with")
         if errors.share <= max_error:
-            return Assessment(Verdict.DETERMINED, errors.reason)
+            return Assessment(Verdict.DETERMINED, errors.limit)
         if condition := errors.condition(max_error):
             return self.field.conditional(condition)
         steps = (errors.measure_next(share) for share in (max_error, errors.share / 2))

@@ -649,7 +649,7 @@ def test_other_answers_are_shown_beside_the_best(
     answers = tool.view.solutions
     assert answers.isVisible()
     assert answers.itemText(0).endswith(": best")
-    assert answers.itemText(1) == "from near: +2.0 %, differs by 50%"
+    assert answers.itemText(1) == "from near: +2.0 %, differs by 50 %"
     count = len(window.layers)
     answers.setCurrentIndex(1)
     qtbot.waitUntil(lambda: not tool.view._alternative.busy, timeout=PATIENCE)

@@ -462,7 +462,7 @@ def test_a_result_says_where_everything_came_from(
     rows = texts_of(tool.report)
     assert rows["Image"] == "measured"
     assert rows["Source"].startswith("estimate: fitted polynomial")
-    assert rows["Source mask"] == "layer 'measured source mask', excludes 17.4% of the pixels"
+    assert rows["Source mask"] == "layer 'measured source mask', excludes 17 % of the pixels"
     assert "Mask" not in rows
     assert rows["Setup"] == "particles (protons, …), came with experiment.h5"
     field = next(layer for layer in viewer.layers if role_of(layer) == "field")
