@@ -20,6 +20,8 @@ from importlib import import_module
 from typing import Any
 from urllib.parse import urlsplit
 
+from threadpoolctl import threadpool_limits
+
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv.errors import (
@@ -303,6 +305,7 @@ def _begin_worker(stop: Any) -> None:
     global _stop_of_worker
     _stop_of_worker = stop
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(limits=1, user_api="blas")  # the shots side by side use the cores
     parent: Any = multiprocessing.parent_process()
 
     def end() -> None:
