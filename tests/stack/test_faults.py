@@ -15,6 +15,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
+import dask
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
@@ -230,6 +231,12 @@ def test_ten_of_a_hundred_files_corrupt(make_night, out, cluster):
     for index in spoilt:
         reason = store.report(index)["reason"]
         assert any(word in reason for word in ("truncated", "(3, 3)", "no positive pixel"))
+
+
+def test_what_shots_share_is_sent_to_a_cluster_without_a_warning(night, out, cluster, recwarn):
+    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 kB"}):
+        night.run(out, shots=night.images, scheduler=cluster.scheduler_address)
+    assert not [warning for warning in recwarn if "large graph" in str(warning.message)]
 
 
 def test_a_dask_array_on_the_cluster_is_inverted_there(night, out, expected, cluster):

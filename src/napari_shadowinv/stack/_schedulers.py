@@ -10,6 +10,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, ThreadPoolExecutor
@@ -130,7 +131,9 @@ class _Cluster(Scheduler):
         should_stop: ShouldStop | None,
     ) -> Generator[ShotOutcome, None, None]:
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-        with self._as_interruption():
+        with self._as_interruption(), warnings.catch_warnings():
+            # What shots share has to be sent, however large it is.
+            warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
             tasks = _tasks(shots, beam, context, blocks=True)
             running = dict(zip(self._client.compute(tasks), shots, strict=True))
         for future in running:
