@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from codecs import BOM_UTF8
 from pathlib import Path
 from typing import Any
 
@@ -68,20 +68,23 @@ def read_text(path: Path) -> tuple[FloatArray, dict[str, Any]]:
     """Read an image with its ``geometry`` (m, MeV), and ``source`` and ``mask`` if present."""
     # A number takes two characters at least, and eight bytes in memory.
     check_size(path, 4 * path.stat().st_size)
-    rows: list[str] = []
+    rows: list[bytes] = []
     geometry: dict[str, float] = {}
     blocks: dict[str, tuple[int, int]] = {}
     selected: dict[str, tuple[float, float]] = {}
-    for number, line in enumerate(_read_lines(path), 1):
-        if line[:1] in {"#", "%"}:
+    with path.open("rb") as file:
+        for number, raw in enumerate(file, 1):
+            start = raw.removeprefix(BOM_UTF8).lstrip()[:1]
+            if start not in {b"#", b"%"}:
+                rows += [raw] if start else []
+                continue
+            line = _decode_comment(raw)
             geometry |= _parse_geometry(path, number, line)
             if block := _BLOCK.match(line):
                 first_shape = next(iter(blocks.values()), (0, 0))
                 blocks[block[1]] = (int(block[2]), int(block[3])) if block[2] else first_shape
             if part := _SELECTED.match(line):
                 selected[part[1]] = float(part[2]), float(part[3])
-        elif line:
-            rows.append(line)
     image = _parse_rows(path, rows)
     height, width = image.shape
     if "flux2D" in blocks:
@@ -168,28 +171,27 @@ def _is_axis(numbers: FloatArray, least_steps: int = 4, deviation: float = 0.3) 
     return usual != 0 and bool((np.abs(steps / usual - 1) < deviation).all())
 
 
-def _read_lines(path: Path) -> Iterator[str]:
-    with path.open("rb") as file:
-        for raw in file:
-            try:
-                yield raw.decode("utf-8-sig").strip()
-            except UnicodeDecodeError:
-                # Comments that Windows wrote; numbers look the same in both.
-                yield raw.decode("latin-1").strip()
+def _decode_comment(raw: bytes) -> str:
+    try:
+        return raw.decode("utf-8-sig").strip()
+    except UnicodeDecodeError:
+        return raw.decode("latin-1").strip()  # as Windows wrote it
 
 
-def _parse_rows(path: Path, rows: list[str]) -> FloatArray:
+def _parse_rows(path: Path, rows: list[bytes]) -> FloatArray:
     if len(rows) < 2:
         raise FileFormatError(
             f"{path} holds {len(rows)} rows of numbers: expected at least two, one row of pixels "
             "per line; export the image again"
         )
-    separator = next((sign for sign in ";," if sign in rows[0]), None)
+    # Numbers look the same in every encoding.
+    lines = [row.removeprefix(BOM_UTF8).decode("latin-1").strip() for row in rows]
+    separator = next((sign for sign in ";," if sign in lines[0]), None)
     if separator == ";":
-        rows = [row.replace(",", ".") for row in rows]
+        lines = [line.replace(",", ".") for line in lines]
     try:
         image = np.loadtxt(
-            [row.rstrip(separator) for row in rows], delimiter=separator, comments=None, ndmin=2
+            [line.rstrip(separator) for line in lines], delimiter=separator, comments=None, ndmin=2
         )
     except ValueError as error:
         reason = str(error).partition(";")[0][:120]
