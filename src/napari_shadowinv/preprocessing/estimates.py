@@ -19,8 +19,8 @@ may hold anything, NaN too, and are filled in. Default: all are usable.
 
 An `InputError` refuses an image and a mask that cannot be used, an image without flux, a parameter
 out of range, and an estimate that rises, where it sees nothing, to ten times the brightest pixel
-it saw. Estimates that take long ask `should_stop` at each of their steps, and raise
-`InversionCancelled` when it returns true.
+it saw. Estimates that take long ask `should_stop` at each of their steps, that of total variation
+before its first, and raise `InversionCancelled` when it returns true.
 
 Structure that an estimate attributes to the beam is lost from the object, and vice versa. The
 choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179, section V.
