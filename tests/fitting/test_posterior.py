@@ -329,6 +329,28 @@ def test_numbers_that_begin_far_away_end_within_their_errors() -> None:
     assert np.abs(off).max() < 3
 
 
+@pytest.mark.parametrize("stated", [{"gamma": 0.1}, {"background": 0.1}])
+def test_bright_lines_do_not_move_numbers_of_a_detector(stated: dict[str, float]) -> None:
+    """Rays far apart would smear the lines, which passes for less contrast."""
+    noise, size = 0.02, (40, 40)
+    scene = replace(
+        weak_scene(size, (1.0, 1.0)),
+        weights=np.full((2, *size), noise**-2),
+        free_brightness=False,
+        free_frames=np.zeros(6, bool),
+        imperfect=Imperfect(**stated),
+    )
+    truth = scene.nothing()
+    y, x = np.indices(scene.rays.shape)
+    truth.potentials[0] = -20 * np.exp(-((y - 12) ** 2 + (x - 12.5) ** 2) / 2 / 2.6**2)
+    shot = replace(scene, images=replace(scene, spacing=0.05).model(truth))
+    start = Minimum("truth", truth, np.inf, scene.displacement(truth), 1)
+    settled, end = estimate_smoothness(shot, start, np.random.default_rng(0), lambda *_: None)
+    assert settled.spread is not None
+    off = np.linalg.solve(settled.spread, numbers_of(scene, end.unknowns))
+    assert np.abs(off).max() < 1
+
+
 @pytest.mark.parametrize("is_common", [True, False])
 def test_beams_of_their_own_are_told_from_fields_by_the_finest_structure(is_common: bool) -> None:
     """In pixels of two, a broad lens moves an object whose structure would show it."""

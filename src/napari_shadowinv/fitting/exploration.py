@@ -114,7 +114,8 @@ def explore(
     def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:
         # What rays that are far apart add would tell fields from what resembles them.
         is_dense = scene.imperfect.resembles_fields
-        middle = best.coarsen(scene, SPACING_WITH_NUMBERS if is_dense else spacing)
+        rays = SPACING_WITH_NUMBERS if is_dense else spacing
+        middle = replace(best.coarsen(scene), spacing=rays)
         return Posterior(middle, start.unknowns, rng, lambda: on_step("samples", best.value), modes)
 
     posterior = posterior_with(scene, best, None if data.single else copy(best.modes))

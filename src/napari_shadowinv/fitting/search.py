@@ -34,7 +34,7 @@ _COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
 _COARSE_STEPS, COARSE_GAIN, _FINE_GAIN = 60, 3.0, 2.0
 _LAST_GAIN = 0.5  # in pixels of two, where it costs little
 _HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
-_COARSE_SPACING, _MIDDLE_SPACING = 1 / 3, 0.25
+_COARSE_SPACING = 1 / 3
 _BLURRED, _SPACING_OF_BLURRED = 2.0, 0.5  # px: so wide a blur hides how far apart rays are
 _SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
 # With numbers that resemble fields, an error of the model far below the noise changes the field.
@@ -86,9 +86,9 @@ class Minimum:
             unknowns = finer(unknowns)
         return unknowns
 
-    def coarsen(self, scene: Scene, spacing: float = _MIDDLE_SPACING) -> Scene:
+    def coarsen(self, scene: Scene) -> Scene:
         """Return a scene in the pixels of this minimum."""
-        return replace(coarser(scene, self.bin), spacing=spacing)
+        return coarser(scene, self.bin)
 
     def distance(self, other: Minimum) -> float:
         """Return how far another displacement is from this one, relative to it (r.m.s.)."""
@@ -238,11 +238,12 @@ def estimate_smoothness(
             scene = replace(scene, smoothness=smoothness)
             end = settle_minimum(scene, end, on_step, is_rough=True)
         scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness, held=free)
-    is_small = scene.images.size <= _MOST_RECORDED
-    if scene.imperfect.resembles_fields and is_small and not is_near:
-        # In larger pixels fine structure is lost by which a blur differs from a smooth object, and
-        # which a field that replaces the beams would move.
-        end = in_recorded_pixels(scene, end)
+    if scene.imperfect.resembles_fields and not is_near:
+        scene = replace(scene, spacing=SPACING_WITH_NUMBERS)
+        if scene.images.size <= _MOST_RECORDED:
+            # In larger pixels fine structure is lost by which a blur differs from a smooth object,
+            # and which a field that replaces the beams would move.
+            end = in_recorded_pixels(scene, end)
     least_gain = COARSE_GAIN if is_near else _LAST_GAIN
     end = settle_minimum(scene, end, on_step, least_gain=least_gain)
     if not response:
