@@ -106,11 +106,12 @@ def test_nothing_on_the_right_gives_nothing() -> None:
     )
 
 
-def with_soft_directions(size: int, soft: int, seed: int) -> FloatArray:
-    """A matrix with eigenvalues between 0.6 and 2, but for some down to 0.0001."""
+def with_soft_directions(size: int, soft: int, seed: int, stiff: int = 0) -> FloatArray:
+    """A matrix with eigenvalues between 0.6 and 2, but for some down to 0.0001 or up to 3000."""
     rng = np.random.default_rng(seed)
     directions = np.linalg.qr(rng.normal(size=(size, size)))[0]
     values = np.append(np.geomspace(1e-4, 0.3, soft), rng.uniform(0.6, 2, size - soft))
+    values[size - stiff :] = np.geomspace(10, 3000, stiff)
     return np.asarray(directions * values @ directions.T)
 
 
@@ -154,9 +155,24 @@ def test_soft_modes_of_a_solution_make_the_next_ones_short() -> None:
     np.testing.assert_allclose(solution, plain, atol=2e-3 * np.abs(plain).max())
 
 
+def test_stiff_modes_make_solutions_short_and_scales_stay_positive() -> None:
+    rng = np.random.default_rng(12)
+    matrix, modes = with_soft_directions(400, 15, 13, stiff=25), SoftModes()
+    for _ in range(3):
+        solve_and_count(matrix, rng.normal(size=400), modes)
+    right = rng.normal(size=400)
+    solution, steps = solve_and_count(matrix, right, modes)
+    _, plain_steps = solve_and_count(matrix, right)
+    assert steps < plain_steps / 3
+    assert np.linalg.norm(matrix @ solution - right) < 1.1e-6 * np.linalg.norm(right)
+    scales = np.array([modes.precondition(unit) for unit in np.eye(400)])
+    np.testing.assert_allclose(scales, scales.T, atol=1e-9 * np.abs(scales).max())
+    assert np.linalg.eigvalsh(scales)[0] > 0
+
+
 def test_modes_of_another_matrix_do_no_harm() -> None:
     rng, modes = np.random.default_rng(8), SoftModes()
-    solve_and_count(with_soft_directions(300, 20, 9), rng.normal(size=300), modes)
+    solve_and_count(with_soft_directions(300, 20, 9, stiff=20), rng.normal(size=300), modes)
     assert len(modes) > 0
     for size in (300, 200):
         matrix, right = with_soft_directions(size, 20, 10), rng.normal(size=size)

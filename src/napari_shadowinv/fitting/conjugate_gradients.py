@@ -1,9 +1,10 @@
 """Linear systems with a positive definite matrix: `solve`, and what one teaches the next.
 
 Where fields and the numbers of an instrument explain images alike, some dozens of the eigenvalues
-of a scaled Hessian are a thousand times smaller than all others. Conjugate gradients find these
-directions slowly, but a solution yields them (`SoftModes`), and further systems with nearly the
-same matrix are solved in few steps once they are treated apart.
+of a scaled Hessian are a thousand times smaller than all others; where rays have crossed, some are
+a thousand times larger. Conjugate gradients find these directions slowly, but a solution yields
+them (`SoftModes`), and further systems with nearly the same matrix are solved in few steps once
+they are treated apart.
 
 References
 ----------
@@ -20,13 +21,13 @@ from scipy.linalg import eigh_tridiagonal
 
 from napari_shadowinv._typing import AnyArray, FloatArray
 
-_SOFT = 0.5  # eigenvalues below, where most are about 1
+_SOFT, _STIFF = 0.5, 4.0  # eigenvalues below and above, where most are about 1
 _MOST_MODES = 120
 _OUTDATED_STEPS = 100  # of a solution with so many modes: they belong to another matrix
-_WORTH_STEPS = 30  # of a solution from which modes are taken
+_WORTH_STEPS = 12  # of a solution from which modes are taken
 _MOST_NUMBERS = 8_000_000  # in each list of vectors that is kept of a solution
 _FOUND = 0.5  # residual of an eigenvector over its eigenvalue
-_INDEPENDENT = 1e-6  # least eigenvalue of the vectors' products; rounding makes copies of some
+_INDEPENDENT = 1e-4  # least eigenvalue of the vectors' products; rounding makes copies of some
 
 
 def product(first: FloatArray, second: FloatArray) -> float:
@@ -35,7 +36,7 @@ def product(first: FloatArray, second: FloatArray) -> float:
 
 
 class SoftModes:
-    """Directions in which a matrix is small, for systems with nearly the same matrix.
+    """Directions in which a matrix is small or large, for systems with nearly the same matrix.
 
     `solve` uses them, and adds those that have cost it many steps. What they are changes the number
     of steps, not the solution beyond its tolerance.
@@ -49,7 +50,7 @@ class SoftModes:
         return len(self._weights)
 
     def precondition(self, residual: FloatArray) -> FloatArray:
-        """Return a residual with larger parts along the modes: 1 over their eigenvalues."""
+        """Return a residual with its parts along the modes over their eigenvalues."""
         if self._vectors.shape[1] != residual.size:
             return residual
         along = np.einsum("kn,n->k", self._vectors, residual)
@@ -63,7 +64,8 @@ class SoftModes:
         matrix = history.matrix()
         values, mixing = _tridiagonal_eigensystem(matrix[:-1, :-1])
         errors = np.abs(matrix[-1, -2] * mixing[-1])
-        chosen = np.flatnonzero((values < _SOFT) & (errors < _FOUND * values))
+        is_far = (values < _SOFT) | (values > _STIFF)
+        chosen = np.flatnonzero(is_far & (errors < _FOUND * values))
         size, is_outdated = history.size, len(history) > _OUTDATED_STEPS
         if self._vectors.shape[1] != size or (is_outdated and len(self) == _MOST_MODES):
             self._vectors, self._weights = np.empty((0, size)), np.empty(0)
@@ -86,7 +88,7 @@ class SoftModes:
         mixing = np.einsum("jk,ki->ij", turn, inner)
         directions = np.einsum("ij,jn->in", mixing, vectors)
         self._vectors = np.concatenate([self._vectors, directions])
-        self._weights = np.append(self._weights, np.maximum(1 / values - 1, 0))
+        self._weights = np.append(self._weights, 1 / values - 1)
 
 
 def _tridiagonal_times(matrix: FloatArray, columns: FloatArray) -> FloatArray:
