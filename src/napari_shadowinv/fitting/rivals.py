@@ -127,6 +127,7 @@ def compare_rivals(
     *,
     only: str = "",
     hopeless: float = 3.0,
+    behind: float = 10.0,
 ) -> Comparison:
     """Compare a fit with rivals that free one quantity each.
 
@@ -142,6 +143,9 @@ def compare_rivals(
         The one cause to look for. Default: all.
     hopeless : float, default 3
         Times the least objective in larger pixels, beyond which a rival is left out.
+    behind : float, default 10
+        How far the objective in larger pixels may be above the fit's where a number is tried: on
+        images with and without blur a rival that was worse there was worse in recorded pixels.
     """
     # A field that hides a flaw is rougher than any that rivals need.
     least = SMOOTHNESS_RATIO**2 * FIRST_SMOOTHNESS
@@ -157,10 +161,13 @@ def compare_rivals(
     ends = run_in_parallel(works, threads, on_step)
     limit = hopeless * min(end.value for end in ends)
     pairs = list(zip(rivals, ends, strict=True))
-    hopeful = [(rival, end) for rival, end in pairs[1:] if end.value <= limit]
+    most = {0: limit, 1: min(limit, ends[0].value + behind)}
+    hopeful = [(rival, end) for rival, end in pairs[1:] if end.value <= most[rival.tried]]
+    gains = {rival.frees: -np.inf for rival in rivals[1:]}
+    if not hopeful:
+        return Comparison(gains)
     works = [partial(rival.log_evidence, end) for rival, end in [pairs[0], *hopeful]]
     usual, *values = run_in_parallel(works, threads, on_step)
-    gains = {rival.frees: -np.inf for rival in rivals[1:]}
     for (rival, end), value in zip(hopeful, values, strict=True):
         # A sharp field follows blurred images in recorded pixels, but not in larger ones.
         in_larger = ends[0].value - end.value if rival.tried else 0.0
