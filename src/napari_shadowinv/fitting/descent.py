@@ -145,7 +145,7 @@ _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 # Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.
 _RENEWING_GAIN = 5.0
 _TRIED_STEPS = 3  # before a search may be hopeless
-_AS_EXPECTED = 0.1  # of a gain
+_AS_EXPECTED = 0.2  # of a gain
 _MOST_PIXELS = 2_000_000  # of all images
 _SCALE, _TRANSPOSE = "nmyx,nyx->myx", "nmyx,myx->nyx"  # sums over the fields of scales
 
@@ -242,6 +242,7 @@ class Preconditioner:
         scales._diagonals = [scale.copy() for scale in self._diagonals]
         scales._diagonals[0][:] = 0
         scales._diagonals[3][:] = 0
+        scales.others = np.concatenate([part.ravel() for part in scales._diagonals])
         long, places, table, root = self._coupling
         scales._coupling = _Coupling(long, places[:0], table[:0], root[:0, :0])
         return scales
@@ -302,7 +303,7 @@ class Preconditioner:
         common, separate = (self._diagonals[place] for place in (0, 3))
         return bool(separate.any() or np.count_nonzero(common) > len(self._coupling.places))
 
-    @property
+    @cached_property
     def others(self) -> FloatArray:
         """Scales of all values but the potentials."""
         return np.concatenate([part.ravel() for part in self._diagonals])
@@ -443,8 +444,9 @@ def settle(
 
     while taken < newton and shortened < _MOST_SHORTENED:
         down = -scales.transpose_times(slope).flat()
-        # A name here would keep the Jacobians in memory while the next are made.
-        step = newton_step(linear or scene.linear(now, counts), down)
+        is_new = linear is None
+        linear = linear or scene.linear(now, counts)
+        step = newton_step(linear, down)
         expected_gain = product(down, step) / 2
         if value - expected_gain > hopeless:
             break
@@ -455,12 +457,10 @@ def settle(
             if trial_value < value:
                 break
         else:
-            if linear is None:
+            if is_new:
                 break
             linear = None
             continue
-        if share < 1:
-            linear = None
         taken, shortened = taken + 1, shortened + (share < 1)
         gain = value - trial_value
         now, value, slope = trial, trial_value, trial_slope
@@ -474,6 +474,9 @@ def settle(
             return now, scene.value(now), taken, True
         if taken == _TRIED_STEPS and value > hopeless:
             break
+        # Where little is left to gain, Jacobians from nearby serve.
+        if share < 1 or (is_new and next_gain > _RENEWING_GAIN):
+            linear = None
         if gain > _RENEWING_GAIN:
             counts = scene.ray_counts(now)
             value, slope = scene.value_and_gradient(now, counts)
