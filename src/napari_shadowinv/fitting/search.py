@@ -23,7 +23,7 @@ from napari_shadowinv.fitting.descent import (
     settle,
     smoothness_in_pixels,
 )
-from napari_shadowinv.fitting.forward import Scene
+from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.posterior import Posterior, Response
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
@@ -230,13 +230,7 @@ def estimate_smoothness(
         shared = {part.key for part in scene.imperfect.parts if part.is_common}
         free, scene = scene.held, replace(scene, held=scene.held | shared)
         end = settle_minimum(scene, end, on_step, is_rough=True)
-        for _ in range(_ROUNDS):  # towards the likeliest λ and κ
-            estimate, change = posterior_of(scene, end, rng, on_step).likely_smoothness()
-            smoothness = estimate / smoothness_in_pixels(end.bin)
-            if change < _SETTLED:
-                break
-            scene = replace(scene, smoothness=smoothness)
-            end = settle_minimum(scene, end, on_step, is_rough=True)
+        smoothness, end = _likely_smoothness(scene, end, rng, on_step)
         scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness, held=free)
     if scene.imperfect.resembles_fields and not is_near:
         scene = replace(scene, spacing=SPACING_WITH_NUMBERS)
@@ -250,6 +244,26 @@ def estimate_smoothness(
         return scene, end
     rounds = _NEAR_ROUNDS if is_near else _RESPONSE_ROUNDS
     return _settle_response(scene, end, rng, on_step, rounds=rounds, least_gain=least_gain)
+
+
+def _likely_smoothness(
+    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+) -> tuple[FloatArray, Minimum]:
+    """Return λ and κ nearer to the likeliest, and the minimum that moves with them.
+
+    It moves so little that the scene to first order serves in all rounds.
+    """
+    linear = end.coarsen(scene).linear(end.unknowns)
+    smoothness = scene.smoothness
+    for _ in range(_ROUNDS):
+        posterior = posterior_of(scene, end, rng, on_step, linear=linear)
+        estimate, change = posterior.likely_smoothness()
+        smoothness = estimate / smoothness_in_pixels(end.bin)
+        if change < _SETTLED:
+            break
+        scene = replace(scene, smoothness=smoothness)
+        end = settle_minimum(scene, end, on_step, is_rough=True, linear=linear)
+    return smoothness, end
 
 
 def _with_likely_numbers(scene: Scene, end: Minimum) -> Minimum:
@@ -306,11 +320,16 @@ def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
 
 
 def posterior_of(
-    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep, stage: str = "smoothness"
+    scene: Scene,
+    end: Minimum,
+    rng: np.random.Generator,
+    on_step: OnStep,
+    stage: str = "smoothness",
+    linear: Linear | None = None,
 ) -> Posterior:
-    """Return the Gaussian around a minimum of a scene, in its pixels."""
+    """Return the Gaussian around a minimum of a scene, in its pixels; `linear` from nearby."""
     report, middle = partial(on_step, stage, end.value), end.coarsen(scene)
-    linear = middle.linear(end.unknowns)
+    linear = replace(linear, scene=middle) if linear else middle.linear(end.unknowns)
     return Posterior(middle, end.unknowns, rng, report, end.modes, linear)
 
 
@@ -323,6 +342,7 @@ def settle_minimum(
     steps: int = _ROUND_STEPS,
     to_beat: float | None = None,
     is_rough: bool = False,
+    linear: Linear | None = None,
 ) -> Minimum:
     """Return where a descent ends with other λ and κ, in the minimum's pixels, without blur."""
     middle = minimum.coarsen(scene)
@@ -333,6 +353,7 @@ def settle_minimum(
         least_gain=least_gain,
         after_step=lambda now: on_step(name, now),
         modes=minimum.modes,
+        linear=replace(linear, scene=middle) if linear else None,
         to_beat=to_beat,
         is_rough=is_rough,
     )
