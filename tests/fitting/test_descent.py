@@ -117,7 +117,7 @@ def test_larger_pixels_keep_the_information_of_an_image(scene: Scene, factor: in
     coarse = coarser(brighter, factor)
     for each in (brighter, coarse):
         nothing = each.nothing()
-        misfit = each.chi2(nothing, each.ray_counts(nothing)) * each.weights[0].size
+        misfit = each.chi2(each.model(nothing)) * each.weights[0].size
         np.testing.assert_allclose(misfit, 0.07**2 * 400 * weights[0].size, rtol=0.01)
     assert coarse.images.shape == (2, SIZE[0] // factor, SIZE[1] // factor)
     assert coarse.bin == factor

@@ -332,7 +332,7 @@ class _Work:
         """χ² of an image with a field of its own, and of the noise in it."""
         fit = self._sample_fit([k])
         unknowns = fit.unknowns.only([k])
-        chi2 = float(fit.scene.chi2(unknowns)[0])
+        chi2 = float(fit.scene.chi2(fit.scene.model(unknowns))[0])
         # A field of an image's own follows the noise by as much as it is left open.
         variance = fit.variance_in(self._linear_of([k]) or fit.scene.linear(unknowns))
         share = min(variance, _MAX_FITTED_SHARE)
@@ -359,7 +359,8 @@ class _Work:
         return replace(end, unknowns=unknowns, modes=SoftModes())
 
     def _chi2_in_middle(self, minimum: Minimum, members: list[int]) -> FloatArray:
-        return minimum.coarsen(self.scene.only(members)).chi2(minimum.unknowns.only(members))
+        scene = minimum.coarsen(self.scene.only(members))
+        return scene.chi2(scene.model(minimum.unknowns.only(members)))
 
     def _linear_of(self, members: list[int]) -> Linear | None:
         """Some images to first order by a joint fit, if there is one in which all take part."""

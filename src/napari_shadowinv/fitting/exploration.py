@@ -84,7 +84,7 @@ def find_basins(
         rival = replace(rival, unknowns=unknowns)
         ends.append(settle_minimum(scene, rival, on_step, "other starts"))
     middle = best.coarsen(scene)
-    chi2 = [float(middle.chi2(end.unknowns).mean()) for end in ends]
+    chi2 = [float(middle.chi2(middle.model(end.unknowns)).mean()) for end in ends]
     return tuple(
         Basin(end.start, end.value, each, best.distance(end), end.displacement)
         for end, each in zip(ends, chi2, strict=True)

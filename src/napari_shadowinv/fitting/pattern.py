@@ -238,9 +238,9 @@ def find_pattern(
     measured unless it is stated, in the residuals and before, as `noise`.
     """
     height, width = size
-    counts = scene.ray_counts(unknowns)
     roots = np.sqrt(scene.weights[:, :height, :width])
-    models = scene.model(unknowns, counts)[:, :height, :width]
+    seen = scene.model(unknowns)
+    models = seen[:, :height, :width]
     residuals = roots * (scene.images[:, :height, :width] - models)
     used = roots > 0
     if correlation is None:
@@ -250,7 +250,7 @@ def find_pattern(
         pattern_strength(residual, use, correlation)
         for residual, use in zip(residuals, used, strict=True)
     ]
-    chi2 = scene.chi2(unknowns, counts)
+    chi2 = scene.chi2(seen)
     missing, deviation = 0.0, np.inf
     if is_counted and not correlation:
         # The weight of a pixel is one over the variance of its counts in units of the beam.

@@ -393,8 +393,7 @@ def refine_minimum(
             modes=modes,
         )
         steps += taken
-        chi2 = scene.chi2(unknowns)
-        explained = not denser or bool(chi2.max() < _EXPLAINED)
+        explained = not denser or scene.chi2(scene.model(unknowns)).max() < _EXPLAINED
         if steps >= options.max_iterations or (ended and explained):
             return FineMinimum(scene, unknowns, value, steps, ended)
         if not explained:

@@ -103,11 +103,11 @@ def summarise(
     """Return the answer of a fit in recorded pixels, with its verdict."""
     scene, unknowns = refined.scene, refined.unknowns
     height, width = data.size
-    counts = scene.ray_counts(unknowns)
     units = data.units[:, None, None]
     used = scene.weights[:, :height, :width] > 0
     images = scene.images[:, :height, :width] * units
-    model = scene.model(unknowns, counts)[:, :height, :width] * units
+    seen = scene.model(unknowns)
+    model = seen[:, :height, :width] * units
     brightness = np.exp(unknowns.brightness)
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
     displacements = scene.displacement(unknowns)[..., :height, :width].copy()
@@ -134,7 +134,7 @@ def summarise(
         frames=unknowns.frames,
         reprojection=model,
         residual=np.where(used, images - model, 0.0),
-        chi2=data.noise.relative_chi2(scene.chi2(unknowns, counts)),
+        chi2=data.noise.relative_chi2(scene.chi2(seen)),
         basins=basins,
         folded=float((jacobian < 0).mean()),
         assessment=Assessment(Verdict.UNCERTAIN, ""),
