@@ -73,7 +73,8 @@ def _transport_potential(
     pad = scene.pad
     beam = scene.beams[number, pad : pad + height, pad : pad + width]
     options = InversionOptions(
-        n_sites=min(most_sites, height * width),
+        # Less than a third of the width by which it is blurred apart.
+        n_sites=min(most_sites, height * width // 4),
         negative="clip",
         threads=scene.threads,
         tolerance=0.05,
