@@ -312,12 +312,12 @@ def _likeliest_shifts(
     patterns of the source, as many of the image, and the ratio of both.
     """
     squares = sum((line[:, None] - line) ** 2 for line in places.T)
-    long = np.exp(-squares / (2 * beam.length**2))
-    short = long**16  # a quarter of the length
+    long, short = (np.exp(squares / (-2 * length**2)) for length in (beam.length, beam.length / 4))
     best, likeliest = [_NO_STEP] * len(counts), [-np.inf] * len(counts)
     for of_beam, of_rest in search.differences:
-        covariance = beam.rms**2 * (of_beam**2 * long + of_rest**2 * short)
-        covariance += noise * np.eye(len(places))
+        covariance = (beam.rms * of_beam) ** 2 * long
+        covariance += (beam.rms * of_rest) ** 2 * short
+        covariance.flat[:: len(places) + 1] += noise
         # Its first rows are the root of the first cells' covariance.
         root = linalg.cholesky(covariance, lower=True, check_finite=False)
         white = linalg.solve_triangular(root, columns, lower=True, check_finite=False)
