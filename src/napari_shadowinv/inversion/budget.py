@@ -457,7 +457,7 @@ def _error_by_edge(
         block_means(values, step) for values in (potential, *displacement, mask)
     )
     changes = edge_changes(plane, np.array([down, right]), step)[:, 1:]
-    squares = used * (changes**2).sum(axis=(0, 1))
+    squares = used * np.einsum("kcyx,kcyx->yx", changes, changes)
     row, column = peak // step
     along = displacement[:, *peak] / max(float(np.hypot(*displacement[:, *peak])), 1e-300)
     at_peak = ((changes[:, :, row, column] @ along) ** 2).sum()

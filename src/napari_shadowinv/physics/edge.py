@@ -78,7 +78,10 @@ def edge_changes(
     turned_back = potential_of_slopes(spacing * outflow)
     leaving = _divergence_at_edge(displacement, spacing) * _even_source(potential.shape, spacing)
     planes = turned_back, *opposite, leaving
-    changes = np.array([[each, *-np.array(np.gradient(each, spacing))] for each in planes])
+    changes = np.empty((len(planes), 3, *potential.shape))
+    for change, plane in zip(changes, planes, strict=True):
+        change[0] = plane
+        change[1], change[2] = np.gradient(plane, -spacing)
     largest = np.sqrt((displacement**2).sum() / max((changes[-1, 1:] ** 2).sum(), 1e-300))
     changes[-1] *= min(1.0, float(largest))
     return changes
