@@ -239,9 +239,8 @@ class Preconditioner:
     def held(self) -> Preconditioner:
         """Return scales in which the numbers of an instrument do not change."""
         scales = copy(self)
-        scales._diagonals = [scale.copy() for scale in self._diagonals]
-        scales._diagonals[0][:] = 0
-        scales._diagonals[3][:] = 0
+        common, brightness, frames, separate, *added = self._diagonals
+        scales._diagonals = [0 * common, brightness, frames, 0 * separate, *added]
         scales.others = np.concatenate([part.ravel() for part in scales._diagonals])
         long, places, table, root = self._coupling
         scales._coupling = _Coupling(long, places[:0], table[:0], root[:0, :0])

@@ -196,14 +196,9 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
     """Return a minimum of a scene in the pixels of the recorded images."""
     if minimum.bin == 1:
         return minimum
-    unknowns = _in_smaller_pixels(scene, minimum)
+    # Without waves that larger pixels left behind.
+    unknowns = Preconditioner(scene).damp(minimum.in_pixels(1))
     return Minimum(minimum.start, unknowns, minimum.value, scene.displacement(unknowns), 1)
-
-
-def _in_smaller_pixels(scene: Scene, minimum: Minimum) -> Unknowns:
-    """Return the unknowns in the pixels of a scene, without waves that larger ones left behind."""
-    unknowns = minimum.in_pixels(scene.bin)
-    return unknowns if minimum.bin == scene.bin else Preconditioner(scene).damp(unknowns)
 
 
 def estimate_smoothness(
@@ -254,9 +249,10 @@ def _likely_smoothness(
     It moves so little that the scene to first order serves in all rounds.
     """
     linear = end.coarsen(scene).linear(end.unknowns)
-    smoothness = scene.smoothness
     for _ in range(_ROUNDS):
-        posterior = posterior_of(scene, end, rng, on_step, linear=linear)
+        linear = replace(linear, scene=end.coarsen(scene))
+        report = partial(on_step, "smoothness", end.value)
+        posterior = Posterior(linear.scene, end.unknowns, rng, report, end.modes, linear)
         estimate, change = posterior.likely_smoothness()
         smoothness = estimate / smoothness_in_pixels(end.bin)
         if change < _SETTLED:
@@ -320,16 +316,11 @@ def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
 
 
 def posterior_of(
-    scene: Scene,
-    end: Minimum,
-    rng: np.random.Generator,
-    on_step: OnStep,
-    stage: str = "smoothness",
-    linear: Linear | None = None,
+    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep, stage: str = "smoothness"
 ) -> Posterior:
-    """Return the Gaussian around a minimum of a scene, in its pixels; `linear` from nearby."""
+    """Return the Gaussian around a minimum of a scene, in its pixels."""
     report, middle = partial(on_step, stage, end.value), end.coarsen(scene)
-    linear = replace(linear, scene=middle) if linear else middle.linear(end.unknowns)
+    linear = middle.linear(end.unknowns)
     return Posterior(middle, end.unknowns, rng, report, end.modes, linear)
 
 
@@ -376,8 +367,8 @@ def refine_minimum(
     scene: Scene, minimum: Minimum, options: FitOptions, on_step: OnStep, *, is_near: bool = False
 ) -> FineMinimum:
     """Descend with the pixels as recorded, with rays as dense as the data need."""
-    unknowns, steps = _in_smaller_pixels(scene, minimum), 0
-    modes = minimum.modes if minimum.bin == scene.bin else SoftModes()
+    minimum, steps = in_recorded_pixels(scene, minimum), 0
+    unknowns, modes = minimum.unknowns, minimum.modes
     has_dense_rays = scene.imperfect.resembles_fields and not is_near
     usual = [SPACING_WITH_NUMBERS] if has_dense_rays else list(_SPACINGS)
     denser = usual if options.spacing is None else [options.spacing]
