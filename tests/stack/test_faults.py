@@ -259,7 +259,7 @@ def count_plans() -> None:
         return original(source, options, **more)
 
     plan_sites.made = 0
-    _worker._plans.clear()
+    _worker._entries.clear()
     _worker.plan_sites = plan_sites
 
 

@@ -29,7 +29,7 @@ OPTIONS = InversionOptions(n_sites=100)
 
 @pytest.fixture(autouse=True)
 def no_plans(monkeypatch):
-    monkeypatch.setattr(_worker, "_plans", {})
+    monkeypatch.setattr(_worker, "_entries", type(_worker._entries)())
 
 
 @pytest.fixture

@@ -385,7 +385,7 @@ def test_worker_processes_receive_all_of_a_row(pack: Path, out: Path) -> None:
 def test_masks_of_a_shot_and_of_all_hold_both_but_for_a_file(fits: bool) -> None:
     """The rule of a shot and its recipe."""
     common, own = np.ones((2, *SHAPE), bool), np.ones((2, *SHAPE), bool)
-    common[:, :3], own[:, :, :5] = False, False
+    common[0, :3], common[1, 20:40, 20:40], own[:, :, :5] = False, False, False
     recipe = Recipe(
         options=OPTIONS, source=PolynomialEstimate(), fit=FitChoices() if fits else None
     )

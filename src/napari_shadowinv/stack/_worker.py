@@ -12,6 +12,7 @@ import json
 import multiprocessing
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -42,6 +43,8 @@ from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import ArrayExposure, Exposure, failure_text
 from napari_shadowinv.transport.sites import SitePlan
 
+_MAX_PLANS = 2  # a worker that changes between two sources makes each once
+
 
 @dataclass(frozen=True, eq=False)
 class Beam:
@@ -63,8 +66,16 @@ class Beam:
         return hashlib.sha256(f"{self.shape}{parts[0]}|{parts[1]}".encode()).hexdigest()
 
 
-_plans: dict[str, SitePlan] = {}  # of this process: that of the last beam
-_plans_lock = threading.Lock()
+@dataclass
+class _SharedPlan:
+    """A plan, complete or in preparation."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    plan: SitePlan | None = None
+
+
+_entries: OrderedDict[str, _SharedPlan] = OrderedDict()
+_entries_lock = threading.Lock()
 
 
 def shared_plan(
@@ -76,13 +87,17 @@ def shared_plan(
 ) -> SitePlan:
     """Return the sites for a beam; the first call in this process computes them."""
     key = f"{beam.key}{options.site_key()}{measured}"
-    with _plans_lock:
-        if key not in _plans:
-            _plans.clear()
-            _plans[key] = plan_sites(
+    with _entries_lock:
+        entry = _entries.setdefault(key, _SharedPlan())
+        _entries.move_to_end(key)
+        while len(_entries) > _MAX_PLANS:
+            _entries.popitem(last=False)
+    with entry.lock:
+        if entry.plan is None:
+            entry.plan = plan_sites(
                 beam.image, options, mask=beam.mask, measured=measured, should_stop=should_stop
             )
-        return _plans[key]
+        return entry.plan
 
 
 @dataclass
@@ -101,10 +116,10 @@ class _SharedSites(Cache):
         *,
         measured: bool = True,
     ) -> SitePlan:
-        if self.beam is not None and same_array(mask, self.beam.mask):
-            return shared_plan(self.beam, options, measured=measured, should_stop=should_stop)
-        # The shot has a beam or unlit pixels of its own.
-        return plan_sites(source, options, mask=mask, measured=measured, should_stop=should_stop)
+        beam = self.beam
+        if beam is None or not same_array(mask, beam.mask):
+            beam = Beam(source.shape, source, mask)  # the shot has unlit pixels of its own
+        return shared_plan(beam, options, measured=measured, should_stop=should_stop)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
