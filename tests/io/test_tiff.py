@@ -51,9 +51,8 @@ def test_missing_or_unnamed_tags_are_the_formats_defaults(path: Path, tags: dict
 
 def test_unnamed_compression_and_photometric_are_numbers(path: Path) -> None:
     write_bare(path, SHOT, compression=60123, photometric=1)
-    with pytest.raises(FileFormatError, match="60123") as caught:
+    with pytest.raises(FileFormatError, match=r"60123.* or in a form that needs another reader"):
         read(path)
-    assert "damaged" not in str(caught.value)
     write_bare(path, SHOT, photometric=60124)
     with pytest.raises(FileFormatError, match="photometric kind 60124"):
         read(path)
@@ -125,7 +124,7 @@ def test_stack_that_ends_too_soon_is_refused(
         pytest.skip("such a file states one frame only")
     tifffile.imwrite(path, STACK, photometric="minisblack", truncate=truncate, **options)
     path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)])
-    with pytest.raises(FileFormatError, match="truncated"):
+    with pytest.raises(FileFormatError, match=r"truncated|incomplete"):
         read(path)
 
 
