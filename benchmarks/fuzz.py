@@ -249,11 +249,12 @@ def read_whole(path: Path) -> None:
     if path.name == "calibration.csv":
         Calibration.from_csv(path).curve()
         return
-    file_table(path)
     content = read(path)
     if path.is_dir():
         status_tables(path, every=True)
         _load_shots(path, content)
+    else:
+        file_table(path)
 
 
 def _load_shots(path: Path, dataset: Any) -> None:

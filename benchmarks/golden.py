@@ -38,18 +38,21 @@ pixel_size = 33e-6
 """
 # Name, and arguments of the command.
 COMMANDS = {
-    "demo": "demo --out demo --dm 60",
-    "plain": "invert low.npy --n-sites 3000 --out plain.shadowinv",
-    "recorded": "invert low.npy --source beam.npy --setup low.toml --n-sites 4000 "
+    "demo": "demo --out demo",
+    "plain": "invert low.npy --set options.n_sites=3000 --out plain.shadowinv",
+    "recorded": "invert low.npy --source beam.npy --setup low.toml --set options.n_sites=4000 "
     "--out a.shadowinv",
-    "free": "invert low.npy --source beam.npy --boundary free --n-sites 3000 --out free.shadowinv",
-    "steps": "invert low.npy --setup low.toml --hot-pixels 6 --bin 2 --source-from polynomial "
-    "--mask mask.png --n-sites 1500 --out steps.shadowinv --save-recipe steps.toml",
-    "instrument": "invert low.npy --source beam.npy --background 0.03 --beam-rms 0.01 "
-    "--n-sites 2000 --out instrument.shadowinv",
-    "blurred": "invert blurred.npy --n-sites 2000 --out blurred.shadowinv",
-    "toroid": "invert toroid.npy --n-sites 10000 --out toroid.shadowinv",
-    "burner": "invert burner.png --source-from low-pass --n-sites 10000 --out burner.shadowinv",
+    "free": "invert low.npy --source beam.npy --boundary free --set options.n_sites=3000 "
+    "--out free.shadowinv",
+    "steps": 'invert low.npy --setup low.toml --step "hot-pixels 6" --bin 2 '
+    "--source-from polynomial --mask mask.png --set options.n_sites=1500 "
+    "--out steps.shadowinv --save-recipe steps.toml",
+    "instrument": "invert low.npy --source beam.npy --set instrument.background=0.03 "
+    "--set instrument.beam_rms=0.01 --set options.n_sites=2000 --out instrument.shadowinv",
+    "blurred": "invert blurred.npy --set options.n_sites=2000 --out blurred.shadowinv",
+    "toroid": "invert toroid.npy --set options.n_sites=10000 --out toroid.shadowinv",
+    "burner": "invert burner.png --source-from low-pass --set options.n_sites=10000 "
+    "--out burner.shadowinv",
     "rerun": "rerun steps.shadowinv",
     "forward": "forward a.shadowinv --setup high.toml --out forward.npy",
     "products": 'analyse a.shadowinv "profile 40,10 40,70 width=3" '
@@ -62,20 +65,21 @@ COMMANDS = {
     "assumed": "fit low.npy high.npy --energies 14.7,30 --setup low.toml --out assumed.shadowinv",
     "compare": "fit low.npy high.npy --energies 14.7,30 --setup low.toml --source beam.npy "
     "--compare",
-    "batch": "batch low.npy high.npy blurred.npy --source beam.npy --n-sites 1500 "
+    "batch": "batch low.npy high.npy blurred.npy --source beam.npy --set options.n_sites=1500 "
     "--out run.shadowinv.zarr",
-    "table": "batch shots.csv --setup low.toml --n-sites 1500 --out table.shadowinv.zarr",
-    "fits": "batch pairs.csv --fit --setup low.toml --out fits.shadowinv.zarr",
-    "status": "status run.shadowinv.zarr --all",
-    "verify": "status table.shadowinv.zarr --verify",
-    "fit status": "status fits.shadowinv.zarr --all",
+    "table": "batch shots.csv --setup low.toml --set options.n_sites=1500 "
+    "--out table.shadowinv.zarr",
+    "fits": "batch pairs.csv --set fit.beam=known --setup low.toml --out fits.shadowinv.zarr",
+    "status": "info run.shadowinv.zarr --all",
+    "verify": "info table.shadowinv.zarr --verify",
+    "fit status": "info fits.shadowinv.zarr --all",
     "export": "export run.shadowinv.zarr --format csv --out run.csv",
-    "plan": "plan toroid:peak=60,radius=20e-6 --setup low.toml --size 64x64 --draws 2 "
+    "plan": "plan toroid:peak=60,radius=20e-6 --setup low.toml --size 64x64 --set plan.draws=2 "
     "--out plan.csv",
     "info": "info a.shadowinv",
     "info fit": "info pair.shadowinv",
     "wrong": "invert low.npy --source missing.npy",
-    "wrong number": "invert low.npy --n-sites -3",
+    "wrong number": "invert low.npy --set options.n_sites=-3",
     "wrong key": "invert low.npy --recipe wrong.toml",
 }
 

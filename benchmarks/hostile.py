@@ -50,6 +50,7 @@ SETUP = {
     "pixel_size": "1e-5",
 }
 NUMBERS = ("nan", "inf", "-inf", "-1", "0", "1e308", "1e-308", '"x"', "[]", "{}", "true", '""')
+FEW = "--set=options.n_sites=60"
 CELLS = ("nan", "inf", "1e300", "-1e300", "1e-300", "x", "=1+1", "\x1b[31m", "\0", "a" * 140_000)
 DEEP = ".".join(["a"] * 60_000) + " = 1\n"
 NESTED = "x = " + "[" * 50_000 + "]" * 50_000 + "\n"
@@ -95,7 +96,7 @@ def tables() -> Iterator[Case]:
     columns = {"file": "shot.npy", "energy": "14.7", "strength": "1", "brightness": "1", "psf": "0"}
     columns |= {"mask": "", "source": "", "noise": "poisson", "setup": "", "exclude": ""}
     commands = (
-        ["fit", "t.csv", "--samples", 0, "--max-iterations", 1],
+        ["fit", "t.csv", "--set=fit.options.samples=0", "--set=fit.options.max_iterations=1"],
         ["batch", "t.csv", "--out", "o.zarr"],
     )
     for name, cell, command in itertools.product(columns, CELLS, commands):
@@ -126,21 +127,21 @@ def setups() -> Iterator[Case]:
     """Setups with hostile numbers."""
     for name, number in itertools.product([*SETUP][1:], NUMBERS):
         text = "\n".join(f"{key} = {value}" for key, value in {**SETUP, name: number}.items())
-        yield _with_text("s.toml", text, "invert", "shot.npy", "--setup", "s.toml", "--n-sites", 60)
+        yield _with_text("s.toml", text, "invert", "shot.npy", "--setup", "s.toml", FEW)
     for text in TEXTS:
         yield _with_text("s.toml", text, "invert", "shot.npy", "--setup", "s.toml")
 
 
 def recipes() -> Iterator[Case]:
-    """Recipes and files of options that are no such thing."""
+    """Recipes and settings that are no such thing."""
     entries = ("mask = {}", "source = {}", "steps = {}", "options = {}", "fit = {}", "setup = {}")
     for entry, number in itertools.product(entries, (*NUMBERS, '"a\\u0000b"', '"/dev/zero"')):
         text = entry.format(number)
-        yield _with_text(
-            "r.toml", text, "invert", "shot.npy", "--recipe", "r.toml", "--n-sites", 60
-        )
-    for text, flag in itertools.product(TEXTS, ("--recipe", "--options")):
-        yield _with_text("r.toml", text, "invert", "shot.npy", flag, "r.toml")
+        yield _with_text("r.toml", text, "invert", "shot.npy", "--recipe", "r.toml", FEW)
+    for text in TEXTS:
+        yield _with_text("r.toml", text, "invert", "shot.npy", "--recipe", "r.toml")
+        yield lambda text=text: _command("invert", "shot.npy", f"--set={text}")
+        yield lambda text=text: _command("invert", "shot.npy", f"--step={text}")
 
 
 def instruments() -> Iterator[Case]:
@@ -155,16 +156,17 @@ def instruments() -> Iterator[Case]:
         )
     for value in ("x", -1, [], {1: 2}, object(), Instrument):
         yield lambda value=value: invert(image, options={"n_sites": 60}, instrument=value)
-    invert_shot = ["invert", "shot.npy", "--n-sites", 60]
+    invert_shot = ["invert", "shot.npy", FEW]
     for name, number in itertools.product(names, NUMBERS):
         text = f"[instrument]\n{name} = {number}\n"
         yield _with_text("r.toml", text, *invert_shot, "--recipe", "r.toml")
     for number in NUMBERS:
         text = f"instrument = {number}\n"
         yield _with_text("r.toml", text, *invert_shot, "--recipe", "r.toml")
-    flags = [name.replace("_", "-") for name in Instrument.model_fields]
-    for flag, number in itertools.product(flags, ("nan", "inf", "-1", "1e308", "1e-308", "x", "")):
-        yield lambda flag=flag, number=number: _command(*invert_shot, f"--{flag}={number}")
+    texts = ("nan", "inf", "-1", "1e308", "1e-308", "x", "")
+    for name, number in itertools.product(Instrument.model_fields, texts):
+        setting = f"--set=instrument.{name}={number}"
+        yield lambda setting=setting: _command(*invert_shot, setting)
 
 
 def packs() -> Iterator[Case]:

@@ -54,16 +54,17 @@ def test_the_commands_of_the_page_run(names):
 
 
 def test_the_totals_of_the_tables_are_those_of_inversions(names):
-    rows = re.findall(r"^\| .* \| .* \| `--([a-z-]+) ([\d.]+)` \| ([\d.]+) %", PAGE, re.MULTILINE)
+    row = r"^\| .* \| .* \| `--set instrument\.([a-z_]+)=([\d.]+)` \| ([\d.]+) %"
+    rows = re.findall(row, PAGE, re.MULTILINE)
     assert len(rows) == 9
     apart = invert(names["shot"], source=names["reference"])
     (total,) = re.findall(r"of another exposure \| .* \| ([\d.]+) %", PAGE)
     assert share(apart) == pytest.approx(float(total), rel=0.06)
-    for flag, value, total in rows:
-        instrument = Instrument(**{"beam_rms": 0.0, flag.replace("-", "_"): float(value)})
-        source = None if flag == "beam-rms" else names["reference"]
+    for name, value, total in rows:
+        instrument = Instrument(**{"beam_rms": 0.0, name: float(value)})
+        source = None if name == "beam_rms" else names["reference"]
         inversion = invert(names["shot"], source=source, instrument=instrument)
-        assert share(inversion) == pytest.approx(float(total), rel=0.06), flag
+        assert share(inversion) == pytest.approx(float(total), rel=0.06), name
     for detector, total in re.findall(
         r"^\| `([A-Za-z0-9 -]+)` \| ([\d.]+) % \|", PAGE, re.MULTILINE
     ):

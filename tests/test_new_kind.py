@@ -120,7 +120,7 @@ def test_table_gives_each_shot_the_quantity_of_a_new_kind(table, setups):
     statistics = stack_statistics(store)
     expected = store["areal_electron_density"].mean("shot")
     np.testing.assert_allclose(statistics["areal_electron_density_mean"], expected, rtol=1e-6)
-    output = flat(shadowinv("status", "out.shadowinv.zarr", "--all").output)
+    output = flat(shadowinv("info", "out.shadowinv.zarr", "--all").output)
     assert "energies 8, 12 keV" in output
     shadowinv("export", "out.shadowinv.zarr", "--format", "csv", "--out", "shots_out.csv")
     with Path("shots_out.csv").open(newline="", encoding="utf-8") as file:
@@ -129,8 +129,12 @@ def test_table_gives_each_shot_the_quantity_of_a_new_kind(table, setups):
 
 def test_command_fits_a_table_of_a_new_kind(table):
     result = shadowinv(
-        *("fit", table, "--setup", "xray.toml", "--out", "fit.shadowinv", "--samples", 0),
-        *("--max-iterations", 3, "--spacing", 0.25),
+        *("fit", table, "--setup", "xray.toml", "--out", "fit.shadowinv"),
+        *(
+            "--set=fit.options.samples=0",
+            "--set=fit.options.max_iterations=3",
+            "--set=fit.options.spacing=0.25",
+        ),
     )
     assert "8 keV" in flat(result.output), result.output
 

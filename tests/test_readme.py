@@ -55,7 +55,7 @@ STEP = re.compile(
     r"|`shadowinv (?P<inline>[^`\n]*)`",
     re.DOTALL | re.MULTILINE,
 )
-LEFT_TO_THE_READER = {"info FILE": "info shot.shadowinv", "status": "status night.shadowinv.zarr"}
+LEFT_TO_THE_READER = {"info FILE": "info shot.shadowinv"}
 
 
 def steps() -> list[tuple[str, str]]:
@@ -82,7 +82,7 @@ def test_commands_and_python_work_one_after_the_other_in_one_folder(shot_folder)
             result = CliRunner().invoke(app, shlex.split(text))
             assert result.exit_code == 0, f"{text}: {result.output}"
             done.append(shlex.split(text)[0])
-    assert done == ["invert", "info", "forward", "batch", "status"]
+    assert done == ["invert", "info", "forward", "batch", "info"]
     assert (shot_folder / "shot.png").read_bytes().startswith(b"\x89PNG")
     assert read("shot.shadowinv").potential.attrs["units"] == "pixel**2"
     image = tifffile.imread("shot_image.tif")

@@ -245,7 +245,7 @@ def test_the_film_without_reference_has_the_numbers_of_its_page(tmp_path, monkey
     )
     # The fit takes too long for a test; its flags must be those of the command.
     assert fit_line.startswith("fit ")
-    listing = CliRunner().invoke(app, ["fit", "--help-all"], env={"COLUMNS": "200"}).output
+    listing = CliRunner().invoke(app, ["fit", "--help"], env={"COLUMNS": "200"}).output
     assert set(re.findall(r"--[a-z-]+", fit_line)) <= set(re.findall(r"--[a-z-]+", listing))
 
 

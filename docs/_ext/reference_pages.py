@@ -11,9 +11,9 @@ import re
 from collections.abc import Mapping, Sequence
 from enum import Enum
 from importlib import import_module
-from inspect import cleandoc, isclass, unwrap
+from inspect import cleandoc, isclass, signature
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -103,8 +103,8 @@ def parameters_page() -> str:
         "The same parameters appear in napari's forms, in TOML files and in Python. "
         "Lengths in px are pixels of the image that a step receives, after any binning before it.",
         "## Steps",
-        "What is done to the image first. In a recipe `[[steps]]`, in any order; flags of the "
-        "command apply steps in the order below. See [](../recipes.md) and [](../filters.md).",
+        "What is done to the image first. In a recipe `[[steps]]`, in any order; the "
+        "command applies steps in the order below. See [](../recipes.md) and [](../filters.md).",
         *(choice_section(model) for model in STEPS.values()),
         "## Sources",
         "The undisturbed beam. In a recipe `[source]`; see [](../sources.md).",
@@ -117,23 +117,24 @@ def parameters_page() -> str:
             for kind, model in SETUPS.items()
         ),
         "## Inversion options",
-        "In napari under *Options*; in Python the arguments of "
+        "In napari under *Options*; on the command line `--set options.…`; in Python the "
+        "arguments of "
         "{py:class}`~napari_shadowinv.InversionOptions`.",
         table_of(InversionOptions.model_fields),
         "## Run options",
-        "Of many shots; flags of `shadowinv batch`, in Python the arguments of "
+        "Of many shots; `shadowinv batch --set run.…`, in Python the arguments of "
         "{py:class}`~napari_shadowinv.pipeline.RunOptions`. See [](../batch.md).",
         table_of(RunOptions.model_fields),
         "## Watch options",
-        "Of a watched folder; flags of `shadowinv watch`, in Python the arguments of "
+        "Of a watched folder; `shadowinv watch --set run.…`, in Python the arguments of "
         "{py:class}`~napari_shadowinv.pipeline.WatchOptions`.",
         table_of(WatchOptions.model_fields),
         "## Fit choices",
-        "What a fit finds and what is known. In a recipe `[fit]`; on the command line flags of "
-        "`shadowinv fit`. See [](../fit.md).",
+        "What a fit finds and what is known. In a recipe `[fit]`; on the command line "
+        "`--set fit.…`. See [](../fit.md).",
         table_of({k: one for k, one in FitChoices.model_fields.items() if k != "options"}),
         "## Fit options",
-        "On the command line flags of `shadowinv fit`; in Python the arguments of "
+        "On the command line `--set fit.options.…`; in Python the arguments of "
         "{py:class}`~napari_shadowinv.FitOptions`.",
         table_of(FitOptions.model_fields),
     ]
@@ -220,26 +221,24 @@ def command_page() -> str:
     group: Any = get_command(app)
     parts = [
         "# The command `shadowinv`",
-        plain(group.help) + " `shadowinv COMMAND --help-all` shows what is below in the terminal.",
+        plain(group.help)
+        + " `shadowinv COMMAND --help` shows what is below in the terminal, and `--set` takes "
+        "the keys of [](parameters.md).",
         *(command_section(name, command) for name, command in group.commands.items()),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def command_section(name: str, command: Any) -> str:
-    kinds = get_type_hints(unwrap(command.callback))
+    kinds = {name: each.annotation for name, each in signature(command.callback).parameters.items()}
     arguments = [one for one in command.params if one.param_type_name == "argument"]
     options = [one for one in command.params if one.param_type_name == "option"]
     usage = " ".join(["shadowinv", name, "[OPTIONS]", *(one.name.upper() for one in arguments)])
     parts = [f"## shadowinv {name}", f"    {usage}", plain(command.help)]
     if arguments:
         parts.append(definitions([(f"`{one.name.upper()}`", one) for one in arguments]))
-    panels: dict[str, list[tuple[str, Any]]] = {}
-    for option in options:
-        panel = getattr(option, "rich_help_panel", None) or "Options"
-        panels.setdefault(panel, []).append((flags(option, kinds.get(option.name)), option))
-    for panel, members in panels.items():
-        parts += [f"**{panel}**", definitions(members)]
+    listed = [(flags(option, kinds.get(option.name)), option) for option in options]
+    parts += ["**Options**", definitions(listed)]
     if command.epilog:
         parts.append(plain(command.epilog))
     return "\n\n".join(parts)

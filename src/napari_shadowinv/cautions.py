@@ -1,6 +1,6 @@
 """Reasons to doubt an image, a setup or a result: `Caution`, with the codes of `CAUTION_CODES`.
 
-People read the text. Scripts, `shadowinv status` and docs/trust.md go by the code, which stays the
+People read the text. Scripts, `shadowinv info` and docs/trust.md go by the code, which stays the
 same when a sentence is improved or a number in it changes.
 """
 

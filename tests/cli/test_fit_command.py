@@ -16,7 +16,6 @@ import xarray as xr
 
 from helpers.command_line import content, flat, interrupted, shadowinv
 from helpers.fit_images import of_each
-from napari_shadowinv.cli._flags import fit_recipe_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit, LeaveOneOut, point_spread
@@ -29,7 +28,7 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.plotting import fit_figure
-from napari_shadowinv.preprocessing import Bin, Recipe, polynomial_source
+from napari_shadowinv.preprocessing import polynomial_source
 from napari_shadowinv.provenance import Origin, Provenance
 from napari_shadowinv.shot import Shot
 
@@ -55,6 +54,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def set_options(**options: object) -> tuple[str, ...]:
+    """Return the flags that set options of a fit."""
+    return tuple(f"--set=fit.options.{name}={value}" for name, value in options.items())
+
+
+QUICK = set_options(samples=0, max_iterations=1, spacing=0.5, smoothness=10)
 PAIR = ("fit", "a.tif", "b.tif", "--energies", "14.7,5", "--setup", "setup.toml")
 
 
@@ -105,7 +110,8 @@ def provenance_in(path: str) -> Provenance:
 
 @pytest.mark.draws_figures
 def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
-    result = shadowinv(*PAIR, "--samples", 2, "--noise", 20, "--beam-rms", 0)
+    exact = "--set=instrument.beam_rms=0"
+    result = shadowinv(*PAIR, *set_options(samples=2), "--noise", 20, exact)
     assert result.exit_code == 0, result.output
     names = {"a.tif", "b.tif", "setup.toml", "a_fit.shadowinv", "a_fit.png"}
     assert set(content(folder)) == names
@@ -134,8 +140,8 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
 
 
 def test_an_ambiguous_field_is_written_with_exit_code_3() -> None:
-    arguments = ("fit", "a.tif", "--source", "unknown", "--samples", 0, "--max-iterations", 2)
-    result = shadowinv(*arguments, "--ambiguous", "--quiet")
+    options = set_options(samples=0, max_iterations=2, ambiguous="true")
+    result = shadowinv("fit", "a.tif", "--source", "unknown", *options, "--quiet")
     assert result.exit_code == 3
     (line,) = result.stderr.splitlines()
     assert line.startswith("ONE IMAGE CANNOT TELL: a_fit.shadowinv was written, but one image")
@@ -148,7 +154,8 @@ def test_an_ambiguous_field_is_written_with_exit_code_3() -> None:
 
 
 def test_one_image_with_unknown_beam_needs_ambiguous(refused: Callable[..., None]) -> None:
-    refused("fit", "a.tif", "--source", "unknown", names=("one image", "--ambiguous"))
+    names = ("one image", "(--set fit.options.ambiguous=true)")
+    refused("fit", "a.tif", "--source", "unknown", names=names)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
@@ -174,9 +181,9 @@ def test_ctrl_c_leaves_nothing(folder: Path) -> None:
 
 def test_images_setups_and_choices_reach_the_fit(fit_arguments: dict[str, Any]) -> None:
     result = shadowinv(
-        *PAIR, "--fields", "B, E", "--noise", "poisson", "--psf", 1.5, "--brightness", "free",
-        "--align", "shift", "--seed", 3,
-    )  # fmt: skip
+        *(*PAIR, "--set=fit.fields=B, E", "--noise", "poisson", "--set=fit.psf=1.5"),
+        *("--set=fit.brightness=free", *set_options(align="shift", seed=3)),
+    )
     assert result.exit_code == 0, result.output
     shots = fit_arguments["shots"]
     np.testing.assert_array_equal(shots[1].image, tifffile.imread("b.tif"))
@@ -206,7 +213,7 @@ def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any
         "\n"
         "b.tif, 5, setup.toml, beam.tif, 1.2, 0.5,,\n"
     )
-    result = shadowinv("fit", "night/shots.csv", "--psf", 2, "--noise", 30)
+    result = shadowinv("fit", "night/shots.csv", "--set=fit.psf=2", "--noise", 30)
     assert result.exit_code == 0, result.output
     shots = fit_arguments["shots"]
     assert of_each(shots, "setup") == [FIRST, SECOND]
@@ -240,7 +247,7 @@ def test_binning_sums_pixels_and_enlarges_the_pixel_size(
     fit_arguments: dict[str, Any],
 ) -> None:
     tifffile.imwrite("beam.tif", np.full(SHAPE, 10, np.float32))
-    sizes = "--source-size", 1e-5, "--resolution", 4e-4
+    sizes = "--set=fit.source_size=1e-5", "--set=fit.resolution=4e-4"
     result = shadowinv(*PAIR, "--bin", 2, "--source", "beam.tif", *sizes)
     assert result.exit_code == 0, result.output
     blocks = tifffile.imread("a.tif").astype(float).reshape(24, 2, 28, 2).sum(axis=(1, 3))
@@ -255,7 +262,9 @@ def test_binning_sums_pixels_and_enlarges_the_pixel_size(
 def test_strengths_replace_energies_and_keep_units(
     fit_arguments: dict[str, Any],
 ) -> None:
-    assert shadowinv(*PAIR, "--strengths", "1 1,1.7 2.9", "--fields", "B,E").exit_code == 0
+    Path("shots.csv").write_text("file,energy,strength\na.tif,14.7,1 1\nb.tif,5,1.7 2.9\n")
+    arguments = ("fit", "shots.csv", "--setup", "setup.toml", "--set=fit.fields=B,E")
+    assert shadowinv(*arguments).exit_code == 0
     assert of_each(fit_arguments["shots"], "strength") == [(1.0, 1.0), (1.7, 2.9)]
     assert fit_in("a_fit.shadowinv")[0].setups == (FIRST, SECOND)
 
@@ -284,20 +293,10 @@ def test_light_is_deflected_by_a_refractive_index_by_default(
     assert "wavelengths differ" in result.stderr
 
 
-def test_options_come_from_a_file_and_flags_override_it(fit_arguments: dict[str, Any]) -> None:
-    Path("options.toml").write_text('boundary = "free"\nsamples = 4\n')
-    assert shadowinv("fit", "a.tif", "--options", "options.toml", "--samples", 0).exit_code == 0
+def test_settings_override_the_recipe_of_a_fit(fit_arguments: dict[str, Any]) -> None:
+    Path("r.toml").write_text('[fit.options]\nboundary = "free"\nsamples = 4\n')
+    assert shadowinv("fit", "a.tif", "--recipe", "r.toml", *set_options(samples=0)).exit_code == 0
     assert fit_arguments["options"] == FitOptions(boundary="free", samples=0)
-
-
-def test_every_option_of_a_fit_has_a_flag() -> None:
-    text = flat(shadowinv("fit", "--help-all").stdout)
-    for name in FitOptions.model_fields:
-        assert f"--{name.replace('_', '-')}" in text
-    flags = {"bin": 2, "ambiguous": True, "max_iterations": 4}
-    recipe = fit_recipe_of(flags, Recipe())
-    options = FitOptions(ambiguous=True, max_iterations=4)
-    assert recipe == Recipe(steps=(Bin(factor=2),), fit=FitChoices(options=options))
 
 
 # Errors
@@ -338,22 +337,27 @@ MISTAKES = {
     "fit a.tif b.tif --energies 3": ("2 images and 1 values of --energies",),
     "fit a.tif b.tif --energies 3,5": ("an energy of 3 MeV and no setup", "--setup"),
     "fit a.tif b.tif --setup setup.toml": ("'energy' is missing",),
-    "fit a.tif b.tif --strengths 1,two": ("b.tif: --strengths is 'two'",),
-    "fit a.tif small.tif --strengths 1,2": ("small.tif has shape (40, 40), a.tif (48, 56)",),
-    "fit a.tif --psf 1 --resolution 1e-5": ("--psf, a point spread in px", "--resolution in m"),
-    "fit a.tif --resolution 1e-5": ("no setup", "--psf"),
+    "fit two.csv": ("line 3", "'strength' is 'two'"),
+    "fit small.csv": ("small.tif has shape (40, 40), a.tif (48, 56)",),
+    "fit a.tif --set fit.psf=1 --set fit.resolution=1e-5": (
+        "fit.psf, a point spread in px, and fit.resolution in m",
+    ),
+    "fit a.tif --set fit.resolution=1e-5": ("no setup", "(--set fit.psf)"),
     "fit a.tif --source nothing.tif": ("nothing.tif does not exist",),
     "fit a.tif --source small.tif": ("a.tif: source has shape (40, 40)",),
     "fit a.tif --out fit.csv": ("expected one of .h5", ".shadowinv"),
     "fit a.tif --out fit.h5": ("pradformat", "needs a setup"),
-    "fit a.tif b.tif --energies 3,5 --setup setup.toml --fields B,E --out fit.h5": (
+    "fit a.tif b.tif --energies 3,5 --setup setup.toml --set fit.fields=B,E --out fit.h5": (
         "holds one field, received B and E",
     ),
     "fit a.tif --out setup.shadowinv --figure setup.toml": (".toml", "expected one of"),
-    "fit a.tif --boundary soft": ("--boundary is 'soft'", "'fading' or 'free'"),
+    "fit a.tif --set fit.options.boundary=soft": (
+        "fit.options.boundary is 'soft'",
+        "'fading' or 'free'",
+    ),
+    "fit a.tif --set options.samples=2": ("options.samples: did you mean fit.options.samples?",),
     "fit shots.csv --energies 3": ("column 'energy'",),
-    "fit a.tif --options setup.toml": ("unknown key 'kind' in setup.toml",),
-    "fit a.tif b.tif --brightness 1,0 --strengths 1,2": ("b.tif: --brightness is '0'",),
+    "fit dark.csv": ("line 3", "'brightness' is '0'"),
 }
 
 
@@ -363,6 +367,9 @@ def test_mistakes_give_one_sentence(
 ) -> None:
     tifffile.imwrite("small.tif", np.ones((40, 40), np.float32))
     Path("shots.csv").write_text("file\na.tif\n")
+    Path("two.csv").write_text("file,strength\na.tif,1\nb.tif,two\n")
+    Path("small.csv").write_text("file,strength\na.tif,1\nsmall.tif,2\n")
+    Path("dark.csv").write_text("file,strength,brightness\na.tif,1,1\nb.tif,2,0\n")
     refused(*command.split(), names=names)
 
 
@@ -430,8 +437,7 @@ def test_rerun_takes_moved_images_in_their_order(
     folder: Path, refused: Callable[..., None]
 ) -> None:
     tifffile.imwrite("beam.tif", np.full(SHAPE, 1000, np.float32))
-    quick = ("--samples", 0, "--max-iterations", 1, "--spacing", 0.5, "--smoothness", 10)
-    assert shadowinv(*PAIR, "--source", "beam.tif", *quick).exit_code in (0, 3)
+    assert shadowinv(*PAIR, "--source", "beam.tif", *QUICK).exit_code in (0, 3)
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
     for name in ("a.tif", "beam.tif"):
@@ -449,8 +455,7 @@ def test_rerun_takes_moved_images_in_their_order(
 
 
 def test_rerun_reports_an_older_version() -> None:
-    quick = ("--samples", 0, "--max-iterations", 1, "--spacing", 0.5, "--smoothness", 10)
-    assert shadowinv("fit", "a.tif", "--bin", 1, *quick).exit_code in (0, 3)
+    assert shadowinv("fit", "a.tif", "--bin", 1, *QUICK).exit_code in (0, 3)
     fit, _ = fit_in("a_fit.shadowinv")
     assert fit.provenance is not None
     older = fit.provenance.model_copy(update={"version": "0.0.1"})
@@ -469,9 +474,8 @@ def test_rerun_uses_the_fiducials_and_masks() -> None:
     Path("shots.csv").write_text("\n".join(lines))
     rows = ["y,x,dy,dx,sigma", *(f"{k % 30}.25,{k % 40}.5,0,0,10" for k in range(1000))]
     Path("mesh.csv").write_text("\n".join(rows))
-    quick = ("--samples", 0, "--max-iterations", 1, "--spacing", 0.5, "--smoothness", 10)
-    part = ("--crop-y", "9:49", "--crop-x", "8:56")
-    result = shadowinv("fit", "shots.csv", "--fiducials", "mesh.csv", *part, *quick)
+    part = ("--step", "crop y=9:49 x=8:56")
+    result = shadowinv("fit", "shots.csv", "--fiducials", "mesh.csv", *part, *QUICK)
     assert result.exit_code in (0, 3), result.output
     provenance = provenance_in("image_one_fit.shadowinv")
     assert [origin.file for origin in provenance.masks] == ["one.tif", "two.tif"]
@@ -495,8 +499,8 @@ def test_rerun_refuses_a_fit_without_provenance(
 def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> None:
     tifffile.imwrite("mask.tif", (np.eye(*SHAPE) == 0).astype(np.uint8))
     chosen = ("--bin", 2, "--mask", "mask.tif", "--noise", "poisson", "--source", "unknown")
-    lengths = ("--source-size", 1e-5, "--samples", 0)
-    first = shadowinv(*PAIR, *chosen, *lengths, "--fields", "B,E", "--save-recipe", "r.toml")
+    lengths = ("--set=fit.source_size=1e-5", *set_options(samples=0))
+    first = shadowinv(*PAIR, *chosen, *lengths, "--set=fit.fields=B,E", "--save-recipe", "r.toml")
     assert first.exit_code == 0, first.output
     before = dict(fit_arguments)
     recipe = read_recipe(Path("r.toml"))
@@ -515,18 +519,11 @@ def test_a_saved_recipe_gives_the_same_fit(fit_arguments: dict[str, Any]) -> Non
         np.testing.assert_equal(vars(new), vars(old))
 
     # Flags override the recipe.
-    overrides = (
-        "--psf",
-        0.5,
-        "--samples",
-        3,
-        "--source",
-        "a.tif",
-        "--brightness",
-        "free",
-        "--bin",
-        4,
-    )
+    spread = ("--set=fit.source_size=", "--set=fit.psf=0.5")
+    refused = shadowinv(*PAIR, "--recipe", "r.toml", spread[1], "--overwrite")
+    assert "fit.psf, a point spread in px, and fit.source_size in m" in refused.stderr
+    more = ("--set=fit.brightness=free", "--source", "a.tif", "--bin", 4)
+    overrides = (*spread, *more, *set_options(samples=3))
     changed = shadowinv(*PAIR, "--recipe", "r.toml", *overrides, "--overwrite")
     assert changed.exit_code == 0, changed.output
     assert of_each(fit_arguments["shots"], "psf") == [0.5, 0.5]
@@ -589,18 +586,8 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
 
 
 def test_fields_are_compared_and_the_likeliest_is_written() -> None:
-    quick = (
-        "--noise",
-        20,
-        "--samples",
-        2,
-        "--max-iterations",
-        5,
-        "--spacing",
-        0.25,
-        "--smoothness",
-        10,
-    )
+    options = set_options(samples=2, max_iterations=5, spacing=0.25, smoothness=10)
+    quick = ("--noise", 20, *options)
     result = shadowinv(*PAIR, "--compare", *quick)
     assert result.exit_code in (0, 3), result.output
     output = flat(result.stdout)
@@ -614,14 +601,15 @@ def test_fields_are_compared_and_the_likeliest_is_written() -> None:
     assert provenance.recipe.fit is not None
     assert provenance.recipe.fit.fields == names
     assert fit.options.evidence
-    chosen = shadowinv(*PAIR, "--compare", "--fields", "E", *quick, "--overwrite")
+    chosen = shadowinv(*PAIR, "--compare", "--set=fit.fields=E", *quick, "--overwrite")
     assert chosen.exit_code in (0, 3), chosen.output
     assert [field.name for field in fit_in("a_fit.shadowinv")[0].fields] == ["E"]
 
 
 def test_incomparable_fields_are_refused(refused: Callable[..., None]) -> None:
-    refused(*PAIR, "--compare", "--fields", "plasma", names=("plasma", "B; E; B,E"))
-    refused("fit", "a.tif", "b.tif", "--compare", "--strengths", "1,2", names=("needs the setup",))
+    refused(*PAIR, "--compare", "--set=fit.fields=plasma", names=("plasma", "B; E; B,E"))
+    Path("shots.csv").write_text("file,strength\na.tif,1\nb.tif,2\n")
+    refused("fit", "shots.csv", "--compare", names=("needs the setup",))
 
 
 # Static field
@@ -640,13 +628,13 @@ def films() -> None:
     Path("films.csv").write_text("\n".join(["file,energy", *rows]))
 
 
-FILMS = ("fit", "films.csv", "--setup", "setup.toml", "--noise", 20, "--samples", 2)
+FILMS = ("fit", "films.csv", "--setup", "setup.toml", "--noise", 20, *set_options(samples=2))
 
 
 def test_left_out_images_are_written(folder: Path) -> None:
     films()
     before = set(content(folder))
-    result = shadowinv(*FILMS, "--spacing", 0.2, "--leave-one-out")
+    result = shadowinv(*FILMS, *set_options(spacing=0.2), "--leave-one-out")
     assert result.exit_code == 3, result.output
     output = flat(result.stdout)
     for words in ("Left out", "c, 14.7 MeV", "not explained"):
@@ -666,7 +654,7 @@ def test_images_left_out_have_energies_without_a_setup(folder: Path) -> None:
     films()
     lines = ["file,energy,strength", "a.tif,5,1", "b.tif,7,0.844", "d.tif,10,0.706"]
     Path("films.csv").write_text("\n".join(lines))
-    quick = ("--spacing", 0.3, "--max-iterations", 3, "--samples", 0)
+    quick = set_options(spacing=0.3, max_iterations=3, samples=0)
     result = shadowinv("fit", "films.csv", "--noise", 20, *quick, "--leave-one-out")
     assert result.exit_code in (0, 3), result.output
     for words in ("a (5 MeV)", "b (7 MeV)", "d (10 MeV)"):
@@ -675,16 +663,10 @@ def test_images_left_out_have_energies_without_a_setup(folder: Path) -> None:
 
 
 STATIC_MISTAKES = {
-    "fit a.tif b.tif --strengths 1,2 --leave-one-out": ("received 2 images", "needs 3 or more"),
+    "fit two.csv --leave-one-out": ("received 2 images", "needs 3 or more"),
     "fit a.tif b.tif b.tif --leave-one-out": ("neither strengths nor setups",),
-    "fit a.tif b.tif b.tif --strengths 1,2,3 --leave-one-out --out fit.h5": (
-        "fit.h5",
-        "a format without it",
-    ),
-    "fit a.tif b.tif b.tif --strengths 1,2,3 --leave-one-out --fiducials mesh.csv": (
-        "--fiducials",
-        "first",
-    ),
+    "fit three.csv --leave-one-out --out fit.h5": ("fit.h5", "a format without it"),
+    "fit three.csv --leave-one-out --fiducials mesh.csv": ("--fiducials", "first"),
 }
 
 
@@ -693,6 +675,9 @@ def test_impossible_static_checks_are_refused(
     refused: Callable[..., None], command: str, names: tuple[str, ...]
 ) -> None:
     Path("mesh.csv").write_text("x,y,dx,dy,sigma\n20,10,0.5,-0.25,0.1\n")
+    rows = ["file,strength", "a.tif,1", "b.tif,2", "b.tif,3"]
+    Path("two.csv").write_text("\n".join(rows[:3]))
+    Path("three.csv").write_text("\n".join(rows))
     refused(*command.split(), names=names)
 
 

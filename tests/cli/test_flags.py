@@ -1,45 +1,54 @@
-"""Flags of the commands, and the sentences about their values."""
+"""Flags of the commands, the keys that --set takes, and the sentences about their values."""
 
-from functools import cache
+from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import BaseModel, ValidationError
 from typer.main import get_command
+from typer.testing import CliRunner
 
-from helpers.command_line import shadowinv
+from helpers.command_line import flat, shadowinv
 from napari_shadowinv.cli import app
-from napari_shadowinv.cli._flags import _annotation_name, flag_names
-from napari_shadowinv.options import FitChoices, FitOptions, Instrument, InversionOptions
-from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
-from napari_shadowinv.preprocessing import ESTIMATES, FIT_STEPS, STEPS, Step
+from napari_shadowinv.cli._settings import FIT_SECTIONS, INVERSION_SECTIONS, Sections, keys_of
+from napari_shadowinv.cli._stack_commands import BATCH_SECTIONS, WATCH_SECTIONS
+from napari_shadowinv.options import FitOptions
 
-INVERSION = (InversionOptions, Instrument, *STEPS.values(), *ESTIMATES.values())
 STORE = ("--out", "out.shadowinv.zarr")
-COMMANDS: dict[str, tuple[tuple[str, ...], tuple[type[BaseModel], ...]]] = {
-    "invert": (("shot.npy",), INVERSION),
-    "fit": (("shot.npy",), (FitOptions, FitChoices, Instrument, *FIT_STEPS.values())),
-    "batch": (("shot.npy", *STORE), (RunOptions, *INVERSION)),
-    "watch": ((".", *STORE), (WatchOptions, *INVERSION)),
+COMMANDS: dict[str, tuple[tuple[str, ...], Sections]] = {
+    "invert": (("shot.npy",), INVERSION_SECTIONS),
+    "fit": (("shot.npy",), {**FIT_SECTIONS, "fit.options": FitOptions}),
+    "batch": (("shot.npy", *STORE), {**BATCH_SECTIONS, "fit.options": FitOptions}),
+    "watch": ((".", *STORE), {**WATCH_SECTIONS, "fit.options": FitOptions}),
 }
-CANDIDATES: dict[str, tuple[Any, ...]] = {
-    "int": (-1, 10**9),
-    "float": (-1.0, 1e9, float("inf")),
-    "str": ("nonsense",),
-}
+CANDIDATES = ("-1", "1e9", "inf", "nonsense")
 
 
-@cache
-def kinds_of_flags(command: str) -> dict[str, str]:
-    """Return the type of the value of each flag of a command."""
-    parameters = get_command(app).commands[command].params  # type: ignore[attr-defined]
-    options = [each for each in parameters if each.param_type_name == "option"]
-    return {flag: _annotation_name(each) for each in options for flag in each.opts}
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
 
 
-def bad_value(model: type[BaseModel], key: str, kind: str) -> Any:
+def flags_of(command: Any) -> set[str]:
+    options = [each for each in command.params if each.param_type_name == "option"]
+    return {flag for each in options for flag in each.opts if flag.startswith("--")}
+
+
+def completed(words: str) -> list[str]:
+    """Return what a shell proposes for the last word."""
+    environment = {
+        "_SHADOWINV_COMPLETE": "complete_bash",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split()) - 1),
+    }
+    result = CliRunner().invoke(app, [], prog_name="shadowinv", env=environment)
+    return result.output.splitlines()
+
+
+def bad_value(model: type[BaseModel], key: str) -> str | None:
     """Return a value that the model refuses, None if it takes all candidates."""
-    for value in CANDIDATES.get(kind, ()):
+    for value in CANDIDATES:
         try:
             model.model_validate({key: value})
         except ValidationError as error:
@@ -48,67 +57,77 @@ def bad_value(model: type[BaseModel], key: str, kind: str) -> Any:
     return None
 
 
-def needed_flags(model: Any) -> dict[str, Any]:
-    """Return the flags without which those of a step or an estimate are refused."""
-    if issubclass(model, Step) and model.primary:
-        primary = model.parameters()[model.primary]
-        return {flag_names(model)[model.primary]: primary.get_default()}
-    return {"--source-from": model.name()} if model in ESTIMATES.values() else {}
+def test_a_command_has_at_most_20_flags_and_all_have_60() -> None:
+    commands = get_command(app).commands  # type: ignore[attr-defined]
+    assert len(commands) == 13
+    flags = {name: flags_of(command) for name, command in commands.items()}
+    assert {name: len(each) for name, each in flags.items() if len(each) > 20} == {}
+    assert len(set.union(*flags.values())) <= 60
 
 
 @pytest.mark.parametrize(
-    ("command", "model"),
-    [(command, model) for command, (_, models) in COMMANDS.items() for model in models],
+    ("command", "section"),
+    [(command, section) for command, (_, sections) in COMMANDS.items() for section in sections],
 )
-def test_bad_values_are_named_by_their_flags(
-    command: str, model: type[BaseModel], tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    kinds = kinds_of_flags(command)
-    for key, flag in flag_names(model).items():
-        value = bad_value(model, key, kinds.get(flag, ""))
-        if value is None:
+def test_bad_values_are_named_by_their_keys(command: str, section: str) -> None:
+    arguments, sections = COMMANDS[command]
+    for key in sections[section].model_fields:
+        value = bad_value(sections[section], key)
+        if value is None or key == "options":
             continue
-        flags = needed_flags(model) | {flag: value}
-        texts = [text for pair in flags.items() for text in pair]
-        result = shadowinv(command, *COMMANDS[command][0], *texts)
+        result = shadowinv(command, *arguments, "--set", f"{section}.{key}={value}")
         assert result.exit_code == 2, result.output
-        assert f"{flag} is " in result.stderr
-        assert f"'{key}'" not in result.stderr
+        assert f"{section}.{key} is " in result.stderr
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_each_flag_with_a_number_is_of_a_model_or_of_the_command(command: str) -> None:
-    named = {flag for model in COMMANDS[command][1] for flag in flag_names(model).values()}
-    numbers = {flag for flag, kind in kinds_of_flags(command).items() if kind in ("int", "float")}
-    assert numbers & named
-    assert numbers <= named
+@pytest.mark.parametrize(
+    ("setting", "sentence"),
+    [
+        ("options.tolernce=1", "options.tolernce: did you mean options.tolerance?"),
+        ("tolerance=1", "tolerance: did you mean options.tolerance?"),
+        ("option.beam_rms=1", "option.beam_rms: did you mean instrument.beam_rms?"),
+        ("zzz=1", "zzz: expected a key that begins with options., instrument."),
+        ("options.tolerance", "expected KEY=VALUE"),
+    ],
+)
+def test_a_wrong_key_is_refused_with_the_nearest(setting: str, sentence: str) -> None:
+    result = shadowinv("invert", "shot.npy", "--set", setting)
+    assert result.exit_code == 2
+    assert sentence in flat(result.stderr)
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
         (
-            "invert shot.npy --solver lbfgs --boundary free",
-            "--solver is 'lbfgs' and --boundary is 'free', expected",
+            "invert shot.npy --set options.solver=lbfgs --boundary free",
+            "options.solver is 'lbfgs' and --boundary is 'free', expected",
         ),
         (
-            "invert shot.npy --noise-level 2 --units-per-quantum 3",
-            "--noise-level is 2 and --units-per-quantum is 3, expected one",
+            "invert shot.npy --set options.noise_level=2 --set options.units_per_quantum=3",
+            "options.noise_level is 2 and options.units_per_quantum is 3, expected one",
         ),
-        ("fit shot.npy --psf 1 --source-size 1e-6", "received --psf, a point spread in px, and"),
-        (
-            "invert shot.npy --options o.toml --n-sites 2",
-            "--n-sites is 2: it must be at least 4; 'floor' in o.toml is 7: it",
-        ),
-        ("invert shot.npy --options o.toml --floor 8", "--floor is 8.0: it must be less than 1"),
+        ("invert shot.npy --accuracy 3", "--accuracy is 3"),
+        ("invert shot.npy --instrument film,filn", "--instrument is 'film,filn': did you mean"),
+        ("invert shot.npy --instrument film,camera", "expected one detector and one beam"),
+        ("batch shot.npy --out a.shadowinv.zarr --workers 0", "--workers is 0"),
     ],
 )
-def test_contradictions_name_flags_and_keys_of_files(
-    arguments: str, sentence: str, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "o.toml").write_text("floor = 7\n")
+def test_contradictions_name_flags_and_keys(arguments: str, sentence: str) -> None:
     result = shadowinv(*arguments.split())
     assert result.exit_code == 2
-    assert sentence in result.stderr
+    assert sentence in flat(result.stderr)
+
+
+def test_keys_steps_and_sources_are_completed() -> None:
+    keys = {f"{key}=" for key in keys_of(INVERSION_SECTIONS)}
+    assert keys <= set(completed("shadowinv invert shot.npy --set o")) | set(
+        completed("shadowinv invert shot.npy --set i")
+    )
+    assert completed("shadowinv invert shot.npy --set options.tol") == ["options.tolerance="]
+    assert completed("shadowinv fit a.npy --set fit.options.sam") == [
+        "fit.options.samples=",
+        "fit.options.sampling=",
+    ]
+    assert completed("shadowinv invert shot.npy --step butter") == ["butterworth"]
+    assert completed("shadowinv batch shot.npy --source-from poly") == ["polynomial"]

@@ -19,7 +19,7 @@ source_object_distance = 1.3e-3
 object_image_distance = 2e-2
 pixel_size = 1.5e-6
 """
-QUICK = ("--size", "64x64", "--draws", 2)
+QUICK = ("--size", "64x64", "--set=plan.draws=2")
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_plan_writes_a_row_for_each_draw_and_a_figure(folder):
     answer = shadowinv(
         *("plan", "toroid:peak=20,radius=9e-6", "--setup", "setup.toml", *QUICK),
-        *("--beam-rms", 0, "--counts", 3000),
+        *("--set=instrument.beam_rms=0", "--counts", 3000),
     )
     assert answer.exit_code == 0, answer.output
     assert "would be determined: 2 of 2" in flat(answer.output)
@@ -44,17 +44,17 @@ def test_a_plan_writes_a_row_for_each_draw_and_a_figure(folder):
 
 
 def test_a_plan_says_which_beam_it_assumes(folder):
-    planned = ("plan", "toroid:peak=20,radius=9e-6", "--setup", "setup.toml", *QUICK)
-    text = flat(shadowinv(*planned, "--counts", 3000).output)
+    arguments = ("plan", "toroid:peak=20,radius=9e-6", "--setup", "setup.toml", *QUICK)
+    text = flat(shadowinv(*arguments, "--counts", 3000).output)
     assert "its unevenness of 5 % is assumed: record a reference" in text
-    stated = flat(shadowinv(*planned, "--beam-rms", 0.05, "--overwrite").output)
+    stated = flat(shadowinv(*arguments, "--set=instrument.beam_rms=0.05", "--overwrite").output)
     assert "limited by beam" in stated
     assert "assumed: record" not in stated
 
 
 def test_a_sweep_has_a_row_for_each_value(folder):
     answer = shadowinv(
-        *("plan", "blob:amplitude=15,sigma=6", *QUICK, "--beam-rms", 0),
+        *("plan", "blob:amplitude=15,sigma=6", *QUICK, "--set=instrument.beam_rms=0"),
         *("--sweep", "counts=100,1600", "--out", "counts.csv"),
     )
     assert answer.exit_code in (0, 3), answer.output
@@ -71,16 +71,17 @@ def test_particles_are_traced_through_a_field_on_a_grid(folder):
     magnetic = {name: (("z", "y", "x"), value, {"units": "T"}) for name, value in values.items()}
     axes = {name: (name, places, {"units": "m"}) for name in "zyx"}
     xr.Dataset(magnetic, axes).to_netcdf(folder / "cube.nc", engine="h5netcdf")
-    seen = ("--setup", "setup.toml", "--beam", "x", "--right", "y")
+    view = ("--setup", "setup.toml", "--set=view.beam=x", "--set=view.right=y")
     answer = shadowinv(
-        *("plan", "cube.nc", *seen, "--draws", 2, "--beam-rms", 0, "--counts", 100_000)
+        *("plan", "cube.nc", *view, "--set=plan.draws=2"),
+        *("--set=instrument.beam_rms=0", "--counts", 100_000),
     )
     assert answer.exit_code == 0, answer.output
     assert "would be determined: 2 of 2" in flat(answer.output)
     for arguments, message in (
         (("cube.nc",), "particles through it need --setup"),
-        (("cube.nc", *seen, "--deflector", "magnetic field"), "which needs only --setup"),
-        (("toroid", *seen), "received --beam, --right, but toroid is no 3-D field"),
+        (("cube.nc", *view, "--deflector", "magnetic field"), "which needs only --setup"),
+        (("toroid", *view), "received view.beam, view.right, but toroid is no 3-D field"),
     ):
         refused = shadowinv("plan", *arguments, "--out", "other.csv")
         assert refused.exit_code == 2
@@ -91,7 +92,8 @@ def test_particles_are_traced_through_a_field_on_a_grid(folder):
 def test_the_object_of_a_file_is_a_displacement(folder):
     np.save(folder / "field.npy", gaussian_blob((64, 64), 15, 6).displacement)
     answer = shadowinv(
-        *("plan", "field.npy", "--draws", 2, "--beam-rms", 0, "--counts", 10_000, "--quiet")
+        *("plan", "field.npy", "--set=plan.draws=2"),
+        *("--set=instrument.beam_rms=0", "--counts", 10_000, "--quiet"),
     )
     assert answer.exit_code == 0, answer.output
     assert answer.output == ""
@@ -115,7 +117,7 @@ def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):
         (("plan", "blob", "--sweep", "counts"), "expected NAME=VALUES"),
         (("plan", "blob", "--sweep", "count=1,2"), "did you mean 'counts'"),
         (("plan", "blob", "--counts", "-1"), "--counts is -1"),
-        (("plan", "blob", "--background", "2"), "--background is 2"),
+        (("plan", "blob", "--set=instrument.background=2"), "instrument.background is '2'"),
         (("plan", "blob", "--deflector", "plasma"), "not a phantom"),
         (("plan", "missing.shadowinv"), "missing.shadowinv"),
         (("plan", "blob", "--out", "plan.txt"), "plan.txt cannot be written"),

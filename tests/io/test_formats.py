@@ -67,7 +67,7 @@ def test_messages_and_help_list_every_format(tmp_path: Path) -> None:
         format_of(tmp_path / "empty")
     listed = [each for each in FORMATS if each.title]
     assert all(each.title in str(error.value) for each in listed)
-    output = CliRunner().invoke(app, ["invert", "--help-all"], env={"COLUMNS": "300"}).output
+    output = CliRunner().invoke(app, ["invert", "--help"], env={"COLUMNS": "300"}).output
     words = " ".join(output.replace("│", " ").split())  # in a table of any width
     assert all(each.title in words for each in listed if "image" in each.holds)
 

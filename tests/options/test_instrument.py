@@ -3,7 +3,8 @@
 import pytest
 
 from napari_shadowinv import InputError, Instrument, Recipe
-from napari_shadowinv.cli._flags import _option_flags, recipe_of
+from napari_shadowinv.cli._flags import instrument_keys
+from napari_shadowinv.cli._settings import INVERSION_SECTIONS, settings_of
 from napari_shadowinv.options import BEAM_SOURCES, DETECTORS, BeamPrior
 from napari_shadowinv.pipeline import read_recipe, write_recipe
 
@@ -45,14 +46,13 @@ def test_a_stated_zero_survives_a_recipe_file(tmp_path):
 
 
 def test_flags_replace_the_detector_of_a_recipe():
-    base = Recipe(instrument=Instrument.of("film", blur=2))
-    flagged = recipe_of({"detector": "CR-39", "gamma": 0.2}, base)
-    assert flagged.instrument == Instrument.of("CR-39", blur=2, gamma=0.2)
+    stated = settings_of(["instrument.gamma=0.2"], INVERSION_SECTIONS, instrument_keys("CR-39"))
+    film = Instrument.of("film", blur=2)
+    assert stated.change("instrument", film) == Instrument.of("CR-39", blur=2, gamma=0.2)
 
 
-def test_flags_list_the_detectors_and_the_sources_of_beams():
-    kinds = dict(_option_flags(Instrument, None))
-    (flag,) = kinds["detector"].annotation.__metadata__
-    assert flag.metavar == "film|image plate|CR-39|scintillator|camera"
-    (flag,) = kinds["beam_source"].annotation.__metadata__
-    assert flag.metavar == "TNSA|implosion|X-ray tube|laser"
+@pytest.mark.parametrize("text", ["image-plate,x-ray-tube", "X-ray tube, Image Plate"])
+def test_a_detector_and_a_beam_are_named_in_any_order(text):
+    stated = settings_of([], INVERSION_SECTIONS, instrument_keys(text))
+    expected = Instrument.of("image plate", source="X-ray tube")
+    assert stated.change("instrument", Instrument()) == expected

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import typing
 from pathlib import Path
@@ -22,7 +21,12 @@ from napari_shadowinv import (
     invert_stack,
 )
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.cli._flags import recipe_of, takes_recipe
+from napari_shadowinv.cli._settings import (
+    INVERSION_SECTIONS,
+    settings_of,
+    source_from,
+    with_steps,
+)
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import number_of_sites
 from napari_shadowinv.io import read_radiograph
@@ -235,31 +239,28 @@ def test_a_recipe_survives_its_file(tmp_path: Path, source: Any, setup: Any) -> 
     assert Recipe.model_validate_json(recipe.model_dump_json()) == recipe
 
 
-def test_every_parameter_has_a_flag() -> None:
-    @takes_recipe
-    def command(*, flags: dict[str, Any]) -> None:
-        raise AssertionError(flags)
+def typed(value: Any) -> str:
+    """Return a value as it is typed."""
+    return ":".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
-    flags = set(inspect.signature(command).parameters)
-    for name in [*InversionOptions.model_fields, *Instrument.model_fields]:
-        assert name in flags
-        flags.discard(name)
-    flagged = recipe_of({"gamma": 0.1}, Recipe(instrument=Instrument(blur=2)))
-    assert flagged.instrument == Instrument(blur=2, gamma=0.1)
+
+def test_every_parameter_can_be_typed() -> None:
     for step in (changed(model) for model in STEPS.values()):
-        assert isinstance(step, Step)
-        values = {
-            (step.name() if name == step.primary else f"{step.name()}-{name}").replace("-", "_"): v
-            for name, v in step.values().items()
-        }
-        assert values.keys() <= flags
-        assert recipe_of(values, Recipe()).steps == (step,)
-        flags -= values.keys()
+        words = [f"{name}={typed(value)}" for name, value in step.values().items()]
+        assert with_steps((), [" ".join([step.name(), *words])], {}) == (step,)
     for source in (changed(model) for model in ESTIMATES.values()):
-        values = {f"source_{name}": value for name, value in source.values().items()}
-        assert values.keys() <= flags
-        assert recipe_of({"source_from": source.name(), **values}, Recipe()).source == source
-    assert {name for name in flags if not name.startswith("source_")} == set()
+        words = [f"{name}={typed(value)}" for name, value in source.values().items()]
+        assert source_from(" ".join([source.name(), *words]), None) == source
+    settings = settings_of(["instrument.gamma=0.1"], INVERSION_SECTIONS, {})
+    assert settings.change("instrument", Instrument(blur=2)) == Instrument(blur=2, gamma=0.1)
+
+
+def test_a_step_of_a_recipe_is_changed_in_its_place() -> None:
+    steps = with_steps((), ["bin 2", "hot-pixels 6", "low-pass 3"], {})
+    assert [step.name() for step in steps] == ["hot-pixels", "bin", "low-pass"]
+    moved = (steps[2], steps[1])
+    again = with_steps(moved, ["low-pass width=4"], {"bin": 5})
+    assert [step.values() for step in again] == [{"width": 4}, {"factor": 5}]
 
 
 OTHER = {

@@ -34,7 +34,7 @@ from napari_shadowinv.provenance import Provenance
 
 HERE = Path(__file__).parent
 SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
-BATCH = ["batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr", "--n-sites", "100"]
+BATCH = ["batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr", "--set=options.n_sites=100"]
 OPTICAL = """
 kind = "optical"
 wavelength = 532e-9
@@ -61,7 +61,7 @@ def folder(night, tmp_path, monkeypatch) -> Path:
 def batch(*more: object) -> Result:
     return shadowinv(
         "batch", "shots/shot_*.npy", "--source", "reference.npy", "--out", "n.shadowinv.zarr",
-        "--n-sites", 100, "--scheduler", "threads", "--beam-rms", 0, *more,
+        "--set=options.n_sites=100", "--scheduler", "threads", "--set=instrument.beam_rms=0", *more,
     )  # fmt: skip
 
 
@@ -72,8 +72,8 @@ def finished(any_night, tmp_path_factory) -> Path:
     np.save(place / "reference.npy", any_night.source)
     (place / "setup.toml").write_text(OPTICAL)
     result = shadowinv(
-        "batch", any_night.glob, "--source", place / "reference.npy", "--n-sites", 100,
-        "--setup", place / "setup.toml", "--scheduler", "threads", "--beam-rms", 0,
+        "batch", any_night.glob, "--source", place / "reference.npy", "--set=options.n_sites=100",
+        "--setup", place / "setup.toml", "--scheduler", "threads", "--set=instrument.beam_rms=0",
         "--out", place / "n.shadowinv.zarr",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
@@ -101,7 +101,7 @@ def test_batch_writes_and_reports_shots(night, folder):
     assert "line_integrated_density" in dataset
     reports = StackStore(Path("n.shadowinv.zarr")).reports()
     total = np.median([report["total_error"] for report in reports])
-    status = flat(shadowinv("status", "n.shadowinv.zarr").output)
+    status = flat(shadowinv("info", "n.shadowinv.zarr").output)
     for text in flat(result.output), status:
         assert "100; as requested" in text
         assert f"errors {100 * total:.2g} % of the displacement (r.m.s., median" in text
@@ -117,15 +117,15 @@ def test_shots_that_fail_are_named_and_the_exit_code_is_one(night, folder):
     assert "shot_1.npy" in text
     assert "is empty" in text
     assert "shot_4.npy: image has no positive pixel" in text
-    status = flat(shadowinv("status", "n.shadowinv.zarr").output)
+    status = flat(shadowinv("info", "n.shadowinv.zarr").output)
     assert "4 done, 2 failed, 0 pending" in status
     assert "shot_4.npy: image has no positive pixel" in status
-    every = shadowinv("status", "n.shadowinv.zarr", "--all").output
+    every = shadowinv("info", "n.shadowinv.zarr", "--all").output
     for index in range(6):
         assert f"shot_{index}.npy" in every
     for index in (1, 4):
         np.save(night.path(index), night.images[index])
-    assert batch("--redo-failed").exit_code == 0
+    assert batch("--set=run.redo_failed=true").exit_code == 0
 
 
 def test_existing_store_is_neither_resumed_nor_replaced(store):
@@ -176,8 +176,8 @@ def test_shots_that_came_since_are_appended_when_it_is_resumed(night, store):
         (["batch", "no/*.tif", "--out", "a.shadowinv.zarr"], "no file matches no/*.tif"),
         (["batch", "shots/*.npy", "--out", "a.zarr"], "ends with .shadowinv.zarr"),
         (["batch", "shots/*.npy", "--out", "a.shadowinv.zarr", "--source", "x.tif"], "not exist"),
-        (["status", "shots"], "is not a stack of shots"),
-        (["status", "none.shadowinv.zarr"], "none.shadowinv.zarr does not exist"),
+        (["info", "shots", "--all"], "is not a stack of shots"),
+        (["info", "none.shadowinv.zarr"], "none.shadowinv.zarr does not exist"),
         (["export", "shots", "--format", "csv"], "is not a stack of shots"),
     ],
 )
@@ -203,11 +203,11 @@ def test_nothing_is_written_among_the_files_of_a_store(store):
 
 
 def test_status_names_shots_with_lost_or_bad_reports(store):
-    assert "n_sites = 100, accuracy" in flat(shadowinv("status", store).stdout)
+    assert "n_sites = 100, accuracy" in flat(shadowinv("info", store).stdout)
     chunk = store / "report" / "c" / "0"
     chunk.unlink()
     for reason in ("its report is missing", "its report is damaged"):
-        result = shadowinv("status", store)
+        result = shadowinv("info", store)
         assert result.exit_code == 0, result.output
         assert "5 done, 0 failed, 0 pending, 1 damaged" in flat(result.output)
         assert f"shot_0.npy: {reason}" in flat(result.output)
@@ -309,7 +309,7 @@ def test_a_table_of_all_shots_is_exported_as_csv(night, folder):
     assert "no positive pixel" in rows[2]["reason"]
     store = read("n.shadowinv.zarr")
     assert float(rows[3]["image_residual"]) == float(store.image_residual[3])
-    status = shadowinv("status", "n.shadowinv.zarr", "--all").output
+    status = shadowinv("info", "n.shadowinv.zarr", "--all").output
     assert f"{float(store.image_residual[3]):.2%}" in flat(status)
     largest = np.hypot(*store.displacement.values[3]).max()
     assert float(rows[3]["displacement_peak (px)"]) == pytest.approx(largest, rel=1e-6)
@@ -320,7 +320,7 @@ def test_status_of_all_shots_fits_80_columns(night, folder, monkeypatch):
     np.save(night.path(2), 0 * night.images[2])
     assert batch().exit_code == 1
     monkeypatch.setenv("COLUMNS", "80")
-    status = shadowinv("status", name, "--all").output
+    status = shadowinv("info", name, "--all").output
     lines = status.splitlines()
     assert max(map(len, lines)) <= 80
     rows = [line.rstrip() for line in lines if " shot_" in line]
@@ -490,8 +490,8 @@ def test_the_variable_of_the_shots_is_not_asked_of_a_source_without_names(
         with h5py.File(path.with_suffix(".h5"), "w") as file:
             file["plane"], file["other"] = np.load(path), np.zeros((2, 2))
     result = shadowinv(
-        "batch", "shots/shot_*.h5", "--variable", "plane", "--source", source, "--n-sites", "100",
-        "--out", "n.shadowinv.zarr", "--scheduler", "threads", "--quiet",
+        "batch", "shots/shot_*.h5", "--variable", "plane", "--source", source,
+        "--set=options.n_sites=100", "--out", "n.shadowinv.zarr", "--quiet",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert (StackStore(tmp_path / "n.shadowinv.zarr").statuses() == DONE).all()
@@ -503,7 +503,7 @@ def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch
     np.save("reference.npy", night.source)
     command = [
         "batch", "shots/shot_*.npy", "--source", "reference.npy", "--out", "n.shadowinv.zarr",
-        "--n-sites", "100",
+        "--set=options.n_sites=100",
     ]  # fmt: skip
     out = tmp_path / "n.shadowinv.zarr"
     process = subprocess.Popen(
@@ -591,7 +591,7 @@ def test_status_counts_verdicts_and_lists_warnings_once(store):
     assert all("peak" in report["headline"] for report in reports)
     doubtful = [report for report in reports if report["level"] == "doubtful"]
     assert all(report["warnings"] for report in doubtful)
-    text = flat(shadowinv("status", store).output)
+    text = flat(shadowinv("info", store).output)
     shots = Counter(report["verdict"] for report in reports)
     assert f"{shots['determined']} determined" in text
     codes = {caution["code"] for report in doubtful for caution in report["warnings"]}
@@ -608,7 +608,7 @@ def test_shots_whose_beam_nobody_recorded_are_a_success(tmp_path, monkeypatch):
     threads = "--scheduler", "threads"
     run = shadowinv("batch", "1.npy", "2.npy", "--out", "b.shadowinv.zarr", *threads)
     assert run.exit_code == 0
-    rows = flat(shadowinv("status", "b.shadowinv.zarr").output)
+    rows = flat(shadowinv("info", "b.shadowinv.zarr").output)
     assert "0 determined, 2 depends on the beam" in rows
 
 
@@ -620,7 +620,7 @@ def test_arrays_of_a_file_are_shots_source_mask_and_rows(night, folder):
             night.images[:2], night.source, usable,
         )  # fmt: skip
     Path("table.csv").write_text("file, mask\nrun.h5::/entry/data[1], run.h5::/entry/usable\n")
-    common = ("--source", "run.h5::/entry/beam", "--n-sites", 100, "--scheduler", "threads")
+    common = ("--source", "run.h5::/entry/beam", "--set=options.n_sites=100")
     mask = ("--mask", "run.h5::/entry/usable")
     results = {}
     for name, more in (("run.h5::/entry/data", mask), ("table.csv", ())):
@@ -638,7 +638,7 @@ def test_a_folder_says_which_files_it_leaves_out(night, folder):
     Path("shots/log.txt").write_text("0")
     result = shadowinv(
         "batch", "shots", "--source", "reference.npy", "--out", "n.shadowinv.zarr",
-        "--n-sites", 100, "--scheduler", "threads",
+        "--set=options.n_sites=100", "--scheduler", "threads",
     )  # fmt: skip
     assert "left out 1 .txt" in flat(result.output)
 

@@ -47,7 +47,7 @@ def test_added_column_is_stored_and_listed_everywhere(
     assert written.site_count.attrs["long_name"] == "Number of sites"
     assert StackStore(out).columns[-1] is site_column
 
-    listed = flat(shadowinv("status", out, "--all").output)
+    listed = flat(shadowinv("info", out, "--all").output)
     assert "places" in listed
     assert "0100" in listed
 

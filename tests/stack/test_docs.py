@@ -72,24 +72,25 @@ def test_page_lists_the_columns_of_the_model():
 def test_the_commands_work_as_shown(folder, night):
     pytest.importorskip("imageio_ffmpeg")
     batch = ["batch", "shots/*.tif", "--source", "reference.tif", "--out", "night.shadowinv.zarr"]
-    assert batch == COMMANDS[0].replace("'", "").split()[1:]
+    assert batch == shlex.split(COMMANDS[0])[1:]
     runner = CliRunner()
     Path("setup.toml").write_text(
         'kind = "proton"\nenergy = 14.7\nsource_object_distance = 0.01\n'
         "object_image_distance = 0.3\npixel_size = 1e-5\n"
     )
-    fast = ["--scheduler", "threads", "--n-sites", "100", "--setup", "setup.toml"]
+    fast = ["--scheduler", "threads", "--set=options.n_sites=100", "--setup", "setup.toml"]
     assert runner.invoke(app, [*batch, *fast]).exit_code == 0
     bare = np.ones(night.source.shape, np.uint8)
     bare[4:17, 6:22] = 0
     iio.imwrite("bare.png", bare)
     (guessing,) = [command for command in COMMANDS if "--source-from" in command]
-    command = [*guessing.replace("'", "").split()[1:], *fast]
+    command = [*shlex.split(guessing)[1:], *fast]
     assert runner.invoke(app, command).exit_code == 0
-    cautious = ["--n-sites", "100", "--beam-rms", "0"]  # the field reaches the edge: a warning
+    # The field reaches the edge: a warning.
+    cautious = ["--set=options.n_sites=100", "--set=instrument.beam_rms=0"]
     watches = [command for command in COMMANDS if command.startswith("shadowinv watch")]
     for watching in watches:
-        if "--status-file" in watching:
+        if "status_file" in watching:
             tifffile.imwrite("shots/shot_3.tif", night.images[4].astype("float32"))
         result = runner.invoke(app, [*watching.split()[1:], "--idle", "0.2", *cautious])
         assert result.exit_code == 0, result.output

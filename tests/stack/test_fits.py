@@ -86,7 +86,7 @@ def test_a_stored_fit_keeps_its_cautions(images: Any, out: Path) -> None:
     codes = [caution.code for caution in alone.cautions]
     assert "hot-pixels" in codes
     assert str(store["cautions"].values[1]).split() == list(dict.fromkeys(codes))
-    assert "hot pixels: 1 pixel" in flat(shadowinv("status", out).stdout)
+    assert "hot pixels: 1 pixel" in flat(shadowinv("info", out).stdout)
     table = out.with_name("night.csv")
     assert shadowinv("export", out, "--out", table, "--format", "csv").exit_code == 0
     with table.open(encoding="utf-8") as file:
@@ -268,7 +268,7 @@ def test_a_shot_with_another_setup_fails_alone(folder: Path, out: Path) -> None:
 
 
 def test_batch_command_fits_reports_and_exports(folder: Path) -> None:
-    arguments = ("batch", "shots.csv", "--fit", "--recipe", "r.toml", "--scheduler", "threads")
+    arguments = ("batch", "shots.csv", "--recipe", "r.toml", "--scheduler", "threads")
     out = "night.shadowinv.zarr"
     result = shadowinv(*arguments, "--out", out)
     assert result.exit_code in (0, 3), result.output
@@ -280,7 +280,7 @@ def test_batch_command_fits_reports_and_exports(folder: Path) -> None:
     assert "noise = 0.02" in output
     assert "fields = ['B']" in output
     assert f"{verdicts.count('determined')} determined" in output
-    table = flat(shadowinv("status", out, "--all").stdout)
+    table = flat(shadowinv("info", out, "--all").stdout)
     assert "verdict" in table
     assert "χ²" in table
 
@@ -318,12 +318,15 @@ def refused(folder: Path) -> Callable[..., None]:
 
 
 def test_fit_mistakes_give_one_sentence(refused: Callable[..., None]) -> None:
-    refused("low*.tif", "--fit", "--tolerance", 1e-3, names=("--tolerance", "[fit.options]"))
+    fitted = "--set=fit.fields=B"
+    both = (fitted, "--set=options.tolerance=1e-3")
+    refused("low*.tif", *both, names=("options.tolerance", "fit.options"))
+    refused("low*.tif", fitted, "--accuracy", 0.1, names=("--accuracy", "fit.options"))
     Path("shots.csv").write_text("file,psf\nlow0.tif,1\n")
-    refused("shots.csv", "--fit", names=("line 2 does not say which shot", "column 'shot'"))
+    refused("shots.csv", fitted, names=("line 2 does not say which shot", "column 'shot'"))
     Path("shots.csv").write_text("shot,file\n1,low0.tif\n1,high0.tif\n2,low1.tif\n")
     single = shadowinv("fit", "shots.csv")
     assert single.exit_code == 2
     assert "several shots, expected one object: fit them as a stack" in flat(single.stderr)
     Path("shots.csv").write_text("shot,file\n1,gone.tif\n")
-    refused("shots.csv", "--fit", names=("none of 1 shots can be read", "gone.tif"))
+    refused("shots.csv", fitted, names=("none of 1 shots can be read", "gone.tif"))

@@ -92,7 +92,7 @@ def test_frame_that_is_missing_fails_alone(any_night, run_file, out):
 def test_batch_and_info_take_arrays_of_hdf5(any_night, run_file, out, tmp_path):
     with h5py.File(run_file, "r+") as file:
         file["entry/reference"] = any_night.source
-    more = ("--source", f"{run_file}::/entry/reference", "--n-sites", 100, "--scheduler", "threads")
+    more = ("--source", f"{run_file}::/entry/reference", "--set=options.n_sites=100")
     result = shadowinv("batch", f"{run_file}::/entry/data/data", "--out", out, *more)
     assert result.exit_code == 0, result.output
     expected = any_night.run(out.with_name("expected.shadowinv.zarr"))

@@ -174,7 +174,8 @@ def test_arrays_of_matlab_files_and_a_free_boundary(night, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     for index, image in enumerate(night.images[:2]):
         savemat(f"shot_{index}.mat", {"shot": image, "dark": 0 * image, "beam": night.source})
-    flags = ["--n-sites", "100", "--boundary", "free", "--margin", "5", "--flux", "known"]
+    keys = ["options.n_sites=100", "options.margin=5", "options.flux=known"]
+    flags = ["--boundary", "free", *(f"--set={key}" for key in keys)]
     batch = ["batch", "shot_*.mat", "--scheduler", "threads", "--quiet", *flags]
     result = CliRunner().invoke(app, [*batch, "--variable", "shot", "--out", "n.shadowinv.zarr"])
     assert result.exit_code == 0, result.output
@@ -184,9 +185,11 @@ def test_arrays_of_matlab_files_and_a_free_boundary(night, tmp_path, monkeypatch
     np.testing.assert_allclose(
         read("n.shadowinv.zarr").potential[1], expected.potential, rtol=1e-6, atol=1e-6
     )
-    refused = CliRunner().invoke(app, [*batch[:5], "--margin", "5", "--out", "m.shadowinv.zarr"])
+    refused = CliRunner().invoke(
+        app, [*batch[:5], "--set=options.margin=5", "--out", "m.shadowinv.zarr"]
+    )
     assert refused.exit_code == 2
-    assert "--margin: it needs --boundary free" in " ".join(refused.output.split())
+    assert "options.margin: it needs --boundary free" in " ".join(refused.output.split())
 
 
 def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
@@ -199,8 +202,8 @@ def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
         '[options]\nn_sites = 100\n[source]\nmethod = "polynomial"\ndegree = 1\n'
     )
     flags = [
-        "--recipe", "recipe.toml", "--mask", "usable.png", "--source-mask", "bare.png",
-        "--low-pass", "0.8", "--hot-pixels", "6", "--bin", "2", "--quiet",
+        "--recipe", "recipe.toml", "--mask", "usable.png", "--set=source_mask=bare.png",
+        "--step=low-pass 0.8", "--step=hot-pixels 6", "--bin", "2", "--quiet",
     ]  # fmt: skip
     out = ["--out", "n.shadowinv.zarr", "--scheduler", "threads"]
     shot = str(night.path(1))
@@ -209,7 +212,7 @@ def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
         assert result.exit_code == 0, result.output
     stack, single = read("n.shadowinv.zarr"), read("one.shadowinv")
     np.testing.assert_array_equal(stack.potential[1], single.potential.astype(np.float32))
-    output = " ".join(CliRunner().invoke(app, ["status", "n.shadowinv.zarr"]).output.split())
+    output = " ".join(CliRunner().invoke(app, ["info", "n.shadowinv.zarr"]).output.split())
     assert 'estimated from each shot: {"method":"polynomial","degree":1}' in output
     assert "low-pass (smooth), width 0.8" in output
     refused = CliRunner().invoke(

@@ -30,7 +30,7 @@ def store(night, tmp_path) -> Path:
 
 
 def status(path: Path):
-    return CliRunner().invoke(app, ["status", str(path)])
+    return CliRunner().invoke(app, ["info", str(path)])
 
 
 def test_the_copy_of_an_arrays_metadata_is_enough(store):
@@ -67,7 +67,7 @@ def test_warnings_of_a_file_are_in_its_shots_report(night, tmp_path):
     np.savetxt(tmp_path / "input.txt", np.vstack([night.images[0]] * 2), header=header)
     arguments = [str(tmp_path / name) for name in ("film.tif", "input.txt")]
     out = str(tmp_path / "a.shadowinv.zarr")
-    chosen = ["--channel", "red", "--n-sites", "100", "--scheduler", "threads", "--out", out]
+    chosen = ["--channel", "red", "--set=options.n_sites=100", "--out", out]
     result = CliRunner().invoke(app, ["batch", *arguments, *chosen])
     assert result.exit_code == 0, result.output
     film, text = (StackStore(Path(out)).report(index)["warnings"] for index in (0, 1))
@@ -82,10 +82,10 @@ def test_status_shows_names_and_reasons_as_they_are(night, tmp_path, monkeypatch
         np.save(name, night.images[0])
     Path("bad\x1b[31m[oh].npy").write_bytes(b"junk")
     runner = CliRunner()
-    out = ["--n-sites", "100", "--scheduler", "threads", "--out", "a.shadowinv.zarr"]
+    out = ["--set=options.n_sites=100", "--scheduler", "threads", "--out", "a.shadowinv.zarr"]
     assert runner.invoke(app, ["batch", *names, "bad\x1b[31m[oh].npy", *out]).exit_code == 1
     for more in ([], ["--all"]):
-        result = runner.invoke(app, ["status", "a.shadowinv.zarr", *more], env={"COLUMNS": "300"})
+        result = runner.invoke(app, ["info", "a.shadowinv.zarr", *more], env={"COLUMNS": "300"})
         assert result.exit_code == 0, result.output
         assert r"bad\x1b[31m[oh].npy" in result.stdout
         assert "\x1b" not in result.stdout

@@ -48,7 +48,7 @@ def test_untouched_store_has_no_damage(store):
     opened = StackStore(store, every_byte=True)
     assert opened.damage.shots == {}
     assert opened.damage.files == ()
-    assert shadowinv("status", store, "--verify").exit_code == 0
+    assert shadowinv("info", store, "--verify").exit_code == 0
 
 
 @pytest.mark.parametrize("name", ["potential", "displacement", "caustic"])
@@ -108,7 +108,7 @@ def test_flipped_bit_in_a_field_is_refused_on_reading(store):
         with pytest.raises(FileFormatError, match=r"displacement/c/2 is damaged .*checksum"):
             again.displacement[1:, 0, ::2][1].load()
         assert np.isfinite(again.displacement[1::2]).all()
-    result = shadowinv("status", store, "--verify")
+    result = shadowinv("info", store, "--verify")
     assert result.exit_code == 1
     assert "shot_2.npy: its displacement is damaged" in flat(result.output)
 
@@ -137,7 +137,7 @@ def test_run_again_redoes_only_damaged_shots(any_night, store, finished):
     changed = [i for i in range(6) if field(store, i).stat().st_mtime_ns != stamps[i]]
     assert changed == [1, 3, 4, 5]
     assert content(store) == content(finished)
-    assert shadowinv("status", store, "--verify").exit_code == 0
+    assert shadowinv("info", store, "--verify").exit_code == 0
 
 
 def test_damaged_shot_is_pending_until_it_is_redone(any_night, store):
@@ -166,7 +166,7 @@ def test_done_shot_whose_file_turns_bad_loses_every_field(make_night, out):
         assert np.isnan(written[name][1]).all()
         assert np.isfinite(written[name][0]).all()
     assert not written.caustic[1].any()
-    assert shadowinv("status", out, "--verify").exit_code == 0
+    assert shadowinv("info", out, "--verify").exit_code == 0
 
 
 @pytest.mark.parametrize("way", ["reopened", "failed"])
@@ -203,6 +203,6 @@ def test_copy_by_another_program_may_leave_out_empty_chunks(finished, tmp_path):
     shots["caustic"] = shots["caustic"] & False
     shots.assign(status=("shot", np.full(6, DONE, np.int8))).to_zarr(path)
     np.testing.assert_array_equal(read(path).potential, read(finished).potential)
-    assert shadowinv("status", path, "--verify").exit_code == 0
+    assert shadowinv("info", path, "--verify").exit_code == 0
     flip(field(path, 2), 60)
     assert list(StackStore(path, every_byte=True).damage.shots) == [2]

@@ -136,7 +136,7 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
         assert provenance.image.file == f"film{k}.npy"
     assert provenance.image.source is not None
     assert provenance.image.source.file == "other.npy"
-    assert "source other.npy" in flat(shadowinv("status", out).stdout)
+    assert "source other.npy" in flat(shadowinv("info", out).stdout)
     first = StackStore(out).report(0)["provenance"]
     assert first["images"][0]["brightness"] == 1.25
     assert first["masks"][0]["file"] == "mask.npy"
@@ -301,11 +301,11 @@ def test_table_mistakes_give_one_sentence(name: str, pack: Path) -> None:
 
 
 def test_the_command_inverts_a_table(pack: Path, out: Path) -> None:
-    flags = ("--setup", "setup.toml", "--source", "beam.npy", "--tolerance", 1e-3)
+    flags = ("--setup", "setup.toml", "--source", "beam.npy", "--set=options.tolerance=1e-3")
     arguments = ("batch", "pack.csv", *flags, "--out", out, "--scheduler", "threads")
     assert shadowinv(*arguments, "--quiet").exit_code == 0
-    assert "energies 5, 14.7, 30 MeV" in flat(shadowinv("status", out).stdout)
-    listed = shadowinv("status", out, "--all").stdout.splitlines()
+    assert "energies 5, 14.7, 30 MeV" in flat(shadowinv("info", out).stdout)
+    listed = shadowinv("info", out, "--all").stdout.splitlines()
     assert [line.split()[2] for line in listed if "film" in line] == ["5", "14.7", "30"]
     assert shadowinv("export", out, "--format", "pradformat", "--out", "h5").exit_code == 0
     for index, energy in enumerate(ENERGIES):

@@ -199,8 +199,9 @@ def test_it_goes_on_with_its_store_and_does_nothing_twice(folder, out):
 def test_a_batch_goes_on_with_the_store_of_a_watch(folder, out, tmp_path):
     np.save(tmp_path / "reference.npy", SOURCE)
     put(folder, 3, 4)
-    flags = ["--source", tmp_path / "reference.npy", "--n-sites", 100, "--out", out]
-    watch = ["watch", folder, "--pattern", "*.npy", *flags, "--settle", SETTLE, "--idle", 0.2]
+    flags = ["--source", tmp_path / "reference.npy", "--set=options.n_sites=100", "--out", out]
+    settle = f"--set=run.settle={SETTLE}"
+    watch = ["watch", folder, "--pattern", "*.npy", *flags, settle, "--idle", 0.2]
     assert shadowinv(*watch).exit_code == 0
     put(folder, 1)
     assert shadowinv(*watch).exit_code == 0
@@ -281,7 +282,8 @@ def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkey
     (folder / "shot_2.npy").write_bytes(b"")
     command = [
         "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
-        "--n-sites", 100, "--out", out, "--idle", 0.2, "--settle", SETTLE, "--beam-rms", 0,
+        "--set=options.n_sites=100", "--out", out, "--idle", 0.2,
+        f"--set=run.settle={SETTLE}", "--set=instrument.beam_rms=0",
     ]  # fmt: skip
     result = shadowinv(*command)
     assert result.exit_code == 1
@@ -304,7 +306,8 @@ def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkey
 def test_it_is_said_once_that_the_folder_is_watched(folder, out):
     put(folder, 0, 1)
     result = shadowinv(
-        "watch", folder, "--pattern", "*.npy", "--out", out, "--max-shots", 2, "--settle", SETTLE
+        *("watch", folder, "--pattern", "*.npy", "--out", out),
+        *("--set=run.max_shots=2", f"--set=run.settle={SETTLE}"),
     )
     assert result.stdout.count("Watching") == 1
     assert "How many sites the first shots need" in result.stderr
@@ -326,7 +329,7 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
     monkeypatch.setattr(_batch._WatchPrinter, "update", update_and_interrupt)
     result = shadowinv(
         "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
-        "--n-sites", 100, "--out", out,
+        "--set=options.n_sites=100", "--out", out,
     )  # fmt: skip
     assert result.exit_code == code
     remainder = ", 2 not yet inverted" if files > 1 else ""
@@ -368,11 +371,11 @@ def test_shot_not_converged_ends_with_exit_code_3(folder, out, tmp_path, command
     np.save(folder / "shot_0.npy", 0.9 * SOURCE + 0.1 * IMAGES[1])  # one step is enough
     put(folder, 1)
     place = folder if command == "watch" else f"{folder}/*.npy"
-    more = ["--pattern", "*.npy", "--settle", SETTLE, "--idle", 0.2]
+    more = ["--pattern", "*.npy", f"--set=run.settle={SETTLE}", "--idle", 0.2]
     more = more if command == "watch" else ["--scheduler", "threads"]
     result = shadowinv(
-        command, place, "--source", tmp_path / "reference.npy", "--n-sites", 100,
-        "--max-iterations", 1, "--out", out, *more,
+        command, place, "--source", tmp_path / "reference.npy", "--set=options.n_sites=100",
+        "--set=options.max_iterations=1", "--out", out, *more,
     )  # fmt: skip
     assert list(read(out).converged.values) == [True, False]
     assert result.exit_code == 3, result.output

@@ -67,7 +67,7 @@ def test_latest_shot_is_next_and_the_others_are_skipped(folder, out):
     assert not StackStore(out, every_byte=True).damage.files
     assert not StackStore(out, every_byte=True).damage.shots
 
-    listed = flat(shadowinv("status", out).output)
+    listed = flat(shadowinv("info", out).output)
     assert "3 done, 0 failed, 0 pending, 2 skipped" in listed
     assert "shot_2.npy, shot_3.npy; a watch without --latest inverts them" in listed
 
@@ -134,8 +134,8 @@ def test_room_of_a_growing_store_is_not_seen_and_given_back(folder, out):
 def test_command_counts_skipped_shots_and_ends_well(folder, out):
     put(folder, 0, 1, 2)
     result = shadowinv(
-        "watch", folder, "--pattern", "*.npy", "--out", out, "--n-sites", 100,
-        "--latest", "--max-shots", 1, "--settle", SETTLE,
+        "watch", folder, "--pattern", "*.npy", "--out", out, "--set=options.n_sites=100",
+        "--latest", "--set=run.max_shots=1", f"--set=run.settle={SETTLE}",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "Stopped: 1 done, 0 failed, 2 skipped; repeat" in result.stdout

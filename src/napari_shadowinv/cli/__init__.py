@@ -22,7 +22,6 @@ from napari_shadowinv.cli import (
     _shot_commands,
     _stack_commands,
 )
-from napari_shadowinv.cli._flags import HELP_NAMES, HelpfulCommand, HelpfulGroup
 from napari_shadowinv.cli._terminal import EXIT_MISTAKE, notify_errors
 from napari_shadowinv.errors import InputError
 
@@ -32,8 +31,7 @@ app = typer.Typer(
     name="shadowinv",
     help="Retrieve deflection potentials and fields from shadowgrams and proton radiographs.",
     invoke_without_command=True,
-    context_settings={"help_option_names": list(HELP_NAMES)},
-    cls=HelpfulGroup,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
 )
@@ -52,7 +50,7 @@ def _check_environment() -> None:
     if threads.strip().lstrip("-").isdecimal() and int(threads) < 1:
         raise InputError(
             f"the environment variable NUMBA_NUM_THREADS is {threads}: expected 1 or more; unset "
-            "it, or use --threads"
+            "it, or use --set options.threads=1"
         )
     # Figures go to files; an unknown backend would break the import of matplotlib.
     os.environ.pop("MPLBACKEND", None)
@@ -79,17 +77,16 @@ def main(
             stream.reconfigure(errors="replace")
 
 
-app.command(cls=HelpfulCommand, epilog=_shot_commands.INVERT_EPILOG)(_shot_commands.invert)
-app.command(cls=HelpfulCommand)(_shot_commands.rerun)
-app.command(cls=HelpfulCommand, epilog=_fit_command.EPILOG)(_fit_command.fit)
-app.command(cls=HelpfulCommand, epilog=_film_command.EPILOG)(_film_command.film)
-app.command(cls=HelpfulCommand, epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
-app.command(cls=_analyse_command.AnalyseCommand)(_analyse_command.analyse)
-app.command(cls=HelpfulCommand, epilog=_plan_command.EPILOG)(_plan_command.plan)
-app.command(cls=HelpfulCommand)(_shot_commands.info)
-app.command(cls=HelpfulCommand)(_shot_commands.demo)
-app.command(cls=HelpfulCommand, epilog=_stack_commands.BATCH_EPILOG)(_stack_commands.batch)
-app.command(cls=HelpfulCommand, epilog=_stack_commands.WATCH_EPILOG)(_stack_commands.watch)
-app.command(cls=HelpfulCommand)(_stack_commands.status)
-app.command(cls=HelpfulCommand)(_stack_commands.export)
-app.command(cls=HelpfulCommand)(_stack_commands.movie)
+app.command(epilog=_shot_commands.INVERT_EPILOG)(_shot_commands.invert)
+app.command()(_shot_commands.rerun)
+app.command(epilog=_fit_command.EPILOG)(_fit_command.fit)
+app.command(epilog=_film_command.EPILOG)(_film_command.film)
+app.command(epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
+app.command(epilog=_analyse_command.EPILOG)(_analyse_command.analyse)
+app.command(epilog=_plan_command.EPILOG)(_plan_command.plan)
+app.command()(_shot_commands.info)
+app.command()(_shot_commands.demo)
+app.command(epilog=_stack_commands.BATCH_EPILOG)(_stack_commands.batch)
+app.command(epilog=_stack_commands.WATCH_EPILOG)(_stack_commands.watch)
+app.command()(_stack_commands.export)
+app.command()(_stack_commands.movie)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
 from napari_shadowinv.cli import _flags, _inputs
-from napari_shadowinv.cli._flags import HelpfulCommand
 from napari_shadowinv.cli._summary import Rows, fact_rows, two_columns, written_rows
 from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
@@ -19,57 +19,44 @@ if TYPE_CHECKING:
     from napari_shadowinv.analysis import Product, ProductResult
 
 HELP = {
-    "result": "Result of an inversion or a fit, .shadowinv; pradformat, .h5; or a store of shots, "
-    ".shadowinv.zarr, whose numbers are followed from shot to shot.",
-    "products": "Products, each in quotes: its name, points y,x in px, and name=value.",
-    "file": "TOML file with a table [[products]] for each product.",
-    "unit": "Unit of the field: T m, T mm, MG µm, kG cm, G cm, V, m⁻², m, rad or px. It chooses "
-    "the field, too. Default: SI.",
-    "deflector": "Field of a fit with several: B, E, plasma or phase. Default: all.",
+    "result": "Result, pradformat file, or store of shots.",
+    "products": "Products in quotes: name, points y,x in px, name=value.",
+    "file": "TOML file with a table 'products' for each.",
+    "unit": "T m, MG µm, kG cm, V, m⁻², rad, px … Default: SI.",
+    "deflector": "Field of a fit: B, E, plasma or phase.",
     "samples": "Samples of the field for the bands.",
-    "shots": "Shots of a store, such as 3:20. Default: all finished ones.",
-    "times": "Time between two shots of the store in s, or a list for the shots used, such as "
-    "0,1e-9,3e-9. Default: shots are numbered.",
+    "times": "Seconds between shots, or a list for each.",
     "figure": "Figure of the products: .png, .pdf or .svg.",
-    "out": "Copy of the result with the products, .shadowinv.",
+    "out": "Copy of the result with the products.",
 }
-_EPILOG = r"""
-[bold]Examples[/bold]
-shadowinv analyse a.shadowinv "profile 99,20 99,180 width=5" --unit "MG um"
-shadowinv analyse a.shadowinv "current center=99,99 radius=40" --csv a.csv
-shadowinv analyse a.shadowinv current-density contrast --figure map.png
-shadowinv analyse night.shadowinv.zarr "region center=99,99 radius=40" --times 1e-9
+EPILOG = """
+shadowinv analyse a.shadowinv 'profile 99,20 99,180 width=5' --unit 'MG um'
 
-[bold]Products[/bold]
-{products}
+shadowinv analyse night.shadowinv.zarr 'region center=99,99 radius=40' --times 1e-9
 
-[bold]Exit codes[/bold]
-0 written; 2 invalid input, nothing written; 130 cancelled.
+Without a product the command lists them. Exit codes: 0 written; 2 invalid input; 130 cancelled.
 """
 
 
-class AnalyseCommand(HelpfulCommand):
-    """Command whose help lists all products, which are imported only then."""
+@dataclass(frozen=True, kw_only=True)
+class ProductFlags:
+    """Flags of the products and of their bands."""
 
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        from napari_shadowinv.analysis.kinds import PRODUCTS, product_syntax
-
-        lines = [product_syntax(kind).replace("[", r"\[") for kind in PRODUCTS.values()]
-        self.epilog = _EPILOG.format(products="\n".join(lines))
-        super().format_help(ctx, formatter)
+    products: Annotated[Path | None, Option(help=HELP["file"])] = None
+    unit: Annotated[str | None, Option(help=HELP["unit"])] = None
+    deflector: Annotated[str | None, Option(help=HELP["deflector"])] = None
+    samples: Annotated[int, Option(help=HELP["samples"], metavar="N")] = 100
+    setup: _flags.SetupFile = None
+    shots: _flags.ChosenShots = None
+    times: Annotated[str | None, Option(help=HELP["times"])] = None
 
 
 @notify_errors
+@_flags.takes_flags
 def analyse(
     result: Annotated[Path, _flags.argument(help=HELP["result"])],
+    flags: ProductFlags,
     product: Annotated[list[str] | None, _flags.argument(help=HELP["products"])] = None,
-    products: Annotated[Path | None, Option(help=HELP["file"])] = None,
-    unit: Annotated[str | None, Option(help=HELP["unit"])] = None,
-    deflector: Annotated[str | None, Option(help=HELP["deflector"])] = None,
-    samples: Annotated[int, Option(help=HELP["samples"], metavar="N")] = 100,
-    setup: _flags.SetupFile = None,
-    shots: Annotated[str | None, Option(help=HELP["shots"])] = None,
-    times: Annotated[str | None, Option(help=HELP["times"])] = None,
     csv: Annotated[Path | None, Option(help="Table of all numbers with their bands.")] = None,
     figure: Annotated[Path | None, Option(help=HELP["figure"])] = None,
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,
@@ -88,34 +75,34 @@ def analyse(
     from napari_shadowinv.io.store_shots import open_shots
     from napari_shadowinv.pipeline.files import setup_from
 
-    chosen = _products(product or [], products)
+    chosen = _products(product or [], flags.products)
     files = (csv, SITES.suffixes), (figure, FIGURE_SUFFIXES), (out, RESULT.suffixes)
     outputs = _inputs.check_outputs(files, overwrite)
-    _inputs.protect(outputs, [result, setup, products])
+    _inputs.protect(outputs, [result, flags.setup, flags.products])
     if is_stack(result):
         if out is not None:
             raise InputError(
                 f"received --out {out}, which copies one result with its products, but a store has "
                 "many results: use --csv"
             )
-        dataset = open_shots(result, shots)
-    elif shots is not None or times is not None:
+        dataset = open_shots(result, flags.shots)
+    elif flags.shots is not None or flags.times is not None:
         raise InputError(f"{result} is one result: --shots and --times belong to a store of shots")
     else:
         dataset = read_dataset(result)
     with work_callbacks(quiet) as callbacks:
         common: dict[str, Any] = {
-            "unit": unit,
-            "deflector": deflector,
-            "setup": None if setup is None else setup_from(setup),
+            "unit": flags.unit,
+            "deflector": flags.deflector,
+            "setup": None if flags.setup is None else setup_from(flags.setup),
             **callbacks,
         }
         if "shot" in dataset.dims:
-            seconds = _times(times, dataset["index"].values.tolist())
+            seconds = _times(flags.times, dataset["index"].values.tolist())
             series = analyse_shots(dataset, chosen, seconds, **common)
             results = [each.result for each in series]
         else:
-            results = measure(dataset, chosen, samples=samples, **common)
+            results = measure(dataset, chosen, samples=flags.samples, **common)
     with ExitStack() as stack:  # both files, or none
         if csv is not None:
             temporary = stack.enter_context(replacing(csv, overwrite))
@@ -149,6 +136,7 @@ def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:
 
 def _products(texts: list[str], file: Path | None) -> list[Product]:
     from napari_shadowinv.analysis import PRODUCTS, product_from_dict, product_from_text
+    from napari_shadowinv.analysis.kinds import product_syntax
     from napari_shadowinv.io import read_toml
 
     entries: Any = [] if file is None else read_toml(file).get("products", [])
@@ -159,7 +147,8 @@ def _products(texts: list[str], file: Path | None) -> list[Product]:
         product_from_dict(entry, f"{file}, product {n}") for n, entry in enumerate(entries, 1)
     ]
     if not listed:
-        raise InputError(f"received no product, expected at least one: {', '.join(PRODUCTS)}")
+        syntax = "; ".join(map(product_syntax, PRODUCTS.values()))
+        raise InputError(f"received no product, expected at least one: {syntax}")
     return listed
 
 

@@ -2,7 +2,7 @@
 
 - progress and summary of `shadowinv batch`: `run_batch`
 - a line for each shot of `shadowinv watch`, and a summary: `run_watch`
-- the tables of `shadowinv status`: `status_tables`
+- the tables of `shadowinv info`: `status_tables`
 """
 
 from __future__ import annotations
@@ -265,7 +265,7 @@ def _trouble_rows(store: StackStore) -> Rows:
         ]
         if len(indices) > _MAX_LISTED:
             hidden = len(indices) - _MAX_LISTED
-            rows.append((label, f"and {hidden} more: shadowinv status {store.path} --all"))
+            rows.append((label, f"and {hidden} more: shadowinv info {store.path} --all"))
     skipped = [store.names[index] for index in np.flatnonzero(statuses == SKIPPED)]
     if skipped:
         rows.append(("skipped", f"{_list_text(skipped)}; a watch without --latest inverts them"))

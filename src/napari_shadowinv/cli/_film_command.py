@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -30,39 +31,30 @@ HELP = {
     "new": "Folder of scans: only write a pack.toml for them, to be completed.",
     "out": "Result file. Default: the pack's name with .shadowinv, in the current folder.",
 }
-EPILOG = r"""
-[bold]Examples[/bold]
+EPILOG = """
 shadowinv film --new scans
+
 shadowinv film scans/pack.toml --layers layers
-shadowinv fit layers/layers.csv --brightness free --source unknown
 
-[bold]pack.toml[/bold] (paths are relative to this file)
-seen_from = "source"                          # or detector: sets the sign of B
-scan = "scan.tif"                             # all films on one scan; or a file for each layer
-\[setup]                                       # distances, if known
-source_object_distance = 0.01
-object_image_distance = 0.1
-\[films.HDV2]
-calibration = "HDV2.csv"
-unexposed = "unexposed.tif"
-\[\[layers]]
-film = "HDV2"
-filters = \["13 um Al", "25 um Fe"]
-file = "film_01.tif"
-Known films: EBT3, HDV2, MDV3; materials: Al, Au, Cu, Fe, Kapton, Mylar, Ta, Ti and others.
-
-[bold]Exit codes[/bold]
-0 written; 2 invalid input, nothing written; 130 cancelled.
+Exit codes: 0 written; 2 invalid input, nothing written; 130 cancelled.
 """
 
 
-@notify_errors
-def film(
-    pack: Annotated[Path | None, _flags.argument(help=HELP["pack"])] = None,
-    layers: Annotated[Path | None, Option(help=HELP["layers"])] = None,
+@dataclass(frozen=True, kw_only=True)
+class LayerFlags:
+    """Flags of the layers' images."""
+
+    layers: Annotated[Path | None, Option(help=HELP["layers"])] = None
     layers_format: Annotated[
         LayersFormat, Option(metavar="tiff|pradformat", help="Format of the layers' images.")
-    ] = "tiff",
+    ] = "tiff"
+
+
+@notify_errors
+@_flags.takes_flags
+def film(
+    flags: LayerFlags,
+    pack: Annotated[Path | None, _flags.argument(help=HELP["pack"])] = None,
     corners: Annotated[Path | None, Option("--save-corners", help=HELP["corners"])] = None,
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
@@ -105,6 +97,7 @@ def film(
     result, figure = _inputs.result_and_figure(pack, out, figure)
     files = _inputs.result_outputs(ResultKind.FILM_DOSES, result, figure)
     files.append((corners, SITES.suffixes))
+    layers = flags.layers
     if layers is not None and (table := layers / LAYERS_TABLE).exists():
         files.append((table, SITES.suffixes))
     outputs = _inputs.check_outputs(files, overwrite)
@@ -115,7 +108,9 @@ def film(
     written = [result, figure]
     failed = _inputs.write_result(doses, [str(pack)], result, figure, overwrite)
     if layers is not None:
-        written.append(write_layers(doses, layers, form=layers_format, overwrite=overwrite)[-1])
+        written.append(
+            write_layers(doses, layers, form=flags.layers_format, overwrite=overwrite)[-1]
+        )
     if corners is not None:
         corners_by_film = {
             str(number): places

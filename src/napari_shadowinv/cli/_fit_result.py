@@ -34,8 +34,8 @@ def compare_fields(
     if written is not None and names not in map(set, compared):
         choices = "; ".join(",".join(choice) for choice in compared)
         raise InputError(
-            f"received --fields {written} and --compare, which compares {choices}: write one of "
-            "these, or leave out --fields to write the likeliest"
+            f"received fit.fields={written} and --compare, which compares {choices}: write one of "
+            "these, or leave out fit.fields to write the likeliest"
         )
     with work_callbacks(quiet) as callbacks:
         fits = run_comparison(recipe, shots, **callbacks)

@@ -40,16 +40,12 @@ def file_table(path: Path, variable: str | None = None) -> Table:
 
 
 def _rows(path: Path, variable: str | None) -> _summary.Rows:
-    from napari_shadowinv.cli._batch import store_rows
-    from napari_shadowinv.io import is_stack, read
+    from napari_shadowinv.io import read
     from napari_shadowinv.io.field_grids import describe_field_grid, is_field_grid
     from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.frames import find_frames
     from napari_shadowinv.io.hdf5_arrays import read_hdf5
-    from napari_shadowinv.io.store import StackStore
 
-    if is_stack(path):
-        return store_rows(StackStore(path))
     if variable is None and is_field_grid(path):
         return [*describe_field_grid(path)]
     frames = find_frames(path, variable)

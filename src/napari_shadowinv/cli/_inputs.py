@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv._system.safety import resolved_path
-from napari_shadowinv.cli._flags import fit_recipe_of, recipe_of
+from napari_shadowinv.cli._flags import FitFlags, InversionFlags, ShotFlags
+from napari_shadowinv.cli._settings import FILE_KEYS, Settings, source_from, with_steps
 from napari_shadowinv.cli._terminal import is_interrupted, say_on_stderr
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
-from napari_shadowinv.options import FitChoices, InversionOptions
+from napari_shadowinv.options import FitChoices
 from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 from napari_shadowinv.shot import Shot
 
@@ -152,73 +153,59 @@ def write_figures(figures: Mapping[Path, Callable[[], Figure]], overwrite: bool)
     return failed
 
 
-def recipe_from(
-    flags: Mapping[str, Any],
-    recipe: Path | None,
-    options: Path | None,
-    *,
-    clip_negative: bool,
-    source: Path | None = None,
-    source_variable: str | None = None,
-    mask: Path | None = None,
-    source_mask: Path | None = None,
-) -> Recipe:
-    """Read a recipe, and override it with an options file and flags."""
+def recipe_from(flags: InversionFlags, settings: Settings) -> Recipe:
+    """Read a recipe, and override it with flags and settings."""
+    recipe = _with_settings(flags, settings, {"dark": flags.dark, "bin": flags.bin})
+    options = settings.change("options", recipe.options)
+    if "options.margin" in settings.values and options.boundary != "free":
+        raise InputError("received options.margin: it needs --boundary free")
+    recipe = recipe.model_copy(update={"options": options})
+    if flags.source is not None and flags.source_from is not None:
+        raise InputError(
+            f"received --source and --source-from {flags.source_from}: choose one of them"
+        )
+    if flags.source is not None:
+        return recipe.model_copy(update={"source": MeasuredSource(file=flags.source)})
+    if flags.source_from is not None:
+        estimate = source_from(flags.source_from, recipe.estimate)
+        return recipe.model_copy(update={"source": estimate})
+    return recipe
+
+
+def fit_recipe_from(flags: FitFlags, settings: Settings) -> Recipe:
+    """Read the recipe of a fit, and override it with flags and settings."""
+    recipe = _with_settings(flags, settings, {"bin": flags.bin})
+    changes: dict[str, Any] = {"fit": settings.change("fit", recipe.fit or FitChoices())}
+    if flags.source is not None:
+        is_known = flags.source != "unknown"
+        changes["source"] = MeasuredSource(file=Path(flags.source)) if is_known else None
+    return recipe.model_copy(update=changes)
+
+
+def shots_recipe_from(flags: InversionFlags, settings: Settings) -> Recipe:
+    """Return the recipe for shots to be inverted, or fitted if it has choices of a fit."""
+    recipe = recipe_from(flags, settings)
+    if recipe.fit is None and not any(key.startswith("fit.") for key in settings.values):
+        return recipe
+    if refused := [key for key in settings.values if key.startswith("options.")]:
+        raise InputError(
+            f"received {settings.flags.get(refused[0], refused[0])}, an option of inversions, for "
+            "a fit: set its own options, such as fit.options.samples"
+        )
+    choices = settings.change("fit", recipe.fit or FitChoices())
+    return recipe.model_copy(update={"fit": choices})
+
+
+def _with_settings(flags: ShotFlags, settings: Settings, steps: Mapping[str, Any]) -> Recipe:
+    """Read a recipe, and override its files, steps and instrument."""
     from napari_shadowinv.pipeline import read_recipe
 
-    if clip_negative:
-        flags = {"negative": "clip", **flags}
-    files = {"mask": mask, "source_mask": source_mask}
-    base = Recipe() if recipe is None else read_recipe(recipe)
-    chosen = recipe_of(flags, base, options)
-    chosen = chosen.model_copy(update={name: file for name, file in files.items() if file})
-    if source is None and source_variable is None:
-        return chosen
-    if "source_from" in flags:
-        raise InputError(
-            f"received --source and --source-from {flags['source_from']}: choose one of them"
-        )
-    measured = MeasuredSource(file=source, variable=source_variable)
-    return chosen.model_copy(update={"source": measured})
-
-
-def fit_recipe_from(
-    flags: Mapping[str, Any],
-    recipe: Path | None,
-    options: Path | None,
-    *,
-    source: str | None,
-    brightness: str | None,
-    mask: Path | None,
-) -> Recipe:
-    """Read the recipe of a fit, and override it with an options file and flags."""
-    from napari_shadowinv.pipeline import read_recipe
-
-    base = Recipe() if recipe is None else read_recipe(recipe)
-    choices = {} if brightness is None else {"brightness": brightness}
-    changes: dict[str, Any] = {} if mask is None else {"mask": mask}
-    if source is not None:
-        is_unknown = source == "unknown"
-        choices["beam"] = "unknown" if is_unknown else "known"
-        changes["source"] = None if is_unknown else MeasuredSource(file=Path(source))
-    return fit_recipe_of({**flags, **choices}, base, options).model_copy(update=changes)
-
-
-def fit_recipe(
-    recipe: Recipe, flags: Mapping[str, Any], options: Path | None, *, clip_negative: bool
-) -> Recipe:
-    """Return the recipe for shots to be fitted; refuse flags of an inversion."""
-    refused = [
-        f"--{name.replace('_', '-')}" for name in InversionOptions.model_fields if name in flags
-    ]
-    refused += ["--options"] if options is not None else []
-    refused += ["--clip-negative"] if clip_negative else []
-    if refused:
-        raise InputError(
-            f"received {refused[0]}, an option of inversions, for a fit: set the options of the "
-            "fit in the recipe's section [fit.options]"
-        )
-    return recipe.model_copy(update={"fit": recipe.fit or FitChoices()})
+    recipe = Recipe() if flags.recipe is None else read_recipe(flags.recipe)
+    files = {name: settings.values[name] for name in FILE_KEYS if name in settings.values}
+    changes: dict[str, Any] = {name: Path(file) if file else None for name, file in files.items()}
+    changes["steps"] = with_steps(recipe.steps, flags.steps or (), steps)
+    changes["instrument"] = settings.change("instrument", recipe.instrument)
+    return recipe.model_copy(update=changes)
 
 
 def setup_for(path: Path | None, shot: Shot, recipe: Recipe) -> Setup | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -10,6 +11,7 @@ from typer import Exit, Option
 
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli._settings import Sections, Settings, settings_of
 from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
     notify_errors,
@@ -28,75 +30,54 @@ if TYPE_CHECKING:
 
 # Help of arguments, where it is longer than a line.
 HELP = {
-    "object": "A phantom with its parameters, such as toroid:peak=60,radius=3e-5, or the file of "
-    "an earlier result, of a displacement (.npy), or of E and B on a 3-D grid (openPMD or NetCDF), "
-    "through which particles are traced.",
-    "energies": "Energy of each image in MeV (of light: wavelength in m), separated by commas. "
-    "Default: one image with the energy of --setup.",
-    "size": "Height and width of an image in px, such as 200x200. Default: of the file, or "
-    "200x200.",
-    "recorded_with": "TOML file with the setup of the object's file, if the file does not have it.",
-    "sweep": "A quantity and its values, such as counts=100,300,1000 or energy=5,10,20 (of the "
-    "last image): a curve of the error.",
-    "out": "Table (.csv) with a row for each draw, or for each value of --sweep. Default: "
-    "plan.csv.",
-    "figure": "Figure file: .png, .pdf or .svg. Default: a PNG next to the table.",
+    "object": "A phantom such as toroid:peak=60,radius=3e-5, a result, a displacement (.npy), or "
+    "E and B on a 3-D grid.",
+    "energies": "MeV of each image, or wavelength in m.",
+    "size": "Height and width, such as 200x200.",
+    "recorded_with": "TOML file of the object's setup.",
+    "deflector": "Cause of the object's deflection.",
+    "counts": "Mean counts a pixel. Default: 1000.",
+    "sweep": "A curve, such as counts=100,300,1000.",
+    "out": "Table (.csv) of draws or sweep.",
 }
-_OF_FILE = "Object of a file"
-EPILOG = r"""
-[bold]Examples[/bold]
-shadowinv plan toroid --setup setup.toml --detector film --beam-source TNSA
-shadowinv plan toroid:peak=60 --setup setup.toml --energies 5,15
+SECTIONS: Sections = {"plan": ExperimentOptions, "instrument": Instrument, "view": GridView}
+EPILOG = """
+shadowinv plan toroid:peak=60 --setup setup.toml --energies 5,15 --instrument film,TNSA
+
 shadowinv plan shot.shadowinv --setup next.toml --sweep counts=100,300,1000
-shadowinv plan fields.h5 --setup setup.toml --beam x --right y --centre
-shadowinv plan toroid --setup setup.toml --energies 5,15 --sweep energy=7,10,15,30
-shadowinv plan toroid --setup setup.toml --reference recorded --sweep beam_rms=0.01,0.03,0.1
 
-[bold]Phantoms[/bold]
-toroid, four_toroids, coaxial, wakefield, blob; parameters as in the window Forward model.
+Phantoms: toroid, four_toroids, coaxial, wakefield, blob.
 
-[bold]Quantities of --sweep[/bold]
-counts, energy or wavelength (of the last image), source_object_distance, object_image_distance,
-psf, source_size, resolution, reference_counts, beam_structure, and numbers of the instrument:
-beam_rms, beam_length, beam_between, energy_error, background, gamma, blur, absorption,
-registration, other_field.
-
-[bold]Exit codes[/bold]
-0 the field would be determined; 2 invalid input, nothing written;
-3 table written, but the field would not be determined reliably; 130 cancelled.
+Exit codes: 0 determined; 2 invalid input; 3 not determined; 130 cancelled.
 """
 
 
+@dataclass(frozen=True, kw_only=True)
+class PlanFlags:
+    """Flags of the object and of the experiment."""
+
+    setup: _flags.SetupFile = None
+    energies: Annotated[str | None, Option(metavar="X,X,…", help=HELP["energies"])] = None
+    instrument: _flags.InstrumentNames = None
+    counts: Annotated[float | None, Option(help=HELP["counts"])] = None
+    size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None
+    recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None
+    deflector: Annotated[str | None, Option(metavar="CAUSE", help=HELP["deflector"])] = None
+    sweep: Annotated[str | None, Option(metavar="NAME=VALUES", help=HELP["sweep"])] = None
+
+
 @notify_errors
-@_flags.takes_plan
+@_flags.takes_flags
 def plan(
     object: Annotated[str, _flags.argument(help=HELP["object"])],
-    setup: _flags.SetupFile = None,
-    energies: Annotated[
-        str | None, Option(metavar="NUMBER,NUMBER,…", help=HELP["energies"])
-    ] = None,
-    size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None,
-    recorded_with: Annotated[
-        Path | None, Option(help=HELP["recorded_with"], rich_help_panel=_OF_FILE)
-    ] = None,
-    deflector: Annotated[
-        str | None,
-        Option(metavar="WHAT", help="Cause of the deflection.", rich_help_panel=_OF_FILE),
-    ] = None,
-    sweep: Annotated[str | None, Option(metavar="NAME=VALUES", help=HELP["sweep"])] = None,
+    flags: PlanFlags,
+    settings: Annotated[list[str] | None, _flags.setting(SECTIONS, "plan.draws=5")] = None,
     out: Annotated[Path, Option(help=HELP["out"])] = Path("plan.csv"),
-    figure: Annotated[Path | None, Option(help=HELP["figure"])] = None,
+    figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
-    *,
-    flags: dict[str, Any],
 ) -> None:
-    """Simulate shots of an experiment, and report whether the field would be determined.
-
-    Each shot has imperfections drawn from the stated instrument. One image is inverted, several
-    are fitted. The report has the error made, the error reported, what limits it, and what a
-    change buys.
-    """
+    """Simulate shots of an experiment, and report whether the field would be determined."""
     from napari_shadowinv.cli._summary import fact_rows, headline_row, two_columns, written_rows
     from napari_shadowinv.io.files import replacing
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES
@@ -108,22 +89,24 @@ def plan(
 
     page = figure or _inputs.figure_beside(out)
     _inputs.check_outputs([(out, SITES.suffixes), (page, FIGURE_SUFFIXES)], overwrite)
-    _inputs.protect([out, page], [setup, recorded_with, _file_of(object)])
-    view = {name: flags.pop(name) for name in GridView.model_fields if name in flags}
-    options = _flags.choices_of(ExperimentOptions, flags)
-    instrument = _flags.choices_of(Instrument, flags)
-    setups = _setups(None if setup is None else setup_from(setup), energies)
-    shape = None if size is None else shape_of_text(size, "--size")
-    target: Any = _object(object, recorded_with, deflector, setups, view)
+    _inputs.protect([out, page], [flags.setup, flags.recorded_with, _file_of(object)])
+    keys = _flags.instrument_keys(flags.instrument) | {"plan.counts": ("--counts", flags.counts)}
+    stated = settings_of(settings or (), SECTIONS, keys)
+    options = stated.change("plan", ExperimentOptions())
+    instrument = stated.change("instrument", Instrument())
+    setup = None if flags.setup is None else setup_from(flags.setup)
+    setups = _setups(setup, flags.energies)
+    shape = None if flags.size is None else shape_of_text(flags.size, "--size")
+    target: Any = _object(object, flags, setups, stated)
     choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
     warn_of_setups((each, shape) for each in setups or ())
     result: Any
     with work_callbacks(quiet) as callbacks:
         choices |= callbacks
-        if sweep is None:
+        if flags.sweep is None:
             result = plan_experiment(target, setups, **choices)
         else:
-            quantity, values = _sweep(sweep)
+            quantity, values = _sweep(flags.sweep)
             result = sweep_experiment(target, setups, quantity=quantity, values=values, **choices)
     is_sweep = isinstance(result, ExperimentSweep)
     with replacing(out, overwrite) as temporary:
@@ -146,21 +129,19 @@ def _file_of(text: str) -> Path | None:
 
 
 def _object(
-    text: str,
-    recorded_with: Path | None,
-    deflector: str | None,
-    setups: list[Setup] | None,
-    view: dict[str, Any],
+    text: str, flags: PlanFlags, setups: list[Setup] | None, settings: Settings
 ) -> PlannedObject | Any:
     """Return the phantom of a text, or the object of a file."""
     from napari_shadowinv.io import is_field_grid
     from napari_shadowinv.pipeline.experiment_object import object_of_displacement, phantom_of_text
     from napari_shadowinv.pipeline.traced_file import object_of_file
 
+    recorded_with, deflector = flags.recorded_with, flags.deflector
     is_file = _file_of(text.partition(":")[0]) is not None
     is_grid = is_file and is_field_grid(Path(text))
+    view = [key for key in settings.values if key.startswith("view.")]
     if view and not is_grid:
-        names = ", ".join(f"--{name}" for name in view)
+        names = ", ".join(view)
         raise InputError(f"received {names}, but {text} is no 3-D field: leave them out")
     if is_grid:
         if recorded_with is not None or deflector is not None:
@@ -170,7 +151,7 @@ def _object(
             )
         if setups is None:
             raise InputError(f"{text} is a 3-D field: particles through it need --setup")
-        return object_of_file(Path(text), setups[0], GridView(**view))
+        return object_of_file(Path(text), setups[0], settings.change("view", GridView()))
     if not is_file:
         if recorded_with is not None or deflector is not None:
             flag = "--deflector" if recorded_with is None else "--recorded-with"

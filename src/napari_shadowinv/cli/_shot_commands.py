@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-from typer import Option, echo
+from typer import Exit, Option, echo
 
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli._settings import (
+    FILE_KEYS,
+    INVERSION_SECTIONS,
+    Sections,
+    Settings,
+    settings_of,
+)
 from napari_shadowinv.cli._summary import (
     fact_rows,
     headline_row,
@@ -33,8 +38,8 @@ from napari_shadowinv.cli._terminal import (
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind, percent
 from napari_shadowinv.io.formats import IMAGE_WRITERS, NETCDF_SUFFIX, PNG, RESULT, TIFF, kind_of
-from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
+from napari_shadowinv.physics.trace_options import SizedView, TraceOptions
 from napari_shadowinv.preprocessing import MeasuredSource
 from napari_shadowinv.shot import Shot
 
@@ -47,124 +52,71 @@ if TYPE_CHECKING:
 
 # Help of arguments, where it is longer than a line.
 HELP = {
-    "source_variable": "Name of the array with the undisturbed beam, in the --source file or "
-    "otherwise in the image file.",
-    "out": "Result file: .shadowinv (complete), .h5 (pradformat) or .csv (sites). Default: the "
-    "image's name with .shadowinv, in the current folder.",
+    "out": "Result: .shadowinv, .h5 or .csv.",
     "image": "The image, if it has moved or changed; for a fit, all images in their order. "
     "Default: the files named in the result, in its folder or the current one.",
     "rerun_out": "Result file. Default: the result's name with _again, in the current folder.",
     "other_folders": "Also read the files in other folders that the result names.",
-    "field": ".shadowinv or pradformat result, or NPY, MATLAB or HDF5 (with --variable) "
-    "containing a displacement (2, H, W) in px or a potential (H, W) in px²; or a 3-D field of a "
-    "simulation (openPMD, NetCDF).",
-    "truth": "NetCDF file for line integrals, displacement and deflection of a traced 3-D field.",
-    "seed": "Seed of the particles of a traced 3-D field, for --output counts.",
-    "setup": "TOML file with the setup of the prediction, for example with another energy. "
-    "Default: the field's own setup.",
-    "recorded_with": "TOML file with the setup of the measurement, if the field's file does not "
-    "contain it.",
-    "deflector": "Cause of the deflection, if --setup differs from the field's setup: "
-    "magnetic-field, electric-field, plasma or refractive-index.",
-    "dispersion": "For a refractive index: ratio of ln η at the new wavelength to ln η at the old "
-    "one.",
+    "field": "Result, displacement (2, H, W) in px, potential (H, W) in px², or 3-D field "
+    "(openPMD, NetCDF).",
+    "truth": "NetCDF file of line integrals.",
+    "seed": "Seed of the particles of a 3-D field.",
+    "setup": "TOML file of the prediction's geometry.",
+    "recorded_with": "TOML file of the measurement's.",
+    "deflector": "Cause of the deflection.",
+    "dispersion": "New ln η / old ln η of an index.",
     "system": "Print the versions and the system instead, for a bug report.",
     "noise": "Standard deviation of the noise, as a fraction of the mean.",
-    "n_sites": InversionOptions.model_fields["n_sites"].description,
-    "predicted_image": "Image file: .tif (float32), .npy or .png (16 bits, scaled to its maximum). "
-    "Default: the field's name with _image.tif, in the current folder.",
+    "predicted_image": "Image: .tif, .npy or .png.",
+    "all": "List each shot of a store.",
+    "verify": "Compare all files of a store with their checksums; exit code 1 if one is damaged.",
 }
-INVERT_EPILOG = r"""
-[bold]Examples[/bold]
-shadowinv invert shot.tif
+_DEMO_PEAK = 97.0  # MG·µm; caustics form from about 185
+INVERT_EPILOG = """
 shadowinv invert shot.tif --source reference.tif --setup setup.toml --bin 4
-shadowinv invert dose.npy --mask usable.png --clip-negative --out film.h5
-shadowinv invert shots.mat --variable shot3 --source-variable beam
-shadowinv invert shot.tif --hot-pixels 6 --source-from polynomial --source-degree 2
 
-[bold]setup.toml[/bold]
-kind = "proton"                  # any charged particle; or "optical"
-species = "proton"               # or "electron", "deuteron", "alpha", …
-energy = 14.7                    # MeV; or with a unit: "700 keV"; for light: wavelength
-source_object_distance = 0.01    # m; inf for a collimated beam
-object_image_distance = 0.28     # m
-detector_pixel_size = "145 µm"   # or pixel_size at the object
+shadowinv invert shot.tif --step 'hot-pixels 6' --set options.tolerance=1e-4
 
-[bold]options.toml[/bold] (all optional; see InversionOptions for more)
-n_sites = 100000
-tolerance = 1e-4
-floor = 1e-3
-
-[bold]recipe.toml[/bold] (all settings in one file; --save-recipe writes one)
-\[\[steps]]                        # in this order
-step = "hot-pixels"
-threshold = 6                    # standard deviations
-\[\[steps]]
-step = "bin"
-factor = 4
-\[source]
-method = "total-variation"
-weight = 2                       # px
-
-[bold]Exit codes[/bold]
-0 success; 2 invalid input, nothing written;
-3 result written, but not converged; 130 cancelled.
+Exit codes: 0 success; 2 invalid input; 3 written, but not converged; 130 cancelled.
 """
 
 
 @notify_errors
-@_flags.takes_recipe
+@_flags.takes_flags
 def invert(
     image: _flags.ImageFile,
-    source: _flags.SourceFile = None,
-    mask: _flags.MaskFile = None,
-    source_mask: _flags.SourceMask = None,
-    setup: _flags.SetupFile = None,
-    recipe: _flags.RecipeFile = None,
-    save_recipe: _flags.SaveRecipe = None,
-    options: _flags.OptionsFile = None,
-    channel: _flags.Channel = None,
-    variable: _flags.Variable = None,
-    source_variable: Annotated[
-        str | None, Option(metavar="NAME", help=HELP["source_variable"])
+    flags: _flags.InversionFlags,
+    settings: Annotated[
+        list[str] | None,
+        _flags.setting(INVERSION_SECTIONS, "options.tolerance=1e-4", FILE_KEYS),
     ] = None,
-    clip_negative: _flags.ClipNegative = False,
+    save_recipe: _flags.SaveRecipe = None,
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.QuietInversion = False,
-    *,
-    flags: dict[str, Any],
 ) -> None:
     """Retrieve the deflection potential of one image.
 
-    Writes potential, displacement, re-projection, residual and all options to one file,
-    and a figure next to it.
+    Writes a result with all options, and a figure next to it.
     """
     from napari_shadowinv.pipeline.files import read_part, write_recipe
 
     result, figure = _inputs.result_and_figure(image, out, figure)
     files = _inputs.result_outputs(ResultKind.INVERSION, result, figure)
     outputs = _inputs.check_outputs([*files, (save_recipe, (".toml",))], overwrite)
-    _inputs.protect(outputs, [image, recipe, setup, options])
+    _inputs.protect(outputs, [image, flags.recipe, flags.setup])
     chosen = _inputs.recipe_from(
-        flags,
-        recipe,
-        options,
-        clip_negative=clip_negative,
-        source=source,
-        source_variable=source_variable,
-        mask=mask,
-        source_mask=source_mask,
+        flags, settings_of(settings or (), INVERSION_SECTIONS, flags.by_key, FILE_KEYS)
     )
     _inputs.protect_files_of(chosen, outputs)
-    shot = read_part(image, channel, variable)
-    chosen = chosen.model_copy(update={"setup": _inputs.setup_for(setup, shot, chosen)})
+    shot = read_part(image, flags.channel, flags.variable)
+    chosen = chosen.model_copy(update={"setup": _inputs.setup_for(flags.setup, shot, chosen)})
     _inputs.check_setup(result, chosen.setup)
     measured = chosen.source
     if isinstance(measured, MeasuredSource) and measured != MeasuredSource():
         # In its own file or in the image's; the channel is that of both.
-        beam = read_part(measured.file or image, channel, measured.variable)
+        beam = read_part(measured.file or image, flags.channel, measured.variable)
         shot = replace(shot, source=beam)
     printed = warn_of_setups([(chosen.setup or shot.setup, shot.shape)])
     inversion = invert_shot(chosen, shot, quiet)
@@ -230,55 +182,46 @@ def rerun(
     exit_unless_sound(content, again_out, again.left_out)
 
 
+FORWARD_SECTIONS: Sections = {"view": SizedView, "trace": TraceOptions}
 FORWARD_EPILOG = """
-[bold]Examples[/bold]
-shadowinv forward shot.shadowinv
-shadowinv forward shot.shadowinv --setup lower_energy.toml
-shadowinv forward shot.shadowinv --setup lower_energy.toml --deflector electric-field
-shadowinv forward d.npy --recorded-with first.toml --setup second.toml
-shadowinv forward fields.h5 --setup setup.toml --beam x --right y --truth truth.nc
+shadowinv forward shot.shadowinv --setup lower.toml --deflector plasma
 
-[bold]Another experiment[/bold]
-A deflection depends on the beam; the object's line integral does not. To convert between
-experiments, choose the cause of the deflection: a magnetic field (∫B dl, angles scale as charge /
-momentum; the default for particles), an electric field (∫E dl, charge / (momentum velocity)),
-a plasma (∫n dz, wavelength squared) or a refractive index (∫ln η dz, unchanged apart from
-dispersion). Both images have the same centre; the predicted one has the pixel size of --setup
-and covers the area where the field is known.
+shadowinv forward fields.h5 --setup setup.toml --set view.beam=x
 
-[bold]A 3-D field[/bold]
-An openPMD file (HDF5), or a NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez on x, y and z with units,
-is traced with the particles of --setup. The image has the middle of the object plane, at the
-grid's x = y = z = 0, in its middle.
+Causes: magnetic-field, electric-field, plasma, refractive-index.
 """
 
 
+@dataclass(frozen=True, kw_only=True)
+class ExperimentFlags:
+    """Flags of the experiment that an image is predicted for."""
+
+    setup: Annotated[Path | None, Option(help=HELP["setup"])] = None
+    recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None
+    deflector: Annotated[str | None, Option(metavar="CAUSE", help=HELP["deflector"])] = None
+    dispersion: Annotated[float, Option(help=HELP["dispersion"])] = 1.0
+    source: _flags.SourceFile = None
+    channel: _flags.Channel = None
+    variable: _flags.Variable = None
+    seed: Annotated[int, Option(help=HELP["seed"])] = 0
+
+
 @notify_errors
-@_flags.takes_trace
+@_flags.takes_flags
 def forward(
     field: Annotated[Path, _flags.argument(help=HELP["field"])],
-    source: _flags.SourceFile = None,
-    setup: Annotated[Path | None, Option(help=HELP["setup"])] = None,
-    recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None,
-    deflector: Annotated[str | None, Option(metavar="WHAT", help=HELP["deflector"])] = None,
-    dispersion: Annotated[float, Option(help=HELP["dispersion"])] = 1.0,
-    channel: _flags.Channel = None,
-    variable: _flags.Variable = None,
-    source_variable: Annotated[
-        str | None, Option(metavar="NAME", help="Name of the array in the source file.")
+    flags: ExperimentFlags,
+    settings: Annotated[
+        list[str] | None, _flags.setting(FORWARD_SECTIONS, "trace.output=counts")
     ] = None,
     out: Annotated[Path | None, Option(help=HELP["predicted_image"])] = None,
     truth: Annotated[Path | None, Option(help=HELP["truth"])] = None,
-    seed: Annotated[int, Option(help=HELP["seed"])] = 0,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
-    *,
-    flags: dict[str, Any],
 ) -> None:
     """Predict the image of a displacement field or of a 3-D field, for any setup.
 
-    Without --source, the result's own source is used if the setup is the same; otherwise
-    the source is uniform.
+    The source is the result's own if the setup is the same, else uniform.
     """
     from napari_shadowinv.io import is_field_grid, read_radiograph, replacing, write
     from napari_shadowinv.pipeline.files import setup_from
@@ -287,21 +230,20 @@ def forward(
     outputs = _inputs.check_outputs(
         [(path, tuple(IMAGE_WRITERS)), (truth, (NETCDF_SUFFIX,))], overwrite
     )
-    _inputs.protect(outputs, [field, source, setup, recorded_with])
-    if source_variable is not None and source is None:
-        raise InputError("received --source-variable: it needs --source, the file that contains it")
-    target = None if setup is None else setup_from(setup)
-    original = None if recorded_with is None else setup_from(recorded_with)
+    _inputs.protect(outputs, [field, flags.source, flags.setup, flags.recorded_with])
+    chosen = settings_of(settings or (), FORWARD_SECTIONS, {})
+    setup = None if flags.setup is None else setup_from(flags.setup)
+    original = None if flags.recorded_with is None else setup_from(flags.recorded_with)
+    beam = None
+    if flags.source is not None:
+        beam = read_radiograph(flags.source, channel=flags.channel).image
     if is_field_grid(field):
-        beam = None
-        if source is not None:
-            beam = read_radiograph(source, channel=channel, variable=source_variable).image
-        if original is not None or deflector is not None or dispersion != 1:
+        if original is not None or flags.deflector is not None or flags.dispersion != 1:
             raise InputError(
                 f"received --recorded-with, --deflector or --dispersion, but {field} is a 3-D "
                 "field, which needs only --setup: leave them out"
             )
-        traced = trace_field(field, target, beam, variable, flags, seed, quiet)
+        traced = trace_field(field, setup, beam, flags, chosen, quiet)
         write(path, traced.image, setup=traced.setup, overwrite=overwrite)
         if truth is not None:
             with replacing(truth, overwrite) as temporary:
@@ -314,16 +256,17 @@ def forward(
             ]
             say(two_columns("Traced field", rows))
         return
-    if flags or truth is not None or seed:
-        names = ", ".join(f"--{name.replace('_', '-')}" for name in flags) or "--truth or --seed"
+    if chosen.values or truth is not None or flags.seed:
+        names = ", ".join(chosen.values) or "--truth or --seed"
         raise InputError(f"received {names}, but {field} is no 3-D field: leave them out")
-    content = field_from(field, variable)
-    original, target = choose_setups(content, target, original, deflector, dispersion)
+    content = field_from(field, flags.variable)
+    original, target = choose_setups(content, setup, original, flags.deflector, flags.dispersion)
     # The beam of another experiment is not known.
-    beam = content.source if original == target else None
-    if source is not None:
-        beam = read_radiograph(source, channel=channel, variable=source_variable).image
-    image, note = predict_image(content.displacement, beam, original, target, deflector, dispersion)
+    if beam is None and original == target:
+        beam = content.source
+    image, note = predict_image(
+        content.displacement, beam, original, target, flags.deflector, flags.dispersion
+    )
     write(path, image, setup=target, overwrite=overwrite)
     if not quiet:
         inside = image.sum() / (image.size if beam is None else beam.sum())
@@ -337,12 +280,15 @@ def forward(
 
 @notify_errors
 def info(
-    file: Annotated[Path | None, _flags.argument(help="An image or a result.")] = None,
+    file: Annotated[Path | None, _flags.argument(help="An image, a result or a store.")] = None,
     variable: _flags.Variable = None,
+    every: Annotated[bool, Option("--all", help=HELP["all"])] = False,
+    verify: Annotated[bool, Option("--verify", help=HELP["verify"])] = False,
     system: Annotated[bool, Option("--system", help=HELP["system"])] = False,
 ) -> None:
-    """Describe a file and its contents."""
+    """Describe a file and its contents, or the shots of a store and why some failed."""
     from napari_shadowinv.cli import _info
+    from napari_shadowinv.io import is_stack
 
     if system:
         if file is not None or variable is not None:
@@ -351,29 +297,40 @@ def info(
         return
     if file is None:
         raise InputError("no file given: name an image or a result, or use --system")
+    if is_stack(file):
+        from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, status_tables
+
+        tables, is_damaged = status_tables(file, every, verify)
+        for table in tables:
+            say(table)
+        if verify and is_damaged:
+            raise Exit(EXIT_FAILED_SHOTS)
+        return
+    if every or verify:
+        raise InputError(f"{file} is not a stack of shots: --all and --verify describe a store")
     say(_info.file_table(file, variable))
 
 
 @notify_errors
 def demo(
     out: Annotated[Path, Option(help="Output folder.")] = Path("demo"),
-    dm: Annotated[float, Option(help="Peak path-integrated field in MG·µm.")] = 97.0,
     noise: Annotated[float, Option(help=HELP["noise"])] = 0.1,
-    n_sites: Annotated[int | None, Option(help=HELP["n_sites"])] = None,
+    settings: Annotated[
+        list[str] | None, _flags.setting(INVERSION_SECTIONS, "options.n_sites=6000")
+    ] = None,
 ) -> None:
     """Simulate a proton radiograph of a toroidal field, invert it and compare with the truth.
 
-    The setup follows Kasim et al., arXiv:1607.04179, section IV. Caustics form from
-    about 185 MG·µm.
+    The setup follows Kasim et al., arXiv:1607.04179, section IV.
     """
     if not 0 <= noise < float("inf"):
         raise InputError(f"--noise is {noise:g}: it must be 0 or more, as a fraction of the mean")
-    if not math.isfinite(dm):
-        raise InputError(f"--dm is {dm:g}: it must be a finite number, in MG·µm")
     from napari_shadowinv.io.files import make_folder
 
-    flags = {} if n_sites is None else {"n_sites": n_sites}
-    chosen = _inputs.recipe_from(flags, None, None, clip_negative=True)
+    chosen = _inputs.recipe_from(
+        _flags.InversionFlags(),
+        settings_of(settings or (), INVERSION_SECTIONS, {"options.negative": ("", "clip")}),
+    )
     make_folder(out)
     from napari_shadowinv.io import write
     from napari_shadowinv.physics.forward import synthetic_image
@@ -382,7 +339,7 @@ def demo(
     from napari_shadowinv.plotting import comparison_figure, report_figure
 
     setup = paper_setup()
-    truth = toroid((200, 200), setup, peak=dm, sigma=30e-6).displacement
+    truth = toroid((200, 200), setup, peak=_DEMO_PEAK, sigma=30e-6).displacement
     image = synthetic_image(truth)
     grain = np.random.default_rng(0).normal(size=image.shape)
     image = image + noise * image.mean() * grain
@@ -393,7 +350,7 @@ def demo(
     fields = {"True": truth, "Retrieved": inversion.displacement, "Poisson": poisson}
     errors = {name: _error_text(fields[name], truth) for name in ("Retrieved", "Poisson")}
     caption = "Errors: " + "; ".join(f"{field} {error}" for field, error in errors.items())
-    name = f"toroid_{dm:g}"
+    name = f"toroid_{_DEMO_PEAK:g}"
     figures = {
         out / f"{name}{PNG.suffix}": lambda: report_figure(inversion, setup, title=f"Demo {name}"),
         out / f"{name}_comparison{PNG.suffix}": lambda: comparison_figure(
@@ -426,29 +383,28 @@ def trace_field(
     path: Path,
     setup: Setup | None,
     source: AnyArray | None,
-    iteration: str | None,
-    flags: Mapping[str, Any],
-    seed: int,
+    flags: ExperimentFlags,
+    settings: Settings,
     quiet: bool,
 ) -> TracedImage:
     """Trace particles through the 3-D field in a file."""
-    from napari_shadowinv.physics.trace_options import SizedView, TraceOptions
     from napari_shadowinv.pipeline.traced_file import trace_file
 
-    view = _flags.choices_of(SizedView, flags)
-    options = _flags.choices_of(TraceOptions, flags)
-    if source is not None and {"height", "width"} & flags.keys():
-        raise InputError("received --height or --width, but --source sets the size: leave it out")
+    view = settings.change("view", SizedView())
+    if source is not None and {"view.height", "view.width"} & settings.values.keys():
+        raise InputError(
+            "received view.height or view.width, but --source sets the size: leave it out"
+        )
     with work_callbacks(quiet) as callbacks:
         return trace_file(
             path,
             setup,
             shape=(view.height, view.width),
             view=view,
-            options=options,
+            options=settings.change("trace", TraceOptions()),
             source=source,
-            iteration=iteration,
-            seed=seed,
+            iteration=flags.variable,
+            seed=flags.seed,
             **callbacks,
         )
 

@@ -1,166 +1,143 @@
-"""Commands for many shots: `batch`, `watch`, `status`, `export`, `movie`."""
+"""Commands for many shots: `batch`, `watch`, `export`, `movie`."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-from typer import Exit, Option
+from typer import Option
 
 from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli._settings import (
+    FILE_KEYS,
+    FIT_SECTIONS,
+    INVERSION_SECTIONS,
+    Sections,
+    Settings,
+    settings_of,
+)
 from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 # Help of options, where it is longer than a line.
 HELP = {
-    "source": "Image of the undisturbed beam; batch also takes a glob matching one image per "
-    "shot. Default: uniform.",
-    "scheduler": "threads, processes, or the address of a dask scheduler (tcp://host:8786).",
+    "scheduler": "threads, processes or tcp://host:8786.",
     "format": "tiff (float32, one file per shot and component), pradformat or openpmd (one file "
     "per shot), or csv (a table with a row per shot).",
-    "shots": "A quoted glob, a folder, a list of files, a file with many frames (multi-page TIFF, "
-    "NPY, SPE, MATLAB), an array of frames in HDF5 (run.h5::/entry/data/data), or a table (.csv) "
-    "of images with one row per shot.",
-    "fit": "Fit the forward model to each shot instead of inverting it, with the recipe's section "
-    "[fit]; table rows with the same shot are images of one object.",
-    "resume": "Resume an interrupted run and append new shots.",
-    "verify": "Read all files and compare their checksums; exit code 1 if any is damaged.",
+    "shots": "A quoted glob, a folder, files, a file of frames, an array of frames in HDF5, or a "
+    "table (.csv) with a row per shot.",
+    "workers": "Shots at once. Default: one per core.",
+    "resume": "Continue a run, append new shots.",
+    "pattern": "Names of the shots, in quotes.",
+    "latest": "Invert the newest file first, skip older ones.",
+    "idle": "Stop after SECONDS without a new file.",
     "variables": "For tiff: variables to export, separated by commas.",
     "variable": "Variable to show; for vectors, the magnitude. Default: the potential.",
     "limits": "Limits of the colour scale. Default: the range over all shots.",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
 }
+_SHOTS: Sections = {**INVERSION_SECTIONS, **FIT_SECTIONS}
+BATCH_SECTIONS: Sections = {**_SHOTS, "run": RunOptions}
+WATCH_SECTIONS: Sections = {**_SHOTS, "run": WatchOptions}
+_EXAMPLE = "run.variables=weights"
+Store = Annotated[Path, Option(help="Store: name.shadowinv.zarr.")]
 BATCH_EPILOG = """
-[bold]Examples[/bold]
-shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr
-shadowinv batch 'shots/*.tif' --source reference.tif --out night.shadowinv.zarr --resume
-shadowinv batch 'shots/*.tif' --source-from polynomial --low-pass 1 --out night.shadowinv.zarr
-shadowinv batch movie.tif --out movie.shadowinv.zarr --scheduler tcp://head:8786
-shadowinv batch run.h5::/entry/data/data --out run.shadowinv.zarr
-shadowinv batch pack.csv --setup setup.toml --out pack.shadowinv.zarr
-shadowinv batch shots.csv --fit --recipe recipe.toml --out fits.shadowinv.zarr
+shadowinv batch 'shots/*.tif' --source reference.tif --out n.shadowinv.zarr
 
-[bold]pack.csv[/bold] (one inversion per row; flags apply where a cell is empty)
-file, energy, brightness, mask, exclude
-film1.tif, 4.3, 1, mask1.png,
-film2.tif, 6.1, 1.2, mask2.png,
-film3.tif, 7.6, 0.8, , yes
-Columns: file, setup, energy (MeV) or wavelength (m), brightness, mask, source, exclude.
-
-[bold]shots.csv[/bold] (one fit per shot; other columns as for shadowinv fit)
-shot, file, energy, setup
-7, shot7_low.tif, 14.7, setup.toml
-7, shot7_high.tif, 30, setup.toml
-
-[bold]Exit codes[/bold]
-0 all done; 1 some shots failed, the others are written; 2 invalid input;
-3 all done, but some did not converge or are not determined; 130 cancelled, continue with --resume.
+Exit codes: 0 all done; 1 some failed; 2 invalid input; 3 some are doubtful.
 """
 WATCH_EPILOG = """
-[bold]Examples[/bold]
 shadowinv watch shots --source reference.tif --out night.shadowinv.zarr
-shadowinv watch shots --pattern '*.bmp' --channel mean --bin 2 --out night.shadowinv.zarr
-shadowinv watch shots --source reference.tif --out night.shadowinv.zarr --idle 600
-shadowinv watch shots --latest --status-file status.json --out night.shadowinv.zarr
 
-Press Ctrl-C to stop. The same command continues with the same store.
-
-[bold]Exit codes[/bold]
-0 all shots that arrived are done; 1 some failed, the others are written; 2 invalid input, or the
-folder disappeared; 3 all done, but some did not converge or are not determined; 130 stopped
-by Ctrl-C while files were waiting.
+Press Ctrl-C to stop; the same command continues. Exit codes as for batch.
 """
 
 
-def _stack_inputs(
-    source: Annotated[Path | None, Option(help=HELP["source"])] = None,
-    mask: _flags.MaskFile = None,
-    source_mask: _flags.SourceMask = None,
-    recipe: _flags.RecipeFile = None,
-    save_recipe: _flags.SaveRecipe = None,
-    setup: _flags.SetupFile = None,
-    options: _flags.OptionsFile = None,
-    fit: Annotated[bool, Option("--fit", help=HELP["fit"])] = False,
-    channel: _flags.Channel = None,
-    variable: _flags.Variable = None,
-    clip_negative: _flags.ClipNegative = False,
-    quiet: _flags.Quiet = False,
-    *,
-    run: RunOptions | WatchOptions,
-    flags: dict[str, Any],
-) -> dict[str, Any]:
-    """Return the inputs of `batch` and `watch`, and save their recipe."""
-    from napari_shadowinv.pipeline.files import setup_from, write_recipe
+@dataclass(frozen=True, kw_only=True)
+class RunFlags:
+    """Flags of a run over many shots."""
 
-    files: dict[str, Any] = {"source": source, "mask": mask, "source_mask": source_mask}
-    chosen = _inputs.recipe_from(flags, recipe, options, clip_negative=clip_negative, **files)
-    if fit or chosen.fit is not None:
-        chosen = _inputs.fit_recipe(chosen, flags, options, clip_negative=clip_negative)
-    if setup is not None:
-        chosen = chosen.model_copy(update={"setup": setup_from(setup)})
-    if save_recipe is not None:
-        _inputs.check_outputs([(save_recipe, (".toml",))], run.overwrite)
-        _inputs.protect([save_recipe], [recipe, setup, options])
-        _inputs.protect_files_of(chosen, [save_recipe])
-        write_recipe(save_recipe, chosen, overwrite=run.overwrite)
+    scheduler: Annotated[str, Option(help=HELP["scheduler"])] = "threads"
+    workers: Annotated[int | None, Option(metavar="N", help=HELP["workers"])] = None
+    resume: Annotated[bool, Option("--resume", help=HELP["resume"])] = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class WatchFlags:
+    """Flags of a watched folder."""
+
+    pattern: Annotated[str | None, Option(help=HELP["pattern"])] = None
+    latest: Annotated[bool, Option("--latest", help=HELP["latest"])] = False
+    idle: Annotated[float | None, Option(metavar="SECONDS", help=HELP["idle"])] = None
+
+
+def _stack_inputs(flags: _flags.InversionFlags, settings: Settings, quiet: bool) -> dict[str, Any]:
+    """Return the inputs of `batch` and `watch`."""
+    from napari_shadowinv.pipeline.files import setup_from
+
+    chosen = _inputs.shots_recipe_from(flags, settings)
+    if flags.setup is not None:
+        chosen = chosen.model_copy(update={"setup": setup_from(flags.setup)})
     if not quiet:
         warn_of_setups([(chosen.setup, None)])
     from napari_shadowinv.stack import read_shot
 
     # A reader is part of a store's identity: only a variable that is there names itself.
-    named: dict[str, Any] = {} if variable is None else {"variable": variable}
-    reader = partial(read_shot, channel=channel, **named)
+    variable: dict[str, Any] = {} if flags.variable is None else {"variable": flags.variable}
+    reader = partial(read_shot, channel=flags.channel, **variable)
     return {"recipe": chosen, "reader": reader, "quiet": quiet}
 
 
 @notify_errors
-@_flags.takes_run(RunOptions, _stack_inputs)
+@_flags.takes_flags
 def batch(
     shots: Annotated[list[str], _flags.argument(help=HELP["shots"])],
-    out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
-    scheduler: Annotated[str, Option(help=HELP["scheduler"])] = "threads",
-    resume: Annotated[bool, Option("--resume", help=HELP["resume"])] = False,
-    *,
-    run: RunOptions,
-    **inputs: Any,
+    out: Store,
+    flags: _flags.InversionFlags,
+    run_flags: RunFlags,
+    settings: Annotated[
+        list[str] | None, _flags.setting(BATCH_SECTIONS, _EXAMPLE, FILE_KEYS)
+    ] = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.Quiet = False,
 ) -> None:
     """Invert or fit many shots into one store; an interrupted run can be resumed."""
     from napari_shadowinv.cli._batch import run_batch
 
-    resume = resume or run.redo_failed
-    run_batch(shots, out, run, resume=resume, scheduler=scheduler, **inputs)
+    run_keys = {"run.workers": ("--workers", run_flags.workers)}
+    chosen = settings_of(settings or (), BATCH_SECTIONS, flags.by_key | run_keys, FILE_KEYS)
+    run = chosen.change("run", RunOptions(overwrite=overwrite))
+    inputs = _stack_inputs(flags, chosen, quiet)
+    resume = run_flags.resume or run.redo_failed
+    run_batch(shots, out, run, resume=resume, scheduler=run_flags.scheduler, **inputs)
 
 
 @notify_errors
-@_flags.takes_run(WatchOptions, _stack_inputs)
+@_flags.takes_flags
 def watch(
     folder: Annotated[Path, _flags.argument(help="Folder in which the shots appear.")],
-    out: Annotated[Path, Option(help="Output store: name.shadowinv.zarr.")],
-    *,
-    run: WatchOptions,
-    **inputs: Any,
+    out: Store,
+    flags: _flags.InversionFlags,
+    watch_flags: WatchFlags,
+    settings: Annotated[
+        list[str] | None, _flags.setting(WATCH_SECTIONS, _EXAMPLE, FILE_KEYS)
+    ] = None,
+    overwrite: _flags.Overwrite = False,
+    quiet: _flags.Quiet = False,
 ) -> None:
     """Invert or fit each new shot in a folder, and append it to a store."""
     from napari_shadowinv.cli._batch import run_watch
 
-    run_watch(folder, out, run, **inputs)
-
-
-@notify_errors
-def status(
-    store: _flags.StoreFolder,
-    every: Annotated[bool, Option("--all", help="Show one line per shot.")] = False,
-    verify: Annotated[bool, Option("--verify", help=HELP["verify"])] = False,
-) -> None:
-    """Show which shots of a store are done, pending, failed or damaged, and why."""
-    from napari_shadowinv.cli._batch import EXIT_FAILED_SHOTS, status_tables
-
-    tables, is_damaged = status_tables(store, every, verify)
-    for table in tables:
-        say(table)
-    if verify and is_damaged:
-        raise Exit(EXIT_FAILED_SHOTS)
+    run_keys = {
+        "run.pattern": ("--pattern", watch_flags.pattern),
+        "run.latest": ("--latest", watch_flags.latest or None),
+        "run.idle": ("--idle", watch_flags.idle),
+    }
+    chosen = settings_of(settings or (), WATCH_SECTIONS, flags.by_key | run_keys, FILE_KEYS)
+    run = chosen.change("run", WatchOptions(overwrite=overwrite))
+    run_watch(folder, out, run, **_stack_inputs(flags, chosen, quiet))
 
 
 @notify_errors

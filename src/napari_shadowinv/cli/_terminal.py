@@ -174,7 +174,8 @@ def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
             elif isinstance(error, OSError | MemoryError | InputError | ValidationError):
                 code, text = EXIT_MISTAKE, str(error) or "There is not enough memory for this"
                 if option := getattr(error, "option", ""):
-                    text = f"{text} (--{option.replace('_', '-')})"
+                    flag = f"set {option}" if "." in option else option.replace("_", "-")
+                    text = f"{text} (--{flag})"
             else:
                 raise  # a bug deserves its traceback
             with suppress(OSError):  # the terminal was closed

@@ -247,7 +247,7 @@ def _refuse_ambiguous(shots: Sequence[Shot], options: FitOptions) -> None:
             "received one image and an unknown source: one image cannot tell the beam from the "
             "object; give the source or an image of another energy, or allow an ambiguous fit, "
             "one of many",
-            option="ambiguous",
+            option="fit.options.ambiguous=true",
         )
 
 

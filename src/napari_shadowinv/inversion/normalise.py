@@ -77,7 +77,7 @@ def prepare(
         raise InputError(
             f"image has {negative} negative pixels (lowest {lowest:.4g}), expected none: "
             f"{remedy}if they result from background subtraction, clip them",
-            option="clip_negative",
+            option="options.negative=clip",
         )
     values = _clip_negative(values)
     _check_range(values, "image")

@@ -1,7 +1,7 @@
 """Numbers and words of each shot, as stores, tables and windows list them: `COLUMNS`.
 
 A column is described once. Every store has an array of each of its columns, ``shadowinv export
---format csv`` writes them all, ``shadowinv status --all`` and the window of a stack list those with
+--format csv`` writes them all, ``shadowinv info --all`` and the window of a stack list those with
 a format.
 
 - add a column: one entry of `COLUMNS`

@@ -179,7 +179,6 @@ class FitChoices(CheckedModel, allow_inf_nan=False):
             f"Cause of the deflection: {_any_of(deflector_titles())}. Two of them, "
             "separated by a comma, need images at two energies. Default: B, or phase for light."
         ),
-        json_schema_extra={"metavar": "NAMES"},
     )
     beam: Literal["known", "unknown"] = Field(
         default="known",
@@ -196,7 +195,6 @@ class FitChoices(CheckedModel, allow_inf_nan=False):
         description="'poisson' for images in counts; 'proportional' if the noise is a fraction of "
         "each pixel, as on film; or the standard deviation of a pixel after all steps. Default: "
         "estimated from the images, the same for all pixels.",
-        json_schema_extra={"metavar": "poisson|proportional|NUMBER"},
     )
     psf: float | None = Field(
         default=None,

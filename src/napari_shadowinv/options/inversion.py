@@ -18,12 +18,9 @@ MaxError = Annotated[
 ]
 """The largest error of a determined result, an option of inversions and fits."""
 
-_BUDGET: Any = {"panel": "Error budget (docs/uncertainty.md)"}
-
 MAX_DEFAULT_SITES = 1_000_000
 
 _MOVES_SITES: Any = {"moves_sites": True}
-_BOUNDARY: Any = {"panel": "Flux across the image edge (docs/boundary.md)"}
 
 
 class InversionOptions(CheckedModel, allow_inf_nan=False):
@@ -57,7 +54,7 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         "first shots decide for all. Ignored with a number of sites, 'single' stages or a solver "
         "other than 'newton'.",
     )
-    max_error: Annotated[MaxError, Field(json_schema_extra=_BUDGET)] = 0.05
+    max_error: MaxError = 0.05
     floor: _Fraction = Field(
         default=1e-3,
         description="Minimum image intensity as a fraction of the mean: darker pixels are raised "
@@ -120,7 +117,7 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         default="closed",
         description="'closed': no flux crosses the image edge, as in the paper. 'free': flux may "
         "leave and enter, and the potential of the object decays beyond the edge.",
-        json_schema_extra={**_MOVES_SITES, **_BOUNDARY},
+        json_schema_extra=_MOVES_SITES,
     )
     margin: int | None = Field(
         default=None,
@@ -128,7 +125,7 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         title="Margin (px)",
         description="Free boundary only: width of the strip beyond each edge from which flux may "
         "enter; it has its own sites. Default: a twentieth of the image's shorter side.",
-        json_schema_extra={**_MOVES_SITES, **_BOUNDARY},
+        json_schema_extra=_MOVES_SITES,
     )
     decay_length: float | None = Field(
         default=None,
@@ -137,14 +134,12 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         title="Decay length (px)",
         description="Free boundary only: distance over which the potential decays beyond the edge; "
         "use roughly the size of the object there. Default: the margin.",
-        json_schema_extra=_BOUNDARY,
     )
     flux: Literal["conserve", "known", "fit"] = Field(
         default="conserve",
         description="Free boundary only. 'conserve': inflow equals outflow, so image and source "
         "may have different units. 'known': image and source have the same exposure and units. "
         "'fit': find the exposure that minimises the movement of flux at the edge.",
-        json_schema_extra=_BOUNDARY,
     )
     caustic_jacobian: float = Field(
         default=0.2,
@@ -160,14 +155,12 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         description="Standard deviation of the noise of one pixel of the inverted image, in its "
         "units, for the error budget. Default: measured from the differences between neighbouring "
         "pixels.",
-        json_schema_extra=_BUDGET,
     )
     units_per_quantum: float | None = Field(
         default=None,
         gt=0,
         description="Image units per detected quantum, for the error budget: the noise is then "
         "Poisson noise.",
-        json_schema_extra=_BUDGET,
     )
     seed: int = Field(
         default=0,

@@ -3,7 +3,7 @@
 - beam, output and accuracy: `TraceOptions`
 - the direction from which a grid is seen: `GridView`; with the size of the image: `SizedView`
 
-The command makes flags of them, so this module does not import numba.
+The command takes their keys, so this module does not import numba.
 """
 
 from __future__ import annotations

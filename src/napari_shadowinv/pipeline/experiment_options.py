@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -10,9 +9,6 @@ from pydantic import Field, model_validator
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv.options import MaxError
 from napari_shadowinv.options.fitting import refuse_two_point_spreads
-
-_rare = partial(Field, json_schema_extra={"panel": "Rarely used options of a plan"})
-_detail = partial(Field, json_schema_extra={"panel": "Point spread, and the reference in detail"})
 
 
 class ExperimentOptions(CheckedModel, allow_inf_nan=False):
@@ -40,35 +36,35 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
         description="'recorded': an image of the beam without the object is the source. 'none': a "
         "uniform beam is assumed.",
     )
-    reference_counts: float | None = _detail(
+    reference_counts: float | None = Field(
         default=None,
         gt=0,
         le=1e12,
         title="Counts of the reference",
         description="Mean counts a pixel of the reference. Default: as many as in an image.",
     )
-    beam_structure: float = _detail(
+    beam_structure: float = Field(
         default=0.0,
         ge=0,
         lt=0.5,
         description="Relative r.m.s. structure of the beam that the reference records, over the "
         "beam's length. How far the beam differs from its reference is a number of the instrument.",
     )
-    psf: float | None = _detail(
+    psf: float | None = Field(
         default=None,
         ge=0,
         le=20,
         title="Point spread (px)",
         description="Known standard deviation of the point spread in px. Default: none.",
     )
-    source_size: float | None = _detail(
+    source_size: float | None = Field(
         default=None,
         ge=0,
         title="Source size (m)",
         description="Standard deviation of the beam's source in m (FWHM / 2.355), for the point "
         "spread of each setup.",
     )
-    resolution: float | None = _detail(
+    resolution: float | None = Field(
         default=None,
         ge=0,
         title="Resolution (m)",
@@ -80,12 +76,12 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
         le=1000,
         description="Number of simulated shots, each with its own imperfections and noise.",
     )
-    method: Literal["automatic", "inversion", "fit"] = _rare(
+    method: Literal["automatic", "inversion", "fit"] = Field(
         default="automatic",
         description="'inversion' for one image, 'fit' for several or one. Default: an inversion "
         "for one image.",
     )
-    searched: int = _rare(
+    searched: int = Field(
         default=1,
         ge=1,
         le=1000,
@@ -94,13 +90,13 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
         "points and computes error bars. The other fits start near the true field.",
     )
     max_error: MaxError = 0.05
-    seed: int = _rare(
+    seed: int = Field(
         default=0,
         ge=0,
         title="Random seed",
         description="Seed of all random choices; the same seed gives the same plan.",
     )
-    threads: int | None = _rare(
+    threads: int | None = Field(
         default=None,
         ge=1,
         title="Number of threads",

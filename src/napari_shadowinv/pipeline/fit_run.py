@@ -310,7 +310,7 @@ def _with_choices(
             raise InputError(
                 f"{name} has no setup, and source size and resolution are in m: give the setup, or "
                 "the point spread in px",
-                option="psf",
+                option="fit.psf",
             )
         psf = point_spread(shot.setup, choices.source_size or 0.0, choices.resolution or 0.0)
     free = "free" if choices.brightness == "free" else None

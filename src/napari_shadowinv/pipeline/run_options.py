@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
 from napari_shadowinv._system.validation import CheckedModel
-
-_RARE: Any = {"panel": "Rarely used options of a run"}
-_rare = partial(Field, json_schema_extra=_RARE)
 
 
 class _StoreOptions(CheckedModel, allow_inf_nan=False):
@@ -22,9 +18,8 @@ class _StoreOptions(CheckedModel, allow_inf_nan=False):
         description="Variables to store; on the command line, separated by commas. Default: "
         "potential, displacement, caustic and mask, at a million pixels 14 MB per shot before "
         "compression; of a fit, potential, displacement and its error bars.",
-        json_schema_extra={"metavar": "NAMES"},
     )
-    dtype: Literal["float32", "float64"] = _rare(
+    dtype: Literal["float32", "float64"] = Field(
         default="float32",
         title="Stored type",
         description="Type of stored images; sites, weights and scalars keep 64 bits.",
@@ -60,7 +55,6 @@ class RunOptions(_StoreOptions):
         default=None,
         ge=1,
         description="Shots that are processed at once on this machine. Default: one per core.",
-        json_schema_extra={**_RARE, "metavar": "N"},
     )
 
 
@@ -89,14 +83,13 @@ class WatchOptions(_StoreOptions):
         default=None,
         description="JSON file with the newest shot and its field, the numbers of shots, the rate "
         "and the last warning, replaced after each shot, for another program to show.",
-        json_schema_extra={"metavar": "FILE"},
     )
-    skip_existing: bool = _rare(
+    skip_existing: bool = Field(
         default=False,
         title="Skip existing files",
         description="Skip files that are in the folder at the start.",
     )
-    settle: float = _rare(
+    settle: float = Field(
         default=0.5,
         gt=0,
         title="Settling time (s)",
@@ -114,5 +107,4 @@ class WatchOptions(_StoreOptions):
         ge=1,
         title="Maximum number of shots",
         description="Stop after N shots, done or failed.",
-        json_schema_extra={**_RARE, "metavar": "N"},
     )

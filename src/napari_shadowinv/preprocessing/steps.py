@@ -33,9 +33,9 @@ class Choice(CheckedModel):
 
     title: ClassVar[str]  # in forms
     key: ClassVar[str]  # the field that names it in files, "step" or "method"
-    # The parameter that the command's flag of the same name sets; "" if each has its own flag.
+    # The parameter that needs no name in a text, such as "bin 4"; "" if all do.
     primary: ClassVar[str] = ""
-    # Its order in lists; steps chosen by flags are applied in this order.
+    # Its order in lists; steps chosen by texts are applied in this order.
     place: ClassVar[int] = 100
 
     @classmethod
@@ -166,7 +166,6 @@ class Dark(Step):
         default=0.0,
         description="Counts of the detector without light, or an image of them, which is "
         "subtracted from image and source.",
-        json_schema_extra={"metavar": "COUNTS|FILE"},
     )
 
     @property
@@ -355,7 +354,6 @@ class Bin(Step):
         ge=1,
         le=1000,
         description="Sum blocks of N×N pixels; the setup's pixel size grows with them.",
-        json_schema_extra={"metavar": "N"},
     )
 
     def apply(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:

@@ -865,8 +865,8 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     tifffile.imwrite(tmp_path / "usable.tif", (painted == 0).astype(np.uint8))
     by_flags = [
         *("fit", "fast.txt", "slow.txt", "--energies", "14.7,6", "--setup", "setup.toml"),
-        *("--source", "beam.txt", "--mask", "usable.tif", "--crop-x", "4:64", "--crop-y", "0:48"),
-        *(word for name, value in QUICK.items() for word in (f"--{name.replace('_', '-')}", value)),
+        *("--source", "beam.txt", "--mask", "usable.tif", "--step=crop x=4:64 y=0:48"),
+        *(word for name, value in QUICK.items() for word in (f"--set=fit.options.{name}={value}",)),
         *("--out", "command.shadowinv"),
     ]
     command(*by_flags)

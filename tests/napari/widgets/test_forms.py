@@ -29,7 +29,6 @@ from napari_shadowinv._napari.widgets._forms import (
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._system.validation import validate
-from napari_shadowinv.cli._inputs import recipe_from
 from napari_shadowinv.io import read_toml
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.pipeline.files import setup_from
@@ -180,11 +179,11 @@ def test_the_command_line_reads_a_saved_setup(
         assert math.isinf(picker.setup().source_object_distance)
 
 
-def test_the_command_line_reads_saved_options(qtbot: Any, tmp_path: Path) -> None:
+def test_saved_options_are_those_of_the_form(qtbot: Any, tmp_path: Path) -> None:
     form = the_form(qtbot, InversionOptions)
     form.set_values(CHANGED)
     path = save_toml(form.values(), tmp_path / "options.toml")
-    assert recipe_from({}, None, path, clip_negative=False).options == InversionOptions(**CHANGED)
+    assert InversionOptions(**read_toml(path)) == InversionOptions(**CHANGED)
 
 
 def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> None:

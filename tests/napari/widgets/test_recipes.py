@@ -364,8 +364,9 @@ def test_the_window_does_what_the_command_saves(
         "object_image_distance = 1.0\npixel_size = 2e-6\n"
     )
     by_command(
-        "invert", shot_file, "--crop-y", "4:44", "--crop-x", "10:", "--bin", 2, "--low-pass", 1.5,
-        "--source", tmp_path / "beam.npy", "--setup", tmp_path / "setup.toml", "--n-sites", 300,
+        "invert", shot_file, "--step=crop y=4:44 x=10:", "--bin", 2, "--step=low-pass 1.5",
+        "--source", tmp_path / "beam.npy", "--setup", tmp_path / "setup.toml",
+        "--set=options.n_sites=300",
         "--save-recipe", tmp_path / "how.toml", "--out", tmp_path / "a.shadowinv",
     )  # fmt: skip
     reloaded = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))

@@ -1,0 +1,209 @@
+"""Keys of a recipe on the command line: `--set KEY=VALUE`, and `--step "NAME KEY=VALUE"`.
+
+The models check the values; a wrong key is refused with the nearest right one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pydantic import BaseModel
+
+from napari_shadowinv._system.validation import Model, nearest, suggestion, validate
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
+from napari_shadowinv.preprocessing import ESTIMATES, STEPS, Step
+from napari_shadowinv.preprocessing.estimates import Estimate
+
+Sections = Mapping[str, type[BaseModel]]
+
+FILE_KEYS = ("mask", "source_mask")
+INVERSION_SECTIONS: Sections = {"options": InversionOptions, "instrument": Instrument}
+FIT_SECTIONS: Sections = {"fit": FitChoices, "instrument": Instrument}
+
+
+def keys_of(sections: Sections) -> Iterator[str]:
+    """Yield the keys of the values in sections, such as ``"fit.options.samples"``."""
+    for section, model in sections.items():
+        for name, each in model.model_fields.items():
+            kind = each.annotation
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                yield from keys_of({f"{section}.{name}": kind})
+            else:
+                yield f"{section}.{name}"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Values by their keys, and the flags that some of them come from."""
+
+    values: Mapping[str, Any]
+    flags: Mapping[str, str] = field(default_factory=dict)
+
+    def change(self, section: str, model: Model) -> Model:
+        """Return a model with other values; an empty one stands for the default."""
+        changes: dict[str, Any] = {}
+        for name, each in type(model).model_fields.items():
+            key = f"{section}.{name}"
+            if key in self.values:
+                changes[name] = self.values[key]
+            elif any(other.startswith(f"{key}.") for other in self.values):
+                before = getattr(model, name)
+                changes[name] = self.change(key, each.get_default() if before is None else before)
+        if not changes:
+            return model
+        before = _stated(model)
+        values = {name: value for name, value in {**before, **changes}.items() if value != ""}
+        names = {
+            name: self.flags.get(key, key)
+            for name in type(model).model_fields
+            for key in [f"{section}.{name}"]
+        }
+        return validate(type(model), values, "", names)
+
+
+def _stated(model: BaseModel) -> dict[str, Any]:
+    """Return the values that are not defaults, from which a model can be made again."""
+    if isinstance(model, Instrument):
+        return model.stated
+    return {name: getattr(model, name) for name in model.model_fields_set}
+
+
+def settings_of(
+    texts: Iterable[str],
+    sections: Sections,
+    flags: Mapping[str, tuple[str, Any]],
+    names: Collection[str] = (),
+) -> Settings:
+    """Return the settings of flags, and of texts KEY=VALUE, which override them.
+
+    Parameters
+    ----------
+    texts : iterable of str
+    sections : mapping of str to model
+    flags : mapping of str to tuple
+        Name and value of a flag, None if it is not given, by the key that it sets.
+    names : collection of str, optional
+        Keys outside of the sections.
+    """
+    entered = {key: flag for key, flag in flags.items() if flag[1] is not None}
+    values = {key: value for key, (_, value) in entered.items()}
+    stated = {}
+    keys = (*names, *keys_of(sections))
+    for text in texts:
+        key, equals, value = text.partition("=")
+        key = key.strip()
+        if not equals:
+            raise InputError(f"--set is '{text}': expected KEY=VALUE, such as {keys[-1]}=…")
+        if key not in keys:
+            raise InputError(_unknown_key(key, keys))
+        stated[key] = value.strip()
+    return Settings(
+        {**values, **stated},
+        {key: flag for key, (flag, _) in entered.items() if key not in stated},
+    )
+
+
+def _unknown_key(key: str, keys: Collection[str]) -> str:
+    # A key without its section, or with another one.
+    alike = [name for name in keys if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    match = alike[0] if alike else nearest(key, keys)
+    if match is None:
+        sections = dict.fromkeys(name.rpartition(".")[0] + "." for name in keys if "." in name)
+        return f"{key}: expected a key that begins with {', '.join(sections)}"
+    return f"{key}: did you mean {match}?"
+
+
+def completion(sections: Sections, names: Collection[str] = ()) -> Callable[[str], list[str]]:
+    """Return a function that completes keys in a shell."""
+
+    def complete(incomplete: str) -> list[str]:
+        keys = (*names, *keys_of(sections))
+        return [f"{key}=" for key in keys if key.startswith(incomplete)]
+
+    return complete
+
+
+def complete_steps(incomplete: str) -> list[str]:
+    """Complete the name of a step, and then its parameters."""
+    name, space, _ = incomplete.partition(" ")
+    if not space:
+        return [step for step in STEPS if step.startswith(name)]
+    parameters = STEPS[name].parameters() if name in STEPS else ()
+    texts = (f"{name} {parameter}=" for parameter in parameters)
+    return [text for text in texts if text.startswith(incomplete)]
+
+
+def complete_sources(incomplete: str) -> list[str]:
+    """Complete the method of a source."""
+    return [name for name in ESTIMATES if name.startswith(incomplete)]
+
+
+def with_steps(
+    steps: tuple[Step, ...], texts: Iterable[str], flags: Mapping[str, Any]
+) -> tuple[Step, ...]:
+    """Change steps, or insert new ones in the order of the list of steps.
+
+    Parameters
+    ----------
+    steps : tuple of Step
+    texts : iterable of str
+        Such as ``"hot-pixels 6"`` or ``"crop y=10:90"``.
+    flags : mapping
+        Values of the main parameters of steps, by the name of the step and of its flag.
+    """
+    result = list(steps)
+    for name, value in flags.items():
+        if value is not None:
+            primary = STEPS[name].primary
+            _put_step(result, STEPS[name], {primary: value}, "", {primary: f"--{name}"})
+    for text in texts:
+        kind, values = _parse_choice("--step", text, STEPS)
+        _put_step(result, kind, values, f"--step '{text}'")
+    return tuple(result)
+
+
+def _put_step(
+    steps: list[Step],
+    kind: type[Step],
+    changes: Mapping[str, Any],
+    where: str,
+    names: Mapping[str, str] | None = None,
+) -> None:
+    order = list(STEPS)
+    index = next((i for i, step in enumerate(steps) if isinstance(step, kind)), None)
+    before = {} if index is None else steps[index].values()
+    step = validate(kind, {**before, **changes}, where, names)
+    if index is None:
+        rank = order.index(kind.name())
+        later = [i for i, each in enumerate(steps) if order.index(each.name()) > rank]
+        steps.insert(later[0] if later else len(steps), step)
+    else:
+        steps[index] = step
+
+
+def source_from(text: str, before: Estimate | None) -> Estimate:
+    """Return the source of a text, such as ``"polynomial degree=3"``; the rest is as before."""
+    method, changes = _parse_choice("--source-from", text, ESTIMATES)
+    values = before.values() if before is not None and before.name() == method.name() else {}
+    source: Estimate = validate(method, {**values, **changes}, f"--source-from '{text}'")
+    return source
+
+
+def _parse_choice(flag: str, text: str, choices: Mapping[str, Any]) -> tuple[Any, dict[str, str]]:
+    """Return the choice that a text names, and its parameters."""
+    name, *words = text.split() or [""]
+    kind = choices.get(name)
+    if kind is None:
+        raise InputError(f"{flag} is '{text}': {suggestion(name, choices)}")
+    values: dict[str, str] = {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals:
+            key, value = kind.primary, word
+        if not key or key in values:
+            raise InputError(f"{flag} is '{text}': expected name=value instead of '{word}'")
+        values[key.replace("-", "_")] = value
+    return kind, values
