@@ -94,7 +94,7 @@ def test_products_come_from_a_file(result: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "received no product, expected at least one: profile, region, flux"),
+        ([], "received no product, expected at least one: profile [label=TEXT]"),
         (["fluxx 1,1 2,2"], "did you mean 'flux'?"),
         ([CIRCLE, "--unit", "furlong"], "unit is 'furlong', expected one of T m"),
         ([CIRCLE, "--samples", "2"], "expected at least 20"),
