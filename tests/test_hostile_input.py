@@ -128,7 +128,7 @@ def test_model_inside_another_is_named_with_its_place() -> None:
         (lambda: fit(np.ones((32, 32)), options="x"), "options is 'x', expected FitOptions"),
         (
             lambda: fit(shots_of(np.ones((32, 32)), setup=[{}])),
-            "setup is {}: expected a ProtonSetup or an OpticalSetup",
+            "setup is {}: expected that of an experiment",
         ),
     ],
 )

@@ -115,9 +115,7 @@ class Shot(Summarised):
 
     def __post_init__(self) -> None:
         if self.setup is not None and not hasattr(self.setup, "pixel_sizes"):
-            raise InputError(
-                f"setup is {self.setup!r:.60}: expected a ProtonSetup or an OpticalSetup"
-            )
+            raise InputError(f"setup is {self.setup!r:.60}: expected that of an experiment")
         if self.strength is not None:
             strengths = as_numbers("strength", self.strength).ravel()
             if not strengths.size or not np.isfinite(strengths).all():

@@ -124,7 +124,7 @@ def test_one_image_keeps_its_field_and_gets_larger_errors() -> None:
     unsure = fitted(image, Instrument(beam_rms=0.05, background=0.1), **keywords)
     np.testing.assert_array_equal(unsure.fields[0].displacement, exact.fields[0].displacement)
     assert unsure.verdict is Verdict.UNCERTAIN
-    assert "beam" in unsure.explanation
+    assert "beam" in unsure.report.ranking
     # A beam 1 % off would move the field by so much; the instrument's numbers stay as stated.
     assert exact.report.beam is not None
     assert unsure.report.parts["beam"] == pytest.approx(5 * exact.report.beam.sensitivity, rel=0.5)
@@ -151,10 +151,8 @@ def test_errors_have_a_part_for_all_that_is_stated() -> None:
     assert parts.keys() - {"edge"} == {"noise", "beam", "background"}
     assert list(parts.values()) == sorted(parts.values(), reverse=True)
     facts = {fact.title: fact.text for fact in result.facts}
-    assert facts["Errors"].startswith(
-        f"{percent(result.report.total)} of the displacement (r.m.s.): "
-    )
-    assert all(title in facts["Errors"] for title in ("noise", "beam", "background"))
+    assert facts["Errors"].startswith(f"{percent(result.report.total)} of the displacement")
+    assert all(title in facts["Limited by"] for title in ("noise", "beam", "background"))
     assert "background" in facts["Instrument"]
     assert "beam between energies" in facts["Instrument"]
     restored = Fit.from_dataset(result.to_dataset())

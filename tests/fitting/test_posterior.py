@@ -338,7 +338,7 @@ def test_bright_lines_do_not_move_numbers_of_a_detector(stated: dict[str, float]
         weights=np.full((2, *size), noise**-2),
         free_brightness=False,
         free_frames=np.zeros(6, bool),
-        imperfect=Imperfect(**stated),
+        imperfect=Imperfect(stated),
     )
     truth = scene.nothing()
     y, x = np.indices(scene.rays.shape)

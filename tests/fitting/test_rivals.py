@@ -99,7 +99,8 @@ def test_a_wider_beam_starts_as_the_narrower_one() -> None:
     assert imperfect.keys == {"beam"}
     unknowns = data.scene.nothing()
     unknowns.common[:] = np.random.default_rng(3).normal(size=unknowns.common.size)
-    wide = replace(imperfect, shapes=(replace(imperfect.shapes[0], key="beam"),), background=0.1)
+    shapes = (replace(imperfect.shapes[0], key="beam"),)
+    wide = replace(imperfect, shapes=shapes, responses={"background": 0.1})
     adapted = wide.adapt(unknowns, imperfect)
     before, after = (
         each.shape_changes(numbers.common, numbers.separate)

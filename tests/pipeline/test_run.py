@@ -385,7 +385,7 @@ def test_a_shot_is_shown_and_what_an_inversion_does_not_use_is_named(image: Floa
     assert "Shot" in repr(Shot("shot.tif", name="shot"))
     with pytest.raises(InputError, match=r"image is 'shot\.tif': read it first"):
         _ = Shot("shot.tif").shape
-    with pytest.raises(InputError, match=r"setup is 'setup\.toml': expected a ProtonSetup"):
+    with pytest.raises(InputError, match=r"setup is 'setup\.toml': expected that of an experiment"):
         Shot(image, setup="setup.toml")
     texts = [c.text for c in run(Recipe(options=OPTIONS), Shot(image, psf=2.0)).report.warnings]
     assert any("the shot has psf, which only fits use" in text for text in texts)

@@ -67,8 +67,12 @@ class SoftModes:
         is_far = (values < _SOFT) | (values > _STIFF)
         chosen = np.flatnonzero(is_far & (errors < _FOUND * values))
         size, is_outdated = history.size, len(history) > _OUTDATED_STEPS
-        if self._vectors.shape[1] != size or (is_outdated and len(self) == _MOST_MODES):
+        if self._vectors.shape[1] != size:
             self._vectors, self._weights = np.empty((0, size)), np.empty(0)
+        elif is_outdated and len(self) == _MOST_MODES:
+            self._vectors, self._weights = np.empty((0, size)), np.empty(0)
+            # Their lengths are those with the old modes: less of a stiff one could become negative.
+            chosen = chosen[values[chosen] < _SOFT]
         chosen = chosen[: _MOST_MODES - len(self)]
         if not chosen.size:
             return
@@ -191,7 +195,7 @@ def solve(
     goal = tolerance**2 * product(residual, residual)
     turned = modes.precondition(residual)
     direction, square, steps = turned, product(residual, turned), 0
-    while steps < iterations and product(residual, residual) > goal:
+    while steps < iterations and square > 0 and product(residual, residual) > goal:
         image = times(direction)
         share = square / product(direction, image)
         solution += share * direction
