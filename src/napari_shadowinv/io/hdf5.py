@@ -2,7 +2,7 @@
 
 - `open_hdf5`; an item, `member`, or all of a group, `members`; its values, `load_dataset`
 - refuse a file whose arrays are elsewhere or too large: `check_arrays`
-- write one: `hdf5_in_memory`
+- write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
 
 An HDF5 file can point to others: by external links, external storage and virtual arrays. No
 reader follows them, because the content of another file would pass for the file's own pixels.
@@ -10,6 +10,8 @@ reader follows them, because the content of another file would pass for the file
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -24,6 +26,7 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
+_SEAL = b"\nshadowinv sha256 "
 MAX_LINKS = 16  # that lead to one item
 
 
@@ -150,8 +153,41 @@ def _iterate_datasets(path: Path, group: Any) -> Iterator[Any]:
 
 
 @contextmanager
-def hdf5_in_memory(path: Path) -> Iterator[BytesIO]:
-    """Make an HDF5 file in memory, and write it to the disk in one go when the block ends well."""
+def hdf5_in_memory(path: Path, *, seal: bool = False) -> Iterator[BytesIO]:
+    """Make an HDF5 file in memory, and write it to the disk in one go when the block ends well.
+
+    With `seal`, the checksum of all its bytes follows its end, where the HDF5 library never looks:
+    the checksums of the format leave out texts of variable length, such as attributes.
+    """
     content = BytesIO()  # on a full disk, the HDF5 library would end the process
     yield content
+    if seal:
+        checksum = hashlib.sha256(content.getvalue()).hexdigest()
+        content.seek(0, os.SEEK_END)
+        content.write(_SEAL + checksum.encode())
     path.write_bytes(content.getvalue())
+
+
+def check_hdf5_seal(path: Path, *, block_bytes: int = 1 << 20) -> None:
+    """Refuse a file that has changed since `hdf5_in_memory` sealed it; others pass.
+
+    A program that changes the file by the HDF5 library removes the seal.
+    """
+    length = len(_SEAL) + 2 * hashlib.sha256().digest_size
+    remaining = path.stat().st_size - length
+    if remaining <= 0:
+        return
+    with path.open("rb") as file:
+        file.seek(remaining)
+        end = file.read(length)
+        if not end.startswith(_SEAL):
+            return
+        file.seek(0)
+        checksum = hashlib.sha256()
+        while remaining > 0 and (block := file.read(min(block_bytes, remaining))):
+            checksum.update(block)
+            remaining -= len(block)
+    if checksum.hexdigest().encode() != end.removeprefix(_SEAL):
+        raise FileFormatError(
+            f"{path} is damaged: its content does not match its checksum; copy it again"
+        )

@@ -34,6 +34,7 @@ from napari_shadowinv.io.formats import (
 from napari_shadowinv.io.frames import FileFrame, find_frames, lazy_frames
 from napari_shadowinv.io.hdf5 import (
     check_arrays,
+    check_hdf5_seal,
     hdf5_in_memory,
 )
 from napari_shadowinv.io.images import film_warnings, to_grey
@@ -266,7 +267,7 @@ def write_result(path: Path, dataset: xarray.Dataset) -> None:
     marked = dataset.assign_attrs(format=ResultKind.of(dataset.attrs).value)
     # From this version of the format on, the file's own structures have checksums.
     with (
-        hdf5_in_memory(path) as content,
+        hdf5_in_memory(path, seal=True) as content,
         h5netcdf.File(content, "w", libver=("v110", "v110")) as file,
     ):
         marked.dump_to_store(H5NetCDFStore(file), encoding=encoding)
@@ -276,6 +277,7 @@ def read_result(path: Path) -> xarray.Dataset:
     """Read a dataset that `write_result` wrote, all of it into memory."""
     import xarray as xr
 
+    check_hdf5_seal(path)
     check_arrays(path)
     # Nothing in it is a time, whatever its units look like.
     return xr.load_dataset(path, engine="h5netcdf", decode_times=False)
