@@ -413,7 +413,7 @@ def test_files_that_are_no_image_are_refused(
     (folder / "notes.tif").write_text("not an image\n")
     refused("invert", "notes.tif", names=("notes.tif", "text file"))
     (folder / "cut.npy").write_bytes(shot.read_bytes()[:-100])
-    refused("invert", "cut.npy", names=("cut.npy", "truncated"))
+    refused("invert", "cut.npy", names=("cut.npy", "incomplete"))
     for place in (folder, "", "."):
         refused("invert", place, names="is a folder")
     for place in (".", "/"):

@@ -256,7 +256,7 @@ def test_a_result_of_the_command_line_opens_whole(
 
 
 BAD = {
-    "cut.shadowinv": (b"\x89HDF\r\n\x1a\n" + b"\0" * 40, "damaged or truncated"),
+    "cut.shadowinv": (b"\x89HDF\r\n\x1a\n" + b"\0" * 40, "damaged, incomplete"),
     "empty.mat": (b"", "is empty"),
     "cut.spe": (b"\x01" * 4200, "SPE"),
     "words.txt": (b"# x\n1 2\n3 four\n", "words.txt"),

@@ -230,7 +230,7 @@ def test_ten_of_a_hundred_files_corrupt(make_night, out, cluster):
     store = StackStore(out)
     for index in spoilt:
         reason = store.report(index)["reason"]
-        assert any(word in reason for word in ("truncated", "(3, 3)", "no positive pixel"))
+        assert any(word in reason for word in ("incomplete", "(3, 3)", "no positive pixel"))
 
 
 def test_what_shots_share_is_sent_to_a_cluster_without_a_warning(night, out, cluster, recwarn):

@@ -156,7 +156,7 @@ def spoil(night) -> dict[int, str]:
     np.save(night.path(2), 0 * night.images[2])
     np.save(night.path(3), np.ones((7, 9)))
     np.save(night.path(4), np.where(night.images[4] > 101, np.nan, night.images[4]))
-    return {0: "is empty", 1: "truncated", 2: "no positive pixel", 3: "(7, 9)", 4: "NaN"}
+    return {0: "is empty", 1: "incomplete", 2: "no positive pixel", 3: "(7, 9)", 4: "NaN"}
 
 
 def test_bad_shots_fail_alone_and_can_be_repeated(make_night, out):

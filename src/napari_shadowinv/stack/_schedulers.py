@@ -209,7 +209,7 @@ def _tasks(
         if blocks and isinstance(shot, ArrayExposure) and shot.is_lazy:
             block = [shot.block.to_delayed().ravel()[0]]
             shot = Exposure(shot.name, source=shot.source)
-        key = f"{10**9 - index}-{name}"  # dask begins with the last
+        key = f"{2 * 10**9 - index}-{name}"  # of ten digits each: dask begins with the last
         run = partial(run_shot, shot, index, should_stop)
         task = delayed(run, name=f"run-{key}", traverse=False)
         tasks.append(task(*shared, *block, dask_key_name=f"shot-{key}"))

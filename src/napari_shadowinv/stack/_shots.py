@@ -113,6 +113,8 @@ class ArrayExposure(Exposure):
 
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         plane = _plain_image(self.block.compute()[0]) if self.is_lazy else self.array[self.index]
+        # Sums depend on the order in memory.
+        plane = np.ascontiguousarray(plane)
         return (Shot(plane),), {"sha256": checksum(plane)}
 
     def __dask_tokenize__(self) -> Any:

@@ -94,7 +94,7 @@ def estimated(tool: Any, method: str, qtbot: Any) -> str:
 def test_an_estimate_that_contains_the_object_says_so(
     viewer: ViewerModel, opened: Any, qtbot: Any
 ) -> None:
-    image = synthetic_image(ellipse_pair((96, 120)).displacement)
+    image = synthetic_image(1.5 * ellipse_pair((96, 120)).displacement)
     viewer.add_image(image * np.random.default_rng(5).normal(1, 0.01, image.shape), name="shot")
     tool = opened(EstimateSource)
     assert tool.method.kind == "polynomial"

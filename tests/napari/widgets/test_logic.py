@@ -353,12 +353,12 @@ def test_a_megapixel_ends_at_the_look_that_asks(job: Any, tmp_path: Path) -> Non
     looks: list[bool] = []
 
     def should_stop() -> bool:
-        looks.append(len(looks) >= 12)  # in the middle of the estimate or filter
+        looks.append(len(looks) >= 8)  # in the middle of the estimate or filter
         return looks[-1]
 
     with pytest.raises(InversionCancelled):
         job(tmp_path)(lambda _: None, should_stop)
-    assert looks.count(False) == 12
+    assert looks.count(False) == 8
     assert looks.count(True) <= 2  # a stack's own, and its worker's
 
 
