@@ -473,7 +473,7 @@ def test_stack_is_clicked_to_its_end(
     window.dims.set_current_step(0, 12)
     qtbot.wait(50)
 
-    (command,) = re.findall(r"^    shadowinv (status .*)$", text, re.M)
+    (command,) = re.findall(r"^    shadowinv (info .*)$", text, re.M)
     result = CliRunner().invoke(app, shlex.split(command))
     assert result.exit_code == 0, result.output
     names: dict[str, Any] = {}
