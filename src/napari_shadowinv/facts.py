@@ -66,6 +66,11 @@ def percent(share: float) -> str:
     return "below 0.01 %" if 0 < share < 1e-4 else f"{to_figures(100 * share)} %"
 
 
+def limit_text(part: str, total: str) -> str:
+    """Name the largest part of the errors, with their total."""
+    return f"limited by {part} (errors {total})"
+
+
 def decimals_of(error: float) -> int:
     """Return the decimals that show an error to two figures."""
     return max(0, 1 - math.floor(math.log10(error)))

@@ -38,6 +38,7 @@ from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.instrument.effects import EFFECTS, Effect
 from napari_shadowinv.inversion.variables import FIT_VARIABLES, belongs, dataset_from_field
 from napari_shadowinv.options import FitOptions, Instrument
+from napari_shadowinv.physics.edge import LARGER_FIELD
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.physics.significance import (
     PixelErrors,
@@ -103,7 +104,7 @@ _REMEDIES = {
     "noise": "average shots, or take images at energies that differ more",
     "other_field": "fit both fields, with images at more energies",
     "registration": "align the images by marks on each of them",
-    "edge": "record a larger field of view",
+    "edge": LARGER_FIELD,
     "beam": "record a reference",
 }
 

@@ -14,13 +14,13 @@ import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.facts import Assessment, Verdict, percent, to_figures
+from napari_shadowinv.facts import Assessment, Verdict, limit_text, percent, to_figures
 from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.measurements import NoiseMatch
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
-from napari_shadowinv.physics.edge import beyond_sides, edge_doubt
+from napari_shadowinv.physics.edge import LARGER_FIELD, beyond_sides, edge_doubt
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import Condition, shown_fields
 
@@ -214,7 +214,7 @@ def _not_explained(case: Evidence) -> Answer:
     return Assessment(
         verdict,
         f"the model does not explain {worst} (χ² {to_figures(chi2.max())})",
-        _short_cause(case, verdict),
+        _short_cause(case) if verdict is Verdict.MISFIT else LARGER_FIELD,
         f"the forward model does not explain {_those(case.names, chi2, misfits)}, where 1 is "
         f"expected: {causes}",
     )
@@ -237,7 +237,7 @@ def _likely_cause(case: Evidence) -> Answer:
         return None
     reason = "the images do not look like the model"
     why = f"{reason}: likely {case.pattern.cause}"
-    return Assessment(Verdict.MISFIT, reason, _short_cause(case, Verdict.MISFIT), why)
+    return Assessment(Verdict.MISFIT, reason, _short_cause(case), why)
 
 
 def _rays_lost(case: Evidence) -> Answer:
@@ -271,13 +271,11 @@ def _rays_meet(case: Evidence) -> Answer:
 def _pattern_left(case: Evidence) -> Answer:
     if not case.pattern.is_certain:
         return None
-    # An object that the edge cuts leaves a pattern, too.
-    verdict = Verdict.EDGE if case.at_edge else Verdict.MISFIT
-    texts = [case.at_edge, _pattern_text(case.pattern, case.names)]
+    pattern_text = _pattern_text(case.pattern, case.names)
+    if case.at_edge:  # an object that the edge cuts leaves a pattern, too
+        return _cut_by_edge(case, f"{case.at_edge}; {pattern_text}")
     reason = "the residual has a pattern"
-    if verdict is Verdict.EDGE:
-        reason = f"the object goes on {beyond_sides(case.fit.report.sides)}"
-    return Assessment(verdict, reason, _short_cause(case, verdict), "; ".join(filter(None, texts)))
+    return Assessment(Verdict.MISFIT, reason, _short_cause(case), pattern_text)
 
 
 def _counts_missing(case: Evidence) -> Answer:
@@ -298,10 +296,7 @@ def _counts_missing(case: Evidence) -> Answer:
 
 
 def _beyond_edge(case: Evidence) -> Answer:
-    if not case.at_edge:
-        return None
-    reason = f"the object goes on {beyond_sides(case.fit.report.sides)}"
-    return Assessment(Verdict.EDGE, reason, _short_cause(case, Verdict.EDGE), case.at_edge)
+    return _cut_by_edge(case, case.at_edge) if case.at_edge else None
 
 
 def _other_answers(case: Evidence) -> Answer:
@@ -406,13 +401,16 @@ def _limited(case: Evidence) -> str:
     report = case.fit.report
     if not (report.parts and np.isfinite(report.total)):
         return ""
-    return f"limited by {TITLES[next(iter(report.parts))]} (errors {percent(report.total)})"
+    return limit_text(TITLES[next(iter(report.parts))], percent(report.total))
 
 
-def _short_cause(case: Evidence, verdict: Verdict) -> str:
+def _cut_by_edge(case: Evidence, explanation: str) -> Assessment:
+    reason = f"the object goes on {beyond_sides(case.fit.report.sides)}"
+    return Assessment(Verdict.EDGE, reason, LARGER_FIELD, explanation)
+
+
+def _short_cause(case: Evidence) -> str:
     """The likely cause of a misfit, or a check, in a few words."""
-    if verdict is Verdict.EDGE:
-        return "record a larger field of view"
     cause = case.pattern.cause.partition(":")[0]
     return f"likely {cause}" if cause else "check noise, source and point spread"
 

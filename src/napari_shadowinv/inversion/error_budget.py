@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.facts import percent, round_down, to_figures
+from napari_shadowinv.facts import limit_text, percent, round_down, to_figures
 from napari_shadowinv.instrument.effects import EFFECTS
 from napari_shadowinv.physics.edge import edge_doubt
 from napari_shadowinv.physics.units import Condition, PeakError
@@ -232,7 +232,7 @@ class Errors:
     @property
     def limit(self) -> str:
         """The largest part, with the total, such as "limited by beam (errors 4 %)"."""
-        return f"limited by {self._title(next(iter(self.parts)))} (errors {self.share_text})"
+        return limit_text(self._title(next(iter(self.parts))), self.share_text)
 
     @property
     def reason(self) -> str:

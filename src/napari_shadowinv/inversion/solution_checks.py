@@ -54,6 +54,7 @@ from napari_shadowinv.geometry.compiler import kernel
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.edge import LARGER_FIELD
 
 _BRIGHT = 3.0  # times the source: a bright line, too fine for the pixels
 _LAGS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 4), (4, 0))
@@ -89,7 +90,7 @@ DECISIVE = {
     "negative": (Verdict.UNCERTAIN, "invert its grey values, or keep it as it is"),
     "no-deflection": (Verdict.UNCERTAIN, "average more shots"),
     "folds": (Verdict.AMBIGUOUS, "fit images at two energies"),
-    "edge": (Verdict.EDGE, "record a larger field of view"),
+    "edge": (Verdict.EDGE, LARGER_FIELD),
     "masked-peak": (Verdict.UNCERTAIN, "unmask what is sound"),
     "correlated-noise": (Verdict.UNCERTAIN, "give the noise level"),
 }

@@ -160,6 +160,10 @@ def edge_sides(squares: FloatArray, strip: float = 0.1, share: float = 0.25) -> 
     )
 
 
+LARGER_FIELD = "record a larger field of view"
+"""The advice about an object that goes on beyond the image."""
+
+
 def edge_doubt(error: float, others: float, largest: float, sides: Sequence[str]) -> str:
     """Return in words how much of a field rests on what lies beyond its sides; "" if it is little.
 
@@ -184,7 +188,7 @@ def edge_doubt(error: float, others: float, largest: float, sides: Sequence[str]
         return ""
     return (
         f"{percent(error)} of the displacement (r.m.s.) rests on what lies {beyond_sides(sides)}: "
-        "record a larger field of view, or compare closed and free boundaries"
+        f"{LARGER_FIELD}, or compare closed and free boundaries"
     )
 
 
