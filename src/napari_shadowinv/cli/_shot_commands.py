@@ -376,7 +376,7 @@ def _error_text(estimate: FloatArray, truth: FloatArray) -> str:
     if not true_peak:
         return f"peak {peak:.3g} px where the truth is zero"
     distance = float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
-    return f"peak {peak / true_peak - 1:+.1%}, L2 {percent(distance)}"
+    return f"peak {100 * (peak / true_peak - 1):+.1f} %, L2 {percent(distance)}"
 
 
 def trace_field(
