@@ -43,9 +43,9 @@ def test_watch_inverts_existing_files_first_then_arrivals(folder, out):
         with pytest.raises(FileFormatError, match="is being written by"), locked(out):
             pass
     names = [f"shot_{index}.npy" for index in (1, 2, 5, 0)]
-    assert [event.name for event in watch.shots] == names
+    ended = [event.name for event in watch.shots]
+    assert [sorted(ended[:2]), *ended[2:]] == [names[:2], *names[2:]]  # two run side by side
     assert list(watch.result.name.values) == names
-    assert watch.shots[0].total == 1
 
 
 def test_watch_equals_a_run(folder, out, tmp_path):
@@ -157,7 +157,7 @@ def test_bad_files_fail_alone(folder, out):
         watch.ended(7)
     result = watch.result
     assert list(result.status.values) == [FAILED] * 3 + [DONE, FAILED, DONE, DONE]
-    reasons = [event.outcome.reason for event in watch.shots]
+    reasons = {event.outcome.index: event.outcome.reason for event in watch.shots}
     assert "is empty" in reasons[0]
     assert "image has shape (10, 28), expected (24, 28)" in reasons[1]
     assert reasons[4] == StackStore(out).report(4)["reason"]
@@ -382,17 +382,17 @@ def test_shot_not_converged_ends_with_exit_code_3(folder, out, tmp_path, command
 
 
 def test_file_written_during_its_read_is_read_again(folder, out):
+    names = "shot_0.npy", "shot_1.npy"
     reads = []
 
     def load_and_change(path: Path) -> np.ndarray:
         image = np.load(path)
         reads.append(path.name)
-        if len(reads) == 1:
+        if path.name == names[0] and reads.count(names[0]) == 1:
             path.write_bytes(whole(4))
         return image
 
     put(folder, 0, 1)
-    names = "shot_0.npy", "shot_1.npy"
     with Watched(folder, out, reader=load_and_change, dtype="float64") as watch:
         watch.ended(3)
         watch.until(lambda: watch.events[-1].waiting == 0)
