@@ -45,6 +45,20 @@ def test_noise_shows_no_shift():
         measure_shift(image, source[:, 1:])
 
 
+def test_a_source_of_noise_stays_and_a_mesh_below_the_noise_is_registered():
+    rng = np.random.default_rng(0)
+    mesh = 100 * (1 + 0.1 * np.sin(Y * 200 * np.pi / 4.5) * np.sin(X * 200 * np.pi / 4.5))
+    image, source = (rng.poisson(plane).astype(float) for plane in (mesh[2:], mesh[:-2]))
+    usable = np.ones(image.shape, bool)
+    moved = register_source(image, source, usable, Instrument(registration=1.0))
+    assert moved.source is not source
+    assert moved.error < 0.1
+    noise = rng.poisson(np.full(image.shape, 100.0)).astype(float)
+    stays = register_source(image, noise, usable, Instrument(registration=1.0))
+    assert stays.source is noise
+    assert stays.error == 1.0
+
+
 def test_an_object_at_the_borders_does_not_move_a_uniform_source():
     image = synthetic_image(opposite_pair((200, 200), paper_setup()).displacement)
     for seed in range(15):

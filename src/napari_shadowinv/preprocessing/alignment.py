@@ -128,6 +128,8 @@ def register_source(
     expected = DEFAULT_REGISTRATION if instrument.registration is None else instrument.registration
     if not expected or not np.ptp(source[usable]) > 0:
         return RegisteredSource(source, 0.0)
+    if _is_white(source, usable):
+        return RegisteredSource(source, expected, is_assumed=instrument.registration is None)
     shift = measure_shift(image, source, usable, beam)
     error = shift.left(expected)
     if not shift.is_significant.any():
@@ -141,6 +143,19 @@ def register_source(
         "shift is in the error. State a registration of 0 if both are on the same pixels"
     )
     return RegisteredSource(moved, error, Caution("register", text))
+
+
+def _is_white(
+    plane: FloatArray, usable: BoolArray, *, deviations: float = 5.0, least: int = 50
+) -> bool:
+    """Return whether means over blocks, of a least number, scatter as those of white noise."""
+    variance, side = float(plane[usable].var()), 2
+    while (whole := complete_blocks(usable, side)).sum() > least:
+        share = float(complete_block_means(plane, side)[whole].var()) * side**2 / variance
+        if abs(share - 1) > deviations * np.sqrt(2 / whole.sum()):
+            return False
+        side *= 2
+    return side > 2
 
 
 def move(source: FloatArray, shift: FloatArray) -> FloatArray:
