@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import constants
@@ -17,6 +15,7 @@ from napari_shadowinv.analysis import (
     Flux,
     analyse,
 )
+from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.result import RetrievedField
@@ -65,8 +64,7 @@ def test_current_of_an_inversion_lacks_nothing_by_its_read_out():
     exact = -2 * np.pi * radius * PIXEL * abs(field) / constants.mu_0
     (read_out,) = circle.measure(potential, displacement, frame).values()
     assert abs(read_out / exact - 1) > 8e-3
-    inverted = replace(frame, is_pixel_mean=True)
-    (current,) = circle.measure(potential, displacement, inverted).values()
+    (current,) = circle.measure(*finer_field(potential, displacement), frame).values()
     assert current == pytest.approx(exact, rel=1e-3)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis._field_samples import Evaluation, SampledField, sampled_fields
 from napari_shadowinv.analysis.frame import FieldFrame, field_unit
 from napari_shadowinv.analysis.kinds import product_from_dict, product_from_text
@@ -165,9 +164,8 @@ class _Task:
         return self.measure
 
     def _values(self, potential: FloatArray, displacement: FloatArray) -> list[Values]:
-        measured = (
-            each.measure(potential, displacement, self.field.frame) for each in self.products
-        )
+        field = self.field.at_points(potential, displacement)
+        measured = (each.measure(*field, self.field.frame) for each in self.products)
         return [
             {name: np.asarray(value, dtype=np.float64) for name, value in values.items()}
             for values in measured
@@ -184,9 +182,7 @@ class _Task:
         """Yield the results, with systematic errors of random sign added to the samples."""
         systematic = {**evaluation.systematic, **self._by_energy(evaluation.value)}
         if len(evaluation.samples):
-            # Means over pixels, and central differences of the read-out
-            finer = finer_field(self.field.potential, self.field.displacement)
-            systematic["pixels"] = self.measure(*finer) - evaluation.value
+            systematic["pixels"] = self.measure(*self.field.within_pixels()) - evaluation.value
             systematic |= self._by_product()
         samples = evaluation.samples
         numbers = stratified_numbers(rng, len(samples), len(systematic))

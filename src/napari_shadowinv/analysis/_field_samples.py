@@ -11,6 +11,7 @@ import numpy as np
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame, FieldUnit
 from napari_shadowinv.analysis.paths import is_inside
 from napari_shadowinv.analysis.product import FieldNoise
@@ -23,8 +24,10 @@ from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
+from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import potential_from_displacement
 from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.preprocessing.pixels import LEAST_LIGHT
 
 if TYPE_CHECKING:
     from napari_shadowinv.fitting.result import Fit
@@ -68,6 +71,16 @@ class SampledField:
         value = choose(None)(self.potential, self.displacement)
         return Evaluation(value, np.zeros((0, value.size)), {}, ())
 
+    def at_points(
+        self, potential: FloatArray, displacement: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return what was read out as potential and displacement at the middles of pixels."""
+        return potential, displacement
+
+    def within_pixels(self) -> tuple[FloatArray, FloatArray]:
+        """Return another potential and displacement, as far off as pixels hide."""
+        return finer_field(self.potential, self.displacement)
+
 
 @dataclass(frozen=True, eq=False)
 class StoredSamples(SampledField):
@@ -95,6 +108,12 @@ class ResampledInversion(SampledField):
     """An inversion, of which samples are drawn by its noise and instrument."""
 
     inversion: Inversion
+
+    def at_points(
+        self, potential: FloatArray, displacement: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the values of what is read out as a mean over pixels, and by differences."""
+        return finer_field(potential, displacement)
 
     def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:
         inversion = self.inversion
@@ -136,6 +155,16 @@ class ResampledInversion(SampledField):
         shifted += (value - repeated.value).astype(shifted.dtype)
         cautions = tuple(self._sample_cautions(scatter))
         return Evaluation(value, shifted, systematic, tuple(causes), cautions)
+
+    def within_pixels(self) -> tuple[FloatArray, FloatArray]:
+        """Return the field if the brightness had a slope within pixels.
+
+        An inversion takes it as constant there, and so it misses the inverse of a blur of 1/6 px²,
+        which moves light by 1/12 of the logarithm's slope.
+        """
+        area = jacobian_determinant(self.displacement)
+        change = np.log(np.maximum(area, LEAST_LIGHT)) / 12
+        return self.potential + change, self.displacement + displacement_from_potential(change)
 
     def _sample_cautions(self, scatter: Uncertainty, least: float = 0.2) -> Iterator[Caution]:
         """Yield doubts about samples, if noise is not below a share of the discretisation error."""
@@ -239,7 +268,7 @@ def _of_inversion(
         source=np.where(inversion.mask, inversion.source * inversion.report.flux_scale, np.nan),
     )  # fmt: skip
     is_folded = any(caution.code == "folds" for caution in inversion.cautions)
-    frame = replace(frame, has_crossed_rays=is_folded, is_pixel_mean=True)
+    frame = replace(frame, has_crossed_rays=is_folded)
     yield ResampledInversion(
         frame, inversion.potential, inversion.displacement, inversion.instrument, inversion
     )

@@ -298,7 +298,6 @@ class AxisymmetricProfile(Product):
         return len(self._slices) > 1
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
-        _, displacement = frame.at_points(potential, displacement)
         right_side, left_side = self._sides(displacement, frame)
         _, inverse = self._operators(frame)
         values = self._profiles((right_side + left_side) / 2 @ inverse.T, frame)

@@ -74,7 +74,6 @@ class _Enclosed(Outlined):
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
         points, sides = edge_midpoints(self.outline)
-        _, displacement = frame.at_points(potential, displacement)
         down, right = (interpolate_cubic(plane, points) for plane in displacement)
         # From x to y around the outline, outwards is to the left of the direction.
         outward = float((right * sides[:, 0] - down * sides[:, 1]).sum())

@@ -132,7 +132,6 @@ class Filaments(Product):
         return {"lag": Coordinate.in_plane(self._lags(frame), frame, "Lag")}
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
-        potential, displacement = frame.at_points(potential, displacement)
         weights = window_weights(frame.mask)
         assert self.angle is not None  # by `adapt`
         radians = math.radians(self.angle)

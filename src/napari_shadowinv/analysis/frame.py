@@ -12,7 +12,6 @@ from functools import cached_property
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis.paths import is_inside
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
@@ -98,9 +97,6 @@ class FieldFrame:
         The recorded image and the undisturbed beam in its unit; NaN where masked.
     has_crossed_rays : bool
         Whether the result says that rays cross.
-    is_pixel_mean : bool
-        Whether the potential is a mean over pixels and the displacement its central differences,
-        as inversions read them out.
     """
 
     shape: tuple[int, int]
@@ -111,7 +107,6 @@ class FieldFrame:
     image: AnyArray | None = None
     source: AnyArray | None = None
     has_crossed_rays: bool = False
-    is_pixel_mean: bool = False
 
     @cached_property
     def contrast(self) -> FloatArray | None:
@@ -174,14 +169,6 @@ class FieldFrame:
         return self.setup.field_in_si(
             self.unit.field, displacement if self.is_vector else potential
         )
-
-    def at_points(
-        self, potential: FloatArray, displacement: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return potential and displacement at the middles of pixels, rather than means."""
-        if not self.is_pixel_mean:
-            return potential, displacement
-        return finer_field(potential, displacement)
 
     @cached_property
     def limits(self) -> tuple[str, ...]:
