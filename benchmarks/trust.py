@@ -586,15 +586,15 @@ def flaws(seed: int, count: int) -> Iterator[Answer]:
     for number in range(count):
         rng = random_number(seed, "flaws", number)
         flaw = FLAWS[number % len(FLAWS)]
-        round_number = number // len(FLAWS) + number % len(FLAWS)
-        name = ("ring", "ellipses", "lumps")[round_number % 3]
-        is_folded = (number + number // len(FLAWS)) % 2 == 1
+        turn, place = divmod(number, len(FLAWS))
+        name = ("ring", "ellipses", "lumps")[(turn + place) % 3]
+        is_folded = (turn + place) % 2 == 1  # each flaw in turns
         displacement, _, truth = made(inside, name, 1.6 if is_folded else 0.6, seed)
-        setups = setups_of(2 + round_number // 2 % 2)
+        setups = setups_of(2 + ((turn + 1) // 2 + place // 2) % 2)
         energies = [setup.energy for setup in setups]
         images = flawed_images(flaw, displacement, energies, rng)
         level = COUNTS * (1 + flaw.pedestal) ** flaw.gamma
-        given = {"noise": "poisson"} if round_number % 2 else {}
+        given = {"noise": "poisson"} if (turn // 2 + place) % 2 else {}
         source = np.full((SIDE, SIDE), level)
         result = fit(shots_of(images, setup=setups, source=source, **given))
         named = causes_named(result)
