@@ -278,23 +278,6 @@ def test_a_rough_search_ends_at_a_step_that_gains_what_was_expected(scene: Scene
     assert value - least < 0.02 * (before - least)
 
 
-def test_a_hopeless_search_ends_before_its_first_step(
-    scene: Scene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Images with a constant beneath them: no field comes near the objective to beat."""
-    truth = bump(scene, 1.0)
-    target = with_noisy_images(scene, truth)
-    to_beat = settle(target, truth, steps=8, least_gain=0.1)[1]
-    brighter = replace(target, images=target.images + 0.3)
-    built: list[Scene] = []
-    original = Scene.linear
-    monkeypatch.setattr(Scene, "linear", lambda *given: built.append(given[0]) or original(*given))
-    end, value, steps, _ = settle(brighter, truth, steps=8, least_gain=0.1, to_beat=to_beat)
-    assert (steps, len(built)) == (0, 1)
-    assert end is truth
-    assert value > 3 * to_beat
-
-
 def steps_of_solution(scene: Scene) -> int:
     """How many steps a linear system of a scene without an object takes."""
     scales, nothing = Preconditioner(scene), scene.nothing()

@@ -144,7 +144,6 @@ _NEXT_GAIN = 0.7  # of the least gain; a step gains up to twice what is expected
 _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 # Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.
 _RENEWING_GAIN = 5.0
-_TRIED_STEPS = 3  # before a search may be hopeless
 _AS_EXPECTED = 0.2  # of a gain
 _MOST_PIXELS = 2_000_000  # of all images
 _SCALE, _TRANSPOSE = "nmyx,nyx->myx", "nmyx,myx->nyx"  # sums over the fields of scales
@@ -380,7 +379,6 @@ def settle(
     after_step: Callable[[float], None] | None = None,
     modes: SoftModes | None = None,
     linear: Linear | None = None,
-    to_beat: float | None = None,
     is_rough: bool = False,
 ) -> tuple[Unknowns, float, int, bool]:
     """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
@@ -399,11 +397,6 @@ def settle(
         Of the Hessians of this scene, from scenes of the same pixels and priors.
     linear : Linear, optional
         The scene to first order near the start: used for all steps while these succeed.
-    to_beat : float, optional
-        An objective to compare with. Then only the objective matters, not the unknowns along a flat
-        valley. A search is hopeless, and ends, if more than a third of its first distance is left
-        after three Gauss-Newton steps, if as much is expected to be left after the next, or where
-        these fail.
     is_rough : bool, default False
         Whether a Gauss-Newton step that gains what it was expected to is the last.
 
@@ -420,15 +413,14 @@ def settle(
     scales = Preconditioner(scene)
     # Scales of numbers that fields may replace, of frames and added light are rough.
     is_scaled = not (scales.has_rough_numbers or scene.added or scene.free_frames.any())
-    if scales.has_rough_numbers and to_beat is None:
+    if scales.has_rough_numbers:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
-    if scene.has_free_numbers and to_beat is None:
+    if scene.has_free_numbers:
         least_gain *= _GAIN_IN_VALLEY
     modes = SoftModes() if modes is None else modes
     now = start
     counts = scene.ray_counts(now)
     value, slope = scene.value_and_gradient(now, counts)
-    hopeless = np.inf if to_beat is None else to_beat + max(value - to_beat, 0.0) / 3
     # Jacobians of many pixels would fill the memory.
     newton = min(_MOST_NEWTON, steps) if scene.images.size <= _MOST_PIXELS else 0
     taken = shortened = 0
@@ -447,8 +439,6 @@ def settle(
         linear = linear or scene.linear(now, counts)
         step = newton_step(linear, down)
         expected_gain = product(down, step) / 2
-        if value - expected_gain > hopeless:
-            break
         change = scales.times(now.like(step))
         for share in _SHARES_OF_STEP:
             trial = now.plus(now.like(share * change.flat()))
@@ -471,8 +461,6 @@ def settle(
         next_gain = product(after, modes.precondition(after)) / 2
         if gain < least_gain or (next_gain < _NEXT_GAIN * least_gain and is_scaled):
             return now, scene.value(now), taken, True
-        if taken == _TRIED_STEPS and value > hopeless:
-            break
         # Where little is left to gain, Jacobians from nearby serve.
         if share < 1 or (is_new and next_gain > _RENEWING_GAIN):
             linear = None
@@ -480,7 +468,7 @@ def settle(
             counts = scene.ray_counts(now)
             value, slope = scene.value_and_gradient(now, counts)
     remaining_steps = steps - taken
-    if remaining_steps > 0 and value <= hopeless:
+    if remaining_steps > 0:
         now, value, more = descend(
             scene, now, iterations=remaining_steps, least_gain=least_gain, after_step=after_step
         )

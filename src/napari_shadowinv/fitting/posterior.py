@@ -479,10 +479,11 @@ class BeamError:
         """The response in a sentence."""
         sentence = (
             f"a beam that differs by 1 % (r.m.s.) over {to_figures(self.scale)} of the "
-            f"image's shorter side would move the displacement by {self.sensitivity:.1%} (r.m.s.)"
+            f"image's shorter side would move the displacement by {percent(self.sensitivity)} "
+            "(r.m.s.)"
         )
         if self.variation:
-            sentence += f", one by {percent(self.variation)} by {self.share:.1%}"
+            sentence += f", one by {percent(self.variation)} by {percent(self.share)}"
         return sentence
 
 

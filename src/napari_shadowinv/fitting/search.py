@@ -330,8 +330,6 @@ def settle_minimum(
     on_step: OnStep,
     name: str = "smoothness",
     least_gain: float = COARSE_GAIN,
-    steps: int = _ROUND_STEPS,
-    to_beat: float | None = None,
     is_rough: bool = False,
     linear: Linear | None = None,
 ) -> Minimum:
@@ -340,12 +338,11 @@ def settle_minimum(
     unknowns, value, _, _ = settle(
         middle,
         minimum.unknowns,
-        steps=steps,
+        steps=_ROUND_STEPS,
         least_gain=least_gain,
         after_step=lambda now: on_step(name, now),
         modes=minimum.modes,
         linear=replace(linear, scene=middle) if linear else None,
-        to_beat=to_beat,
         is_rough=is_rough,
     )
     return replace(
