@@ -15,18 +15,16 @@ import typer
 from typer.testing import CliRunner
 
 from helpers.command_line import flat
-from napari_shadowinv import Fit, FitOptions, Inversion, cli, fit, invert, synthetic_image, write
+from napari_shadowinv import Inversion, cli, invert, synthetic_image, write
 from napari_shadowinv.analysis import PRODUCTS, analyse
 from napari_shadowinv.cli._terminal import EXIT_MISTAKE
-from napari_shadowinv.facts import with_error
-from napari_shadowinv.fitting import unknowns
 from napari_shadowinv.inversion.budget import FLUX_ERRORS
 from napari_shadowinv.io import store_columns
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import STEPS
 from napari_shadowinv.preprocessing.steps import Step, choices_of
-from napari_shadowinv.shot import Shot, shots_of
+from napari_shadowinv.shot import Shot
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "napari_shadowinv"
@@ -128,33 +126,6 @@ def test_the_column_is_in_the_reports_of_inversions(names, monkeypatch, inversio
     values = store_columns.column_values(store_columns.INVERSIONS, inversion)
     assert values[column.key] == pytest.approx(inversion.errors.rms)
     assert column.key not in store_columns.column_values(store_columns.FITS, make_fit())
-
-
-def test_the_unknown_is_fitted_with_the_field(names, monkeypatch):
-    truth = gaussian_blob((48, 48), 30.0, 7.0).displacement
-    backgrounds = [0.08, -0.05]
-    images = np.stack([synthetic_image(truth), synthetic_image(0.6 * truth)])
-    images += np.array(backgrounds)[:, None, None]
-    images += 0.02 * np.random.default_rng(0).normal(size=images.shape)
-    shots = shots_of(images, strength=[1, 0.6], noise=0.02, source=np.ones((48, 48)))
-    monkeypatch.setattr(unknowns, "ADDITIVE", (names["Background"],))
-    options_class = type("Options", (names["FitOptions"], FitOptions), {})
-    result = fit(shots, options=options_class(background=0.1))
-    error = np.abs(result.fields[0].displacement - truth).max()
-    plain = fit(shots, options=options_class(samples=0))
-    assert plain.report.added == {}
-    assert error < 0.1 * np.abs(plain.fields[0].displacement - truth).max()
-    rows = np.array(result.report.added["background"])
-    assert rows.shape == (2, 1, 2)
-    for (value, deviation), background in zip(rows[:, 0], backgrounds, strict=True):
-        assert 1e-4 < deviation < 0.01
-        assert abs(value - background) < 4 * deviation
-    facts = {fact.key: fact.text for fact in result.facts}
-    assert f"background {with_error(*rows[0, 0])}" in facts["image_1"]
-    # The option is then one of FitOptions itself.
-    monkeypatch.setattr("napari_shadowinv.fitting.result.FitOptions", options_class)
-    again = Fit.from_dataset(result.to_dataset())
-    assert again.report.added == result.report.added
 
 
 @pytest.mark.parametrize("kind", ["u1", ">u2"])

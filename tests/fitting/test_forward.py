@@ -13,9 +13,8 @@ from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.forward import Scene, blurred
 from napari_shadowinv.fitting.instrument import EXACT, Imperfect
 from napari_shadowinv.fitting.rays import at_rest
-from napari_shadowinv.fitting.unknowns import AdditiveBlock, Fiducials, Unknowns
+from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 from napari_shadowinv.instrument.shapes import Shapes
-from napari_shadowinv.options import FitOptions
 
 SIZE, PAD = (32, 40), 8
 KERNEL = np.array([[0.0, 0.1, 0.0], [0.2, 0.4, 0.1], [0.0, 0.15, 0.05]])
@@ -24,22 +23,6 @@ KERNEL = np.array([[0.0, 0.1, 0.0], [0.2, 0.4, 0.1], [0.0, 0.15, 0.05]])
 def waves(shape: tuple[int, int], phase: float) -> FloatArray:
     y, x = np.indices(shape)
     return np.asarray(np.cos(y / 5 + phase) * np.sin(x / 7 - phase))
-
-
-class Stripes(AdditiveBlock):
-    """A constant and a stripe."""
-
-    title = "stripes"
-
-    @classmethod
-    def from_options(cls, options: FitOptions) -> Stripes:
-        return cls()
-
-    def spreads(self) -> FloatArray:
-        return np.array([0.1, 0.3])
-
-    def patterns(self, size: tuple[int, int]) -> FloatArray:
-        return np.stack([np.ones(size), waves(size, 0.3)])
 
 
 @pytest.fixture
@@ -70,7 +53,6 @@ def scene() -> Scene:
         blur=0.7,
         spacing=1 / 3,
         threads=1,
-        added=(Stripes(),),
         imperfect=Imperfect(
             {"gamma": 0.1, "background": 0.05},
             blur=0.5,
@@ -94,7 +76,6 @@ def some(scene: Scene) -> Unknowns:
     unknowns.separate[:] = [[0.5, -0.6, 0.4], [-0.3, 0.7, 0.2]]
     unknowns.brightness[:] = 0.1, -0.2
     unknowns.frames[1] = [0.4, 1.01, -0.01, -0.3, 0.02, 0.98]
-    unknowns.added[0][:] = [[0.1, 0.05], [-0.05, 0.02]]
     return unknowns
 
 
@@ -114,7 +95,7 @@ def only(part: str, change: Unknowns) -> Unknowns:
 
 
 @pytest.mark.parametrize(
-    "part", ["potentials", "brightness", "frames", "common", "separate", "added", "all"]
+    "part", ["potentials", "brightness", "frames", "common", "separate", "all"]
 )
 @pytest.mark.parametrize("force", [False, True], ids=["plain", "forced"])
 def test_the_gradient_is_that_of_the_value(scene: Scene, part: str, force: bool) -> None:
@@ -239,7 +220,7 @@ def test_normal_products_of_sharp_images_are_pulled_pushes(
     )
     if not everything:
         fixed = {"free_brightness": False, "free_frames": np.zeros(6, bool)}
-        sharp = replace(sharp, **fixed, added=(), imperfect=EXACT)
+        sharp = replace(sharp, **fixed, imperfect=EXACT)
     assert sharp.rays.seen == SIZE
     unknowns = sharp.nothing()
     unknowns.potentials[:] = some(scene).potentials

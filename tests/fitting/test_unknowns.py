@@ -10,14 +10,14 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 def some(seed: int) -> Unknowns:
     rng = np.random.default_rng(seed)
     shapes = ((2, 4, 5), (4,), (2,), (2, 6), (2, 3), (2, 1))
-    return Unknowns.from_blocks(rng.normal(size=shape) for shape in shapes)
+    return Unknowns(*(rng.normal(size=shape) for shape in shapes))
 
 
 def test_flat_and_like_are_inverses() -> None:
     unknowns = some(0)
     flat = unknowns.flat()
     assert flat.shape == (2 * 4 * 5 + 4 + 2 + 12 + 6 + 2,)
-    for part, restored in zip(unknowns.blocks, unknowns.like(flat).blocks, strict=True):
+    for part, restored in zip(unknowns, unknowns.like(flat), strict=True):
         np.testing.assert_array_equal(part, restored)
 
 
@@ -30,10 +30,10 @@ def test_sums_are_those_of_the_parts() -> None:
 def test_some_images_have_their_rows_of_each_block() -> None:
     unknowns = some(3)
     second = unknowns.only([1])
-    for block, chosen in zip(unknowns.blocks[2:], second.blocks[2:], strict=True):
+    for block, chosen in zip(unknowns[2:], second[2:], strict=True):
         np.testing.assert_array_equal(chosen, block[1:])
     doubled = second.plus(second)
     merged = unknowns.with_images([1], doubled)
     np.testing.assert_array_equal(merged.potentials, doubled.potentials)
-    for block, new in zip(unknowns.blocks[2:], merged.blocks[2:], strict=True):
+    for block, new in zip(unknowns[2:], merged[2:], strict=True):
         np.testing.assert_array_equal(new, np.concatenate([block[:1], 2 * block[1:]]))

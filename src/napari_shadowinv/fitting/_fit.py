@@ -133,9 +133,7 @@ def fit(
         least = float(np.sqrt(data.noise.expected_chi2.min()))
         amplification = max(noise_amplification(pattern.correlation) * least, 1.0)
         errors = field_errors(data, minima.scene, openness, amplification, options.seed)
-        report = report_of(
-            data, minima.instrument, refined, openness, pattern, amplification, options
-        )
+        report = report_of(data, minima.instrument, refined, openness, pattern, options)
         if options.evidence:
             evidence = log_evidence(minima.scene, minima.best, fields, options, on_step)
             report = replace(report, log_evidence=evidence)

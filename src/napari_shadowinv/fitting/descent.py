@@ -195,9 +195,8 @@ class Preconditioner:
         moved = 0.02 * pixels[:, None] * np.array([1, arm, arm, 1, arm, arm]) ** 2
         frames = np.where(scene.free_frames, 1 / np.sqrt(moved + prior.frame_weights), 0.0)
         frames[0] = 0
-        added = [block.scales(scene.weights) for block in scene.added]
         common, separate = scene.number_scales()
-        self._diagonals = [common, brightness, frames, separate, *added]
+        self._diagonals = [common, brightness, frames, separate]
         self._scene, self._weights, self._laplacian = scene, weights, laplacian
 
     @cached_property
@@ -238,8 +237,8 @@ class Preconditioner:
     def held(self) -> Preconditioner:
         """Return scales in which the numbers of an instrument do not change."""
         scales = copy(self)
-        common, brightness, frames, separate, *added = self._diagonals
-        scales._diagonals = [0 * common, brightness, frames, 0 * separate, *added]
+        common, brightness, frames, separate = self._diagonals
+        scales._diagonals = [0 * common, brightness, frames, 0 * separate]
         scales.others = np.concatenate([part.ravel() for part in scales._diagonals])
         long, places, table, root = self._coupling
         scales._coupling = _Coupling(long, places[:0], table[:0], root[:0, :0])
@@ -411,8 +410,8 @@ def settle(
     """
     tolerance, solving = _NEWTON, _MOST_SOLVING
     scales = Preconditioner(scene)
-    # Scales of numbers that fields may replace, of frames and added light are rough.
-    is_scaled = not (scales.has_rough_numbers or scene.added or scene.free_frames.any())
+    # Scales of numbers that fields may replace, and of frames, are rough.
+    is_scaled = not (scales.has_rough_numbers or scene.free_frames.any())
     if scales.has_rough_numbers:
         tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
     if scene.has_free_numbers:

@@ -118,7 +118,6 @@ class Scene(PriorTerms):
             brightness=np.zeros(count),
             frames=np.tile(at_rest(), (count, 1)),
             separate=np.zeros((count, separate)),
-            added=tuple(np.zeros((count, len(block.spreads()))) for block in self.added),
         )
 
     def strengths_with(self, unknowns: Unknowns) -> FloatArray:
@@ -172,8 +171,7 @@ class Scene(PriorTerms):
         value, slope = self.prior.value_and_slope(unknowns)
         if self.force is None:
             return value, slope
-        pairs = zip(self.force.blocks, unknowns.blocks, strict=True)
-        value -= sum(float(np.sum(a * b)) for a, b in pairs)
+        value -= sum(float(np.sum(a * b)) for a, b in zip(self.force, unknowns, strict=True))
         return value, slope.plus(slope.like(-self.force.flat()))
 
     def _misfit(self, unknowns: Unknowns, shot: _Shot) -> tuple[_Seen, FloatArray, FloatArray]:
@@ -194,7 +192,6 @@ class Scene(PriorTerms):
         for k, (of_image, of_brightness, view, scaled, pulls) in enumerate(differentiated):
             value += of_image
             slope.brightness[k] += of_brightness
-            self._add_light_pulls(slope, k, scaled)
             view.effects.add_pulls(slope, k, scaled)
             self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
             slope.frames[k] += pulls.frame
@@ -397,21 +394,12 @@ class Scene(PriorTerms):
         effects = _Effects(
             (part, derivatives[part.key]) for part in imperfect.parts if part.key in derivatives
         )
-        return _Seen(self._with_added(unknowns, k, image), slope, effects)
+        return _Seen(image, slope, effects)
 
     def _variance(self, k: int) -> float:
         """Variance of a Gaussian point spread that an error of the blur adds to."""
         width = self.psf[k]
         return width**2 if isinstance(width, float) else 0.0
-
-    def _with_added(self, unknowns: Unknowns, k: int, image: FloatArray) -> FloatArray:
-        for block, coefficients in zip(self.added, unknowns.added, strict=True):
-            image = image + block.image(coefficients[k], self.rays.size)
-        return image
-
-    def _add_light_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
-        for block, derivatives in zip(self.added, slope.added, strict=True):
-            derivatives[k] += block.pull(pull)
 
     def _add_potential_pulls(
         self, slope: Unknowns, unknowns: Unknowns, strengths: FloatArray, k: int, pull: FloatArray
@@ -619,14 +607,12 @@ class Linear:
 
     def _light_change(self, change: Unknowns, k: int) -> FloatArray:
         """The change of an image by numbers that act where it is seen."""
-        image = change.brightness[k] * self.seen[k].image
-        image = image + self.seen[k].effects.push(change, k, np.zeros(()))
-        return self.scene._with_added(change, k, image)
+        seen = self.seen[k]
+        return change.brightness[k] * seen.image + seen.effects.push(change, k, np.zeros(()))
 
     def _add_light_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
         """Add derivatives by numbers that act where an image is seen."""
         slope.brightness[k] = np.einsum("yx,yx", pull, self.seen[k].image)
-        self.scene._add_light_pulls(slope, k, pull)
         self.seen[k].effects.add_pulls(slope, k, pull)
 
     def _potential_changes(self, change: Unknowns) -> FloatArray:
@@ -659,7 +645,7 @@ class Linear:
     def _has_light(self) -> bool:
         """Whether numbers may change that act where an image is seen."""
         has_effects = any(seen.effects for seen in self.seen)
-        return self.scene.free_brightness or has_effects or bool(self.scene.added)
+        return self.scene.free_brightness or has_effects
 
     @cached_property
     def _dark(self) -> list[FloatArray]:

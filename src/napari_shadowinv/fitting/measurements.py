@@ -43,7 +43,7 @@ from napari_shadowinv.fitting.shots import (
     value_of_first,
     values_of,
 )
-from napari_shadowinv.fitting.unknowns import Fiducials, additive_blocks
+from napari_shadowinv.fitting.unknowns import Fiducials
 from napari_shadowinv.instrument.shapes import Around
 from napari_shadowinv.inversion.noise import estimated_noise, measure_correlation
 from napari_shadowinv.options import (
@@ -190,7 +190,6 @@ def collect_data(
         **_alignment(instrument, options),
         fiducials=_checked_fiducials(value_of_first(shots, "fiducials"), shape),
         threads=options.threads,
-        added=additive_blocks(options),
         imperfect=imperfect,
     )
     return FitData(

@@ -31,7 +31,6 @@ from napari_shadowinv.facts import (
     time_fact,
     to_figures,
     verdict_fact,
-    with_error,
 )
 from napari_shadowinv.fitting.instrument import ASSUMED, TITLES, number_text
 from napari_shadowinv.fitting.posterior import BeamError
@@ -202,9 +201,6 @@ class FitReport:
     noise_correlation : float
         Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise. The
         error bars take it into account.
-    added : dict of str to list
-        Unknown light that adds to each image, by its title: for each image and each coefficient
-        the value and its standard deviation, in the image's unit.
     parts : dict of str to float
         What `total` is made of, the largest first: r.m.s. standard deviations by noise, by the
         beam, by each stated imperfection and by the edge, as shares of the displacement.
@@ -236,7 +232,6 @@ class FitReport:
     pattern: float = float("nan")
     noise_correlation: float = 0.0
     beam: BeamError | None = None
-    added: dict[str, list[list[list[float]]]] = dataclasses.field(default_factory=dict)
     parts: dict[str, float] = dataclasses.field(default_factory=dict)
     sides: tuple[str, ...] = ()
     beam_rms: float = 0.0
@@ -710,9 +705,6 @@ def _image_facts(fit: Fit, names: Sequence[str]) -> Iterator[Fact]:
         if k and fit.options.align != "none":
             dy, dx = fit.frames[k][[0, 3]]
             parts.append(f"shifted by y {dy:+.3g}, x {dx:+.3g} px")
-        for title, rows in fit.report.added.items():
-            light = ", ".join(with_error(value, error) for value, error in rows[k])
-            parts.append(f"{title} {light}")
         text = ", ".join(parts)
         yield Fact(f"image_{k + 1}", f"Image {k + 1}", text, short=f"χ² {to_figures(chi2, 3)}")
 

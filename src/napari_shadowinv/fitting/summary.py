@@ -22,7 +22,6 @@ from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.posterior import (
     BeamError,
     BeamShifts,
-    Sample,
     displacement_errors,
     largest_share,
     potentials_of,
@@ -163,7 +162,6 @@ def report_of(
     refined: FineMinimum,
     openness: Openness,
     pattern: Pattern,
-    amplification: float,
     options: FitOptions,
 ) -> FitReport:
     """Return the report of a fit, without its errors."""
@@ -178,7 +176,6 @@ def report_of(
         total=float("nan"),
         pattern=pattern.largest,
         noise_correlation=pattern.correlation,
-        added=_added_light(data, refined, openness.samples, amplification),
         numbers=numbers_in_units(
             instrument,
             instrument.adapt(unknowns, refined.scene.imperfect),
@@ -212,23 +209,6 @@ def _most_folded(scene: Scene, displacements: FloatArray) -> FloatArray:
         for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)
     ]
     return max(jacobians, key=lambda each: int((each < 0).sum()))
-
-
-def _added_light(
-    data: FitData, refined: FineMinimum, samples: Sequence[Sample], amplification: float
-) -> dict[str, list[list[list[float]]]]:
-    """Return coefficients of light that adds to each image, in its unit, with their σ."""
-    scene, unknowns = refined.scene, refined.unknowns
-    units = (data.units * np.exp(unknowns.brightness))[:, None]
-    light = {}
-    for number, block in enumerate(scene.added):
-        values = units * unknowns.added[number]
-        changes = [sample.change.added[number] for sample in samples]
-        spreads = np.full_like(values, np.nan)
-        if changes:
-            spreads = units * amplification * np.sqrt(np.mean(np.square(changes), axis=0))
-        light[block.title] = np.stack([values, spreads], axis=-1).tolist()
-    return light
 
 
 def _changes_by_edge(

@@ -15,12 +15,11 @@ and that of all other numbers is a sum ½ Σ (θ / s)². Of a smooth object the 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
-from typing import ClassVar, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import dctn, idctn
@@ -28,7 +27,6 @@ from scipy.fft import dctn, idctn
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting._ray_kernels import KNOT, add_ties, spline_tables
 from napari_shadowinv.fitting.rays import RayModel, at_rest
-from napari_shadowinv.options import FitOptions
 
 _COMMON = 2  # blocks that the images share; the others have a row for each image
 
@@ -38,8 +36,7 @@ class Unknowns(NamedTuple):
 
     `potentials` (M, …) are B-spline coefficients of the fields' potentials, `common` (n,) and
     `separate` (L, n) the numbers of an `Imperfect` instrument and of its beam, `brightness` (L,)
-    logarithms, `frames` (L, 6) as a `RayModel` takes them, `added` the coefficients (L, …) of each
-    `AdditiveBlock`.
+    logarithms, `frames` (L, 6) as a `RayModel` takes them.
     """
 
     potentials: FloatArray
@@ -47,53 +44,36 @@ class Unknowns(NamedTuple):
     brightness: FloatArray
     frames: FloatArray
     separate: FloatArray
-    added: tuple[FloatArray, ...] = ()
-
-    @property
-    def blocks(self) -> tuple[FloatArray, ...]:
-        """All arrays."""
-        return tuple(self[:-1]) + self.added
-
-    @classmethod
-    def from_blocks(cls, blocks: Iterable[FloatArray]) -> Unknowns:
-        """Return unknowns with the arrays of `blocks`."""
-        potentials, common, brightness, frames, separate, *added = blocks
-        return cls(potentials, common, brightness, frames, separate, tuple(added))
 
     def flat(self) -> FloatArray:
         """Return all values as one array."""
-        return np.concatenate([block.ravel() for block in self.blocks])
+        return np.concatenate([block.ravel() for block in self])
 
     def like(self, flat: FloatArray) -> Unknowns:
         """Return the same unknowns with the values of a flat array."""
-        blocks = self.blocks
-        ends = [0, *accumulate(block.size for block in blocks)]
+        ends = [0, *accumulate(block.size for block in self)]
         parts = (flat[begin:end] for begin, end in pairwise(ends))
-        return self.from_blocks(
-            new.reshape(old.shape) for new, old in zip(parts, blocks, strict=True)
-        )
+        return Unknowns(*(new.reshape(old.shape) for new, old in zip(parts, self, strict=True)))
 
     def only(self, numbers: Sequence[int]) -> Unknowns:
         """Return the unknowns of some of the images."""
         chosen = list(numbers)
-        separate = (block[chosen] for block in self.blocks[_COMMON:])
-        return self.from_blocks([*self.blocks[:_COMMON], *separate])
+        return Unknowns(*self[:_COMMON], *(block[chosen] for block in self[_COMMON:]))
 
     def with_images(self, numbers: Sequence[int], part: Unknowns) -> Unknowns:
         """Return the unknowns with the numbers of some images replaced."""
-        blocks = [block.copy() for block in self.blocks[_COMMON:]]
-        for block, new in zip(blocks, part.blocks[_COMMON:], strict=True):
+        blocks = [block.copy() for block in self[_COMMON:]]
+        for block, new in zip(blocks, part[_COMMON:], strict=True):
             block[list(numbers)] = new
-        return self.from_blocks([*part.blocks[:_COMMON], *blocks])
+        return Unknowns(*part[:_COMMON], *blocks)
 
     def plus(self, other: Unknowns) -> Unknowns:
         """Return the sum of both."""
-        pairs = zip(self.blocks, other.blocks, strict=True)
-        return self.from_blocks(first + second for first, second in pairs)
+        return Unknowns(*map(np.add, self, other))
 
     def zeros(self) -> Unknowns:
         """Return as many zeros."""
-        return self.from_blocks(np.zeros_like(block) for block in self.blocks)
+        return Unknowns(*map(np.zeros_like, self))
 
 
 class Fiducials(NamedTuple):
@@ -106,60 +86,6 @@ class Fiducials(NamedTuple):
     places: FloatArray
     displacements: FloatArray
     errors: FloatArray
-
-
-class AdditiveBlock(ABC):
-    """Unknown coefficients of each image, to which its light is proportional.
-
-    A fit finds the coefficients of each image together with all other unknowns, and reports
-    them with their standard deviations. They start at zero, where their Gaussian prior has its
-    mean, and are the same in pixels of any size. Image k is exp(γ_k) times the light of the rays
-    plus this light, in units of the beam.
-    """
-
-    title: ClassVar[str]
-    """Name in the result."""
-
-    @classmethod
-    @abstractmethod
-    def from_options(cls, options: FitOptions) -> Self | None:
-        """Return the block that the options ask for; None if its light is known to be zero."""
-
-    @abstractmethod
-    def spreads(self) -> FloatArray:
-        """Return the standard deviation of each coefficient before the fit, shape (n,)."""
-
-    @abstractmethod
-    def patterns(self, size: tuple[int, int]) -> FloatArray:
-        """Return the light of each coefficient of 1, in beams, shape (n, H, W)."""
-
-    def image(self, coefficients: FloatArray, size: tuple[int, int]) -> FloatArray:
-        """Return the light of coefficients, shape (H, W)."""
-        return np.asarray(np.einsum("n,nyx->yx", coefficients, self.patterns(size)))
-
-    def pull(self, image: FloatArray) -> FloatArray:
-        """Return the transpose of `image` times an image, shape (n,)."""
-        size = image.shape[0], image.shape[1]
-        return np.asarray(np.einsum("yx,nyx->n", image, self.patterns(size)))
-
-    def prior_weights(self) -> FloatArray:
-        """Return 1 / s² of each coefficient."""
-        return np.asarray(1 / np.asarray(self.spreads()) ** 2)
-
-    def scales(self, weights: FloatArray) -> FloatArray:
-        """Return approximate standard deviations by the fit, (L, n), for weights 1 / σ²."""
-        size = weights.shape[1], weights.shape[2]
-        curvature = np.einsum("lyx,nyx->ln", weights, self.patterns(size) ** 2)
-        return np.asarray(1 / np.sqrt(curvature + self.prior_weights()))
-
-
-ADDITIVE: Sequence[type[AdditiveBlock]] = ()
-
-
-def additive_blocks(options: FitOptions) -> tuple[AdditiveBlock, ...]:
-    """Return the blocks of `ADDITIVE` that the options ask for."""
-    blocks = (kind.from_options(options) for kind in ADDITIVE)
-    return tuple(block for block in blocks if block is not None)
 
 
 POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
@@ -185,8 +111,6 @@ class PriorTerms:
         Side of a pixel in recorded pixels.
     shift_spread : float
         Standard deviation of an image's shift, px of the recorded image.
-    added : tuple of AdditiveBlock
-        Unknown light that adds to each image.
     """
 
     smoothness: FloatArray
@@ -195,7 +119,6 @@ class PriorTerms:
     fiducials: Fiducials | None = None
     bin: int = 1
     shift_spread: float = 5.0
-    added: tuple[AdditiveBlock, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,8 +140,7 @@ class Prior(PriorTerms):
         """Return the sum of all terms, and its derivatives."""
         about_rest = unknowns._replace(frames=unknowns.frames - at_rest())
         slope = self.times(about_rest)
-        pairs = zip(slope.blocks, about_rest.blocks, strict=True)
-        value = sum(float(np.sum(a * b)) for a, b in pairs) / 2
+        value = sum(float(np.sum(a * b)) for a, b in zip(slope, about_rest, strict=True)) / 2
         if self.fiducials is None:
             return value, slope
         weights = 1 / self.fiducials.errors[:, None] ** 2
@@ -234,8 +156,7 @@ class Prior(PriorTerms):
         waves *= self.roughness
         slope = idctn(waves, axes=(1, 2), norm="ortho")
         self.add_ties(change.potentials, slope)
-        products = map(np.multiply, self._weights, change.blocks[1:])
-        return Unknowns.from_blocks([slope, *products])
+        return Unknowns(slope, *map(np.multiply, self._weights, change[1:]))
 
     def add_ties(self, potentials: FloatArray, slope: FloatArray) -> None:
         """Add the Hessian of potentials, but for λ and κ, times their change."""
@@ -246,7 +167,7 @@ class Prior(PriorTerms):
 
     def flat_weights(self, unknowns: Unknowns) -> FloatArray:
         """Return 1 / s² of all values but the potentials, as one array."""
-        pairs = zip(self._weights, unknowns.blocks[1:], strict=True)
+        pairs = zip(self._weights, unknowns[1:], strict=True)
         return np.concatenate([np.broadcast_to(w, block.shape).ravel() for w, block in pairs])
 
     def draw(self, like: Unknowns, rng: np.random.Generator) -> Unknowns:
@@ -267,9 +188,9 @@ class Prior(PriorTerms):
             self._add_there(potentials, rng.normal(size=(len(errors), 2)) / errors)
         slopes = [
             np.sqrt(weights) * rng.normal(size=block.shape)
-            for weights, block in zip(self._weights, like.blocks[1:], strict=True)
+            for weights, block in zip(self._weights, like[1:], strict=True)
         ]
-        return Unknowns.from_blocks([potentials, *slopes])
+        return Unknowns(potentials, *slopes)
 
     def root_of_smoothness(self, field: int, values: FloatArray) -> FloatArray:
         """Return values per cosine times the root of the roughness penalty."""
@@ -313,9 +234,7 @@ class Prior(PriorTerms):
     @cached_property
     def _weights(self) -> list[FloatArray]:
         """1 / s² of the values of each block but the potentials."""
-        added = (block.prior_weights() for block in self.added)
-        brightness = np.array(_BRIGHTNESS_WEIGHT)
-        return [_NORMAL, brightness, self.frame_weights, _NORMAL, *added]
+        return [_NORMAL, np.array(_BRIGHTNESS_WEIGHT), self.frame_weights, _NORMAL]
 
     @cached_property
     def frame_weights(self) -> FloatArray:
