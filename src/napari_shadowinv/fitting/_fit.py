@@ -33,7 +33,7 @@ from napari_shadowinv.fitting.pattern import (
     log_evidence,
     noise_amplification,
 )
-from napari_shadowinv.fitting.result import Fit
+from napari_shadowinv.fitting.result import Basin, Fit
 from napari_shadowinv.fitting.rivals import compare_rivals, transmission_of
 from napari_shadowinv.fitting.search import (
     SMALL_PX,
@@ -121,24 +121,25 @@ def fit(
         minima = _with_smoothness(data, minima, rng, on_step)
     begun, threads = time.perf_counter(), available_threads(minima.scene.threads)
     works: list[Any] = [
-        partial(_refine, data, minima, options),
-        partial(_explore, data, minima, rng, options),
+        partial(_refine, data, minima),
+        partial(_explore, data, minima, rng),
     ]
-    (refined, seconds["full size"]), openness = run_in_parallel(works, threads, on_step)
+    (refined, seconds["full size"]), (basins, openness) = run_in_parallel(works, threads, on_step)
     seconds["samples"] = max(time.perf_counter() - begun - seconds["full size"], 0.0)
     with measure_time("residual", seconds):
-        pattern = _find_misfit(data, minima, refined, openness, fields, options, on_step)
+        pattern = _find_pattern(data, minima, refined, openness, on_step)
+        pattern = _with_cause(data, minima, pattern, on_step)
     with measure_time("samples", seconds):
         # What the weights do not include of it.
         least = float(np.sqrt(data.noise.expected_chi2.min()))
         amplification = max(noise_amplification(pattern.correlation) * least, 1.0)
-        errors = field_errors(data, minima.scene, openness, amplification, options.seed)
-        report = report_of(data, minima.instrument, refined, openness, pattern, options)
+        errors = field_errors(data, minima.scene, openness, amplification)
+        report = report_of(data, minima.instrument, refined, openness, pattern)
         if options.evidence:
-            evidence = log_evidence(minima.scene, minima.best, fields, options, on_step)
+            evidence = log_evidence(data, minima.scene, minima.best, on_step)
             report = replace(report, log_evidence=evidence)
     report = replace(report, seconds=seconds)
-    return summarise(data, fields, options, refined, openness.basins, errors, report, pattern)
+    return summarise(data, refined, basins, errors, report, pattern)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,47 +199,28 @@ def _with_smoothness(
     return replace(minima, scene=scene, ends=[best, *minima.ends[1:]])
 
 
-def _refine(
-    data: FitData, minima: _Minima, options: FitOptions, on_step: OnStep
-) -> tuple[FineMinimum, float]:
+def _refine(data: FitData, minima: _Minima, on_step: OnStep) -> tuple[FineMinimum, float]:
     """Descend in recorded pixels; also return the seconds."""
     begun, is_near = time.perf_counter(), data.near is not None
-    refined = refine_minimum(minima.scene, minima.best, options, on_step, is_near=is_near)
+    refined = refine_minimum(minima.scene, minima.best, data.options, on_step, is_near=is_near)
     return refined, time.perf_counter() - begun
 
 
 def _explore(
-    data: FitData,
-    minima: _Minima,
-    rng: np.random.Generator,
-    options: FitOptions,
-    on_step: OnStep,
-) -> Openness:
+    data: FitData, minima: _Minima, rng: np.random.Generator, on_step: OnStep
+) -> tuple[tuple[Basin, ...], Openness]:
     """Find how far the images leave the answer open, by other starts and by samples."""
     best, *rivals = minima.ends
     basins = find_basins(minima.scene, best, rivals, on_step)
     unsure = minima.unsure if data.single else minima.scene
     there = adapt(best, unsure.imperfect, minima.scene.imperfect)
-    return explore(data, unsure, there, basins, rng, options, on_step)
+    return basins, explore(data, unsure, there, rng, on_step)
 
 
-def _find_misfit(
-    data: FitData,
-    minima: _Minima,
-    refined: FineMinimum,
-    openness: Openness,
-    fields: Sequence[str],
-    options: FitOptions,
-    on_step: OnStep,
-    *,
-    least_blur: float = 4.0,
-    most_chi2: float = 25.0,
+def _find_pattern(
+    data: FitData, minima: _Minima, refined: FineMinimum, openness: Openness, on_step: OnStep
 ) -> Pattern:
-    """Find a pattern that the fit leaves, and its likely cause by rival fits.
-
-    Blur leaves little of a pattern, so it is looked for from `least_blur` standard deviations on. A
-    fit that ended further away than `most_chi2` is no start for a rival.
-    """
+    """Find a pattern that the fit leaves, and how much of the noise of counts is missing."""
     # A fit of one image absorbs too much of its noise for the counts to be tested.
     is_counted = data.counted and not data.single
     pattern = find_pattern(
@@ -251,16 +233,33 @@ def _find_misfit(
     )
     if pattern.lacks_counts and openness.posterior is not None:
         posterior = openness.posterior.reporting(lambda: on_step("samples", refined.objective))
-        absorbed = posterior.count_determined(np.random.default_rng(options.seed))
+        absorbed = posterior.count_determined(np.random.default_rng(data.options.seed))
         share = pattern.missing_counts - absorbed / np.count_nonzero(minima.scene.weights)
         pattern = replace(pattern, missing_counts=share)
+    return pattern
+
+
+def _with_cause(
+    data: FitData,
+    minima: _Minima,
+    pattern: Pattern,
+    on_step: OnStep,
+    *,
+    least_blur: float = 4.0,
+    most_chi2: float = 25.0,
+) -> Pattern:
+    """Find the likely cause of a pattern by rival fits.
+
+    Blur leaves little of a pattern, so it is looked for from `least_blur` standard deviations on. A
+    fit that ended further away than `most_chi2` is no start for a rival.
+    """
     is_off = pattern.is_certain or pattern.chi2 > MISFIT_CHI2
     is_blurred = data.single or pattern.blur_score > least_blur
-    if (is_off or is_blurred) and pattern.chi2 < most_chi2:
-        only, best = "" if is_off else "blur", minima.best
-        rivals = compare_rivals(data, minima.scene, best, fields, on_step, only=only)
-        pattern = replace(pattern, cause=rivals.cause(), tried=rivals.tried)
-    return pattern
+    if not (is_off or is_blurred) or pattern.chi2 >= most_chi2:
+        return pattern
+    only = "" if is_off else "blur"
+    rivals = compare_rivals(data, minima.scene, minima.best, on_step, only=only)
+    return replace(pattern, cause=rivals.cause(), tried=rivals.tried)
 
 
 def report_steps(

@@ -105,7 +105,7 @@ def leave_one_out(
     ensure_compiled(on_progress, should_stop)
     on_step = report_steps("leave one out", on_progress, should_stop)
     first = search(data.scene, collect_starts(data, on_step, should_stop), on_step)[0]
-    work = _Work(data, options, on_step, data.scene, first)
+    work = _Work(data, on_step, data.scene, first)
     agreeing = work.find_agreeing()
     predictions = work.with_smoothness(agreeing).predict_all(agreeing)
     return _result(data, predictions)
@@ -156,7 +156,6 @@ class _Work:
     """
 
     data: FitData
-    options: FitOptions
     on_step: OnStep
     scene: Scene
     common: Minimum
@@ -172,14 +171,14 @@ class _Work:
         def run(k: int, on_step: OnStep) -> _T:
             return work(replace(self, on_step=on_step), k)
 
-        threads = available_threads(self.options.threads)
+        threads = available_threads(self.data.options.threads)
         results = run_in_parallel([partial(run, k) for k in numbers], threads, self.on_step)
         return dict(zip(numbers, results, strict=True))
 
     def find_agreeing(self) -> list[int]:
         """The most images that one field explains, found in pixels of two."""
         work = self
-        if self.options.smoothness is None:
+        if self.data.options.smoothness is None:
             usual = SMOOTHNESS_RATIO * np.tile(FIRST_SMOOTHNESS, (len(self.scene.smoothness), 1))
             work = replace(self, scene=replace(self.scene, smoothness=usual))
         alone = work._run_for_each(
@@ -216,7 +215,7 @@ class _Work:
 
     def with_smoothness(self, members: list[int]) -> _Work:
         """Return the same with the λ and κ and the field of some images, and weights of counts."""
-        rng, start = np.random.default_rng(self.options.seed), self.common.unknowns
+        rng, start = np.random.default_rng(self.data.options.seed), self.common.unknowns
         first = replace(self.common, unknowns=start.only(members))
         part, best = estimate_smoothness(self.scene.only(members), first, rng, self.on_step)
         scene = replace(self.scene, smoothness=part.smoothness)
@@ -264,7 +263,7 @@ class _Work:
         coarse = self._settle_members(self.common, members, _name(members), _LAST_GAIN)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
         scene = self.scene.only(members)
-        fine, unknowns, *_ = refine_minimum(scene, first, self.options, self.on_step)
+        fine, unknowns, *_ = refine_minimum(scene, first, self.data.options, self.on_step)
         # Folds are deeper in the image that is left out if it is displaced most.
         fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
         return coarse, fine, *self._settle_densely(fine, unknowns, members)
@@ -296,7 +295,7 @@ class _Work:
             large = fine.images.size > _MAX_SAMPLED_PIXELS
             if large:
                 sampled = coarse.coarsen(self.scene.only(members)), coarse.unknowns.only(members)
-        rng = np.random.default_rng(self.options.seed)
+        rng = np.random.default_rng(self.data.options.seed)
         report = partial(self.on_step, _name(members), value)
         posterior = Posterior(*sampled, rng, report, linear=linear)
         samples = posterior.draw_samples(_SAMPLES, _SAMPLE_TOLERANCE)

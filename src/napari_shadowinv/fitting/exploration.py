@@ -35,20 +35,17 @@ from napari_shadowinv.fitting.search import (
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.instrument.effects import EFFECTS, RESPONSES
 from napari_shadowinv.inversion.samples import Pairs
-from napari_shadowinv.options import FitOptions
 
 
 @dataclass(frozen=True)
 class Openness:
     """How far the images leave the best unknowns open, and how far an instrument would move them.
 
-    `basins` are the answers of all starts, the best first; `posterior` is that of counts; `pairs`
-    compares samples with those that are solved in full; `errors`, `by_part` and `by_beam` are those
-    of the displacement, `sensitivities` shares of it. `assumed` are the likely changes by a
-    detector of which nothing was stated.
+    `posterior` is that of counts; `pairs` compares samples with those that are solved in full;
+    `errors`, `by_part` and `by_beam` are those of the displacement, `sensitivities` shares of it.
+    `assumed` are the likely changes by a detector of which nothing was stated.
     """
 
-    basins: tuple[Basin, ...]
     posterior: Posterior | None
     samples: list[Sample]
     pairs: Pairs | None
@@ -95,9 +92,7 @@ def explore(
     data: FitData,
     scene: Scene,
     best: Minimum,
-    basins: tuple[Basin, ...],
     rng: np.random.Generator,
-    options: FitOptions,
     on_step: OnStep,
     *,
     spacing: float = 1 / 3,
@@ -119,6 +114,7 @@ def explore(
         return Posterior(middle, start.unknowns, rng, lambda: on_step("samples", best.value), modes)
 
     posterior = posterior_with(scene, best, None if data.single else copy(best.modes))
+    options = data.options
     count = options.samples if options.samples > 1 else 0
     if count and "beam_between" in scene.imperfect.keys:
         count = max(count, least_of_beams)
@@ -135,7 +131,7 @@ def explore(
     by_part = errors_by_part(scene, posterior, samples, data.size)
     if errors is not None and not by_part:
         by_part = {"noise": errors}
-    by_beam = shifts_by_beam(data, scene, posterior, samples, options)
+    by_beam = shifts_by_beam(data, scene, posterior, samples)
     responses: dict[str, tuple[Unknowns, float]] = {}
     sensitivities: dict[str, float] = {}
     if samples:
@@ -152,7 +148,6 @@ def explore(
     # Counts are those of a detector that is linear and has no dark level.
     is_linear = data.counted or data.instrument.has_numbers
     return Openness(
-        basins,
         posterior if data.counted else None,  # its Jacobians are large
         samples,
         pairs,

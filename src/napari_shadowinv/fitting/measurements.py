@@ -81,7 +81,7 @@ _FREE_TIE = 0.3
 
 @dataclass(frozen=True)
 class FitData:
-    """Images in units of their beams, with their instrument.
+    """Images in units of their beams, with their instrument, and what is to be fitted to them.
 
     `scene` has the sides of blocks, and λ and κ if they are given, else 0; the images are its first
     `size` pixels. `units` (L,) are the recorded values of one unit, `brightness` (L,) the
@@ -100,7 +100,9 @@ class FitData:
     assumed: bool
     unknown: bool
     common: bool
+    fields: tuple[str, ...]
     instrument: Instrument
+    options: FitOptions
     beam: BeamPrior
     setups: tuple[Setup, ...] | None
     names: tuple[str, ...] | None  # if the images have any
@@ -203,7 +205,9 @@ def collect_data(
         assumed=is_assumed,
         unknown=unknown,
         common=is_common,
+        fields=tuple(fields),
         instrument=instrument,
+        options=options,
         beam=prior,
         setups=setups,
         names=names if any(shot.name for shot in shots) else None,

@@ -12,7 +12,6 @@ the noise in each pixel.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from zlib import crc32
 
@@ -22,10 +21,9 @@ from scipy.ndimage import gaussian_filter, laplace
 from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import NoiseMatch
+from napari_shadowinv.fitting.measurements import FitData, NoiseMatch
 from napari_shadowinv.fitting.search import SMOOTHNESS_RATIO, Minimum, posterior_of, settle_minimum
 from napari_shadowinv.fitting.unknowns import Unknowns
-from napari_shadowinv.options import FitOptions
 
 _WIDTHS_PX = (2.0, 4.0, 8.0)
 _SMALLEST_VARIANCE = 1e-12  # of the noise
@@ -267,24 +265,19 @@ def find_pattern(
     )
 
 
-def log_evidence(
-    scene: Scene, best: Minimum, names: Sequence[str], options: FitOptions, on_step: OnStep
-) -> float:
+def log_evidence(data: FitData, scene: Scene, best: Minimum, on_step: OnStep) -> float:
     """Return the log evidence at the likeliest λ and κ, where it depends least on their accuracy.
 
     Parameters
     ----------
-    scene, best
-        The fit.
-    names : sequence of str
-        The fields, whose random probes are the same for all models.
-    options : FitOptions
-        Its seed, and whether the smoothness was given.
+    data, scene, best
+        The fit; its fields have random probes that are the same for all models.
     on_step : callable
         Receives the stage and the objective.
     """
-    if options.smoothness is None:
+    if data.options.smoothness is None:
         scene = replace(scene, smoothness=scene.smoothness / SMOOTHNESS_RATIO)
     ended = settle_minimum(scene, best, on_step, "evidence", least_gain=0.1)
-    chances = [np.random.default_rng([options.seed, crc32(name.encode())]) for name in names]
+    seeds = [[data.options.seed, crc32(name.encode())] for name in data.fields]
+    chances = list(map(np.random.default_rng, seeds))
     return posterior_of(scene, ended, chances[0], on_step, "evidence").log_evidence(chances)

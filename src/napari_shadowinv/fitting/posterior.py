@@ -36,7 +36,6 @@ from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.inversion.samples import Pairs, stratified_numbers
-from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.poisson import border_mean
 
 _ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
@@ -582,11 +581,7 @@ class BeamShifts:
 
 
 def shifts_by_beam(
-    data: FitData,
-    scene: Scene,
-    posterior: Posterior,
-    samples: Sequence[Sample],
-    options: FitOptions,
+    data: FitData, scene: Scene, posterior: Posterior, samples: Sequence[Sample]
 ) -> BeamShifts | None:
     """Return the effect of beams that differ from their sources; None if beams are fitted.
 
@@ -596,7 +591,7 @@ def shifts_by_beam(
         return None
     variation = data.beam.rms
     middle = posterior.scene
-    rng = np.random.default_rng([options.seed, _BEAM_SEED])
+    rng = np.random.default_rng([data.options.seed, _BEAM_SEED])
     length = data.beam.length * min(data.size)
     count = 1 if data.common else len(scene.images)
     variations = [

@@ -7,7 +7,7 @@ prior has the standard deviation s and the images leave σ open, about (`log_shr
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -122,7 +122,6 @@ def compare_rivals(
     data: FitData,
     scene: Scene,
     best: Minimum,
-    names: Sequence[str],
     on_step: OnStep,
     *,
     only: str = "",
@@ -135,8 +134,6 @@ def compare_rivals(
     ----------
     data, scene, best
         The fit.
-    names : sequence of str
-        The fields.
     on_step : callable
         Receives the stage and the objective.
     only : str, default ""
@@ -150,7 +147,7 @@ def compare_rivals(
     # A field that hides a flaw is rougher than any that rivals need.
     least = SMOOTHNESS_RATIO**2 * FIRST_SMOOTHNESS
     scene = replace(scene, smoothness=np.maximum(scene.smoothness, least))
-    rivals = [Rival((), scene, best.unknowns), *_rivals(data, scene, best, names)]
+    rivals = [Rival((), scene, best.unknowns), *_rivals(data, scene, best)]
     rivals = [each for each in rivals if not only or each.frees in ((), (only,))]
     threads = available_threads(scene.threads)
 
@@ -185,7 +182,7 @@ def transmission_of(data: FitData, minimum: Minimum, rms: float) -> Shapes:
     return Absorption().shapes(lit, rms, FITTED_VARIANCE).pad(data.around)
 
 
-def _rivals(data: FitData, scene: Scene, best: Minimum, names: Sequence[str]) -> Iterator[Rival]:
+def _rivals(data: FitData, scene: Scene, best: Minimum) -> Iterator[Rival]:
     for width in (1.5, 3.0):  # px
         widths = [np.hypot(psf, width) if isinstance(psf, float) else psf for psf in scene.psf]
         blurred = replace(scene, psf=list(map(_as_width, widths)))
@@ -199,7 +196,7 @@ def _rivals(data: FitData, scene: Scene, best: Minimum, names: Sequence[str]) ->
             yield Rival(frees, replace(scene, free_frames=free), best.unknowns)
     if not scene.free_brightness:
         yield Rival(("brightness",), replace(scene, free_brightness=True), best.unknowns)
-    if data.setups and set(names) == {"B"}:
+    if data.setups and data.fields == ("B",):
         yield from _with_electric_field(scene, best, data)
 
 

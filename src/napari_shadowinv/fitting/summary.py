@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,7 +29,6 @@ from napari_shadowinv.fitting.posterior import (
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import FineMinimum
 from napari_shadowinv.fitting.verdict import Evidence, assess_verdict, hidden_contrast
-from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.edge import edge_changes, edge_sides
 from napari_shadowinv.physics.forward import jacobian_determinant
 
@@ -54,7 +52,7 @@ class FieldErrors:
 
 
 def field_errors(
-    data: FitData, scene: Scene, openness: Openness, amplification: float, seed: int
+    data: FitData, scene: Scene, openness: Openness, amplification: float
 ) -> FieldErrors:
     """Return the errors by noise, numbers, beam and an assumed detector, and samples of fields."""
     amplified = openness.amplified(amplification)
@@ -64,7 +62,7 @@ def field_errors(
     by_beam = openness.by_beam
     of_beam = () if by_beam is None else by_beam.changes
     shifts = [*of_beam, *openness.assumed.values()]
-    samples = sampled_potentials(scene, openness.samples, shifts, data.size, seed)
+    samples = sampled_potentials(scene, openness.samples, shifts, data.size, data.options.seed)
     before, after = openness.errors.ravel(), amplified.errors.ravel()
     samples *= np.float32(np.sqrt(product(after, after) / product(before, before)))
     errors = replace(errors, samples=samples)
@@ -91,8 +89,6 @@ def with_edge(
 
 def summarise(
     data: FitData,
-    names: Sequence[str],
-    options: FitOptions,
     refined: FineMinimum,
     basins: tuple[Basin, ...],
     errors: FieldErrors,
@@ -111,7 +107,7 @@ def summarise(
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
     displacements = scene.displacement(unknowns)[..., :height, :width].copy()
     potentials = potentials_of(scene, unknowns, data.size)
-    errors = with_edge(errors, potentials, displacements, options.seed)
+    errors = with_edge(errors, potentials, displacements, data.options.seed)
     jacobian = _most_folded(scene, displacements)
     unassessed = Fit(
         images=images,
@@ -126,7 +122,7 @@ def summarise(
                 (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1])),
                 None if errors.samples is None else errors.samples[m],
             )
-            for m, name in enumerate(names)
+            for m, name in enumerate(data.fields)
         ),
         source=beams,
         brightness=brightness * data.brightness,
@@ -138,7 +134,7 @@ def summarise(
         folded=float((jacobian < 0).mean()),
         assessment=Assessment(Verdict.UNCERTAIN, ""),
         report=_with_shares(report, errors, displacements),
-        options=options,
+        options=data.options,
         instrument=data.instrument,
         setups=data.setups or (),
         noise=data.noise_of(scene.weights),
@@ -162,7 +158,6 @@ def report_of(
     refined: FineMinimum,
     openness: Openness,
     pattern: Pattern,
-    options: FitOptions,
 ) -> FitReport:
     """Return the report of a fit, without its errors."""
     unknowns, pairs = refined.unknowns, openness.pairs
@@ -182,7 +177,7 @@ def report_of(
             [sample.change for sample in openness.samples],
         ),
         sensitivities=openness.sensitivities,
-        sampling=options.sampling,
+        sampling=data.options.sampling,
         nonlinearity=float("nan") if pairs is None else pairs.nonlinearity,
         spread_ratio=float("nan") if pairs is None else pairs.spread_ratio,
         beam=None if by_beam is None else _beam_error(data, by_beam, displacements),
