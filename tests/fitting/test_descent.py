@@ -12,9 +12,10 @@ from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import solve
-from napari_shadowinv.fitting.descent import Preconditioner, coarser, descend, finer, settle
+from napari_shadowinv.fitting.descent import coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import FITTED_VARIANCE, Imperfect
+from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 from napari_shadowinv.instrument.shapes import beam_shapes
 from napari_shadowinv.options import BeamPrior

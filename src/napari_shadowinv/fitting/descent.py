@@ -13,19 +13,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from copy import copy
 from dataclasses import replace
-from functools import cached_property
-from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.fft import dctn, idctn
 
 from napari_shadowinv._system.arrays import block_sums, complete_block_means
-from napari_shadowinv._typing import FloatArray, IntArray
-from napari_shadowinv.fitting._ray_kernels import KNOT
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.forward import Linear, Scene
+from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
 
 _PAIRS = 20  # of steps and changes of the gradient that are kept
@@ -146,175 +142,6 @@ _NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
 _RENEWING_GAIN = 5.0
 _AS_EXPECTED = 0.2  # of a gain
 _MOST_PIXELS = 2_000_000  # of all images
-_SCALE, _TRANSPOSE = "nmyx,nyx->myx", "nmyx,myx->nyx"  # sums over the fields of scales
-
-
-class _Coupling(NamedTuple):
-    """The coupling of the `long` waves of potentials and numbers of the beams, at `places`.
-
-    With M the scaled Hessian between both, and D that of these numbers, all other blocks being the
-    identity: M as a `table` (n, M, …) and a `root` of (D - MᵀM)⁻¹.
-    """
-
-    long: tuple[Any, ...]
-    places: IntArray
-    table: FloatArray
-    root: FloatArray
-
-
-class Preconditioner:
-    """Scales in which the Hessian is about the identity: Sᵀ H S ≈ 1.
-
-    Diagonal in the cosines of the potentials, except for the coupling of two fields, and of fields
-    and beams.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        prior, squares = scene.prior, scene.prior.wave_numbers
-        widths = [psf if isinstance(psf, float) else 0.0 for psf in scene.psf]
-        variances = scene.blur**2 + np.square(widths)
-        weights = np.exp(-variances[:, None, None] * squares)
-        weights *= KNOT**2 * scene.weights.mean(axis=(1, 2))[:, None, None]
-        # An image's change by a weak potential is its Laplacian.
-        laplacian = -squares * np.sqrt(prior.power_seen)
-        data = np.einsum("lyx,li,lj->yxij", weights, scene.strengths, scene.strengths)
-        data *= laplacian[:, :, None, None] ** 2
-        of_data = np.moveaxis(np.diagonal(data, axis1=2, axis2=3), -1, 0)
-        rough = prior.roughness
-        self._kept = np.divide(of_data, of_data + rough, out=np.ones_like(rough), where=rough > 0)
-        of_prior = np.moveaxis(prior.of_potentials(), 0, -1)
-        matrix = data + of_prior[..., None] * np.eye(of_prior.shape[-1])
-        roots = np.linalg.inv(np.linalg.cholesky(matrix))
-        self._potentials = np.ascontiguousarray(np.moveaxis(roots, (2, 3), (0, 1)))
-        self.log_ratio = 0.5 * float(np.linalg.slogdet(matrix)[1].sum())
-        self.log_ratio -= 0.5 * float(np.log(of_prior).sum())
-        pixels = scene.weights.sum(axis=(1, 2))
-        brightness = np.where(scene.free_brightness, 1 / np.sqrt(pixels + 1), 0.0)
-        # Images have contrasts of some tenths over some pixels; stretching moves the edge by more.
-        arm = max(scene.rays.size) / 4
-        moved = 0.02 * pixels[:, None] * np.array([1, arm, arm, 1, arm, arm]) ** 2
-        frames = np.where(scene.free_frames, 1 / np.sqrt(moved + prior.frame_weights), 0.0)
-        frames[0] = 0
-        common, separate = scene.number_scales()
-        self._diagonals = [common, brightness, frames, separate]
-        self._scene, self._weights, self._laplacian = scene, weights, laplacian
-
-    @cached_property
-    def _coupling(self) -> _Coupling:
-        """How weak fields can replace beams."""
-        scene, weights, laplacian = self._scene, self._weights, self._laplacian
-        beams = scene.beam_cosines()
-        scales, count = self.others[beams.places], beams.waves.shape[1:]
-        long = np.s_[..., : count[0], : count[1]]
-        own = np.diag(np.where(scales > 0, scales**2, 1.0))
-        pulls = np.zeros((len(scales), scene.strengths.shape[1], *count))
-        # Images whose beams have the same numbers are counted together.
-        groups: dict[bytes, list[int]] = {}
-        for k, seen in enumerate(beams.images.T):
-            groups.setdefault(seen.tobytes(), []).append(k)
-        for group in groups.values():
-            waves = (scales * beams.images[:, group[0]])[:, None, None] * beams.waves
-            of_fields = np.einsum("lm,lyx->myx", scene.strengths[group], weights[long][group])
-            pulls += of_fields * (laplacian[long] * waves)[:, None]
-            waves *= np.sqrt(weights[long][group].sum(axis=0))
-            own += np.einsum("qyx,pyx->qp", waves, waves)
-        table = np.einsum("nmyx,qmyx->qnyx", self._potentials[long], pulls)
-        own -= np.einsum("qmyx,pmyx->qp", table, table)
-        return _Coupling(long, beams.places, table, np.linalg.inv(np.linalg.cholesky(own)).T)
-
-    def _turn(self, waves: FloatArray, others: FloatArray) -> None:
-        """Turn scaled values in place: with the beams move the fields that replace them."""
-        long, places, table, root = self._coupling
-        others[places] = numbers = np.einsum("qp,p->q", root, others[places])
-        waves[long] -= np.einsum("q,qmyx->myx", numbers, table)
-
-    def _turn_back(self, waves: FloatArray, others: FloatArray) -> None:
-        """Apply the transpose of `_turn` in place."""
-        long, places, table, root = self._coupling
-        numbers = others[places] - np.einsum("qmyx,myx->q", table, waves[long])
-        others[places] = np.einsum("qp,q->p", root, numbers)
-
-    def held(self) -> Preconditioner:
-        """Return scales in which the numbers of an instrument do not change."""
-        scales = copy(self)
-        common, brightness, frames, separate = self._diagonals
-        scales._diagonals = [0 * common, brightness, frames, 0 * separate]
-        scales.others = np.concatenate([part.ravel() for part in scales._diagonals])
-        long, places, table, root = self._coupling
-        scales._coupling = _Coupling(long, places[:0], table[:0], root[:0, :0])
-        return scales
-
-    def damp(self, unknowns: Unknowns) -> Unknowns:
-        """Return unknowns without the finest waves, which knots further apart leave behind."""
-        waves = dctn(unknowns.potentials, axes=(1, 2), norm="ortho") * self._kept
-        return unknowns._replace(potentials=idctn(waves, axes=(1, 2), norm="ortho"))
-
-    def times(self, scaled: Unknowns) -> Unknowns:
-        """Return S times scaled unknowns: their change."""
-        return scaled.like(self._changed(scaled.flat(), scaled)[1])
-
-    def _changed(self, scaled: FloatArray, like: Unknowns) -> tuple[FloatArray, FloatArray]:
-        """Cosines of the potentials' change by scaled values, and the change of all values."""
-        size = like.potentials.size
-        flat = scaled.copy()
-        waves, others = flat[:size].reshape(like.potentials.shape), flat[size:]
-        self._turn(waves, others)
-        waves = self._potentials_times(waves)
-        flat[:size] = idctn(waves, axes=(1, 2), norm="ortho").ravel()
-        others *= self.others
-        return waves, flat
-
-    def transpose_times(self, slope: Unknowns) -> Unknowns:
-        """Return Sᵀ times derivatives: those with respect to scaled unknowns."""
-        waves = dctn(slope.potentials, axes=(1, 2), norm="ortho")
-        return slope.like(self._scaled(waves, slope.flat()))
-
-    def _scaled(self, waves: FloatArray, flat: FloatArray) -> FloatArray:
-        """Sᵀ times derivatives, by the cosines of those by potentials, in place of all."""
-        waves = self._potentials_times(waves, _TRANSPOSE)
-        others = flat[waves.size :]
-        others *= self.others
-        self._turn_back(waves, others)
-        flat[: waves.size] = waves.ravel()
-        return flat
-
-    def hessian_times(self, linear: Linear, scaled: FloatArray) -> FloatArray:
-        """Return Sᵀ H S times scaled unknowns, both flat, by half of the transforms of each."""
-        unknowns, prior = linear.unknowns, linear.scene.prior
-        waves, flat = self._changed(scaled, unknowns)
-        change = unknowns.like(flat)
-        slope = linear.normal_times(change)
-        prior.add_ties(change.potentials, slope.potentials)
-        of_data = dctn(slope.potentials, axes=(1, 2), norm="ortho")
-        of_data += prior.roughness * waves
-        result, size = slope.flat(), waves.size
-        result[size:] += linear.weights_of_others * flat[size:]
-        return self._scaled(of_data, result)
-
-    @property
-    def has_rough_numbers(self) -> bool:
-        """Whether numbers of the instrument may change in scales that hardly know the fields.
-
-        Where each image has a beam of its own, fields are replaced nearly altogether.
-        """
-        common, separate = (self._diagonals[place] for place in (0, 3))
-        return bool(separate.any() or np.count_nonzero(common) > len(self._coupling.places))
-
-    @cached_property
-    def others(self) -> FloatArray:
-        """Scales of all values but the potentials."""
-        return np.concatenate([part.ravel() for part in self._diagonals])
-
-    def _potentials_times(self, waves: FloatArray, sums: str = _SCALE) -> FloatArray:
-        """Cosines of the potentials by scaled ones, or the transpose."""
-        if len(waves) == 1:  # a product is faster than a sum over one field
-            return np.asarray(self._potentials[0] * waves)
-        return np.asarray(np.einsum(sums, self._potentials, waves))
-
-    def log_size(self) -> float:
-        """Return log |det S| plus about half the log-determinant of the prior."""
-        scales = np.append(self.others, np.diag(self._coupling.root))
-        return -self.log_ratio + float(np.log(scales[scales > 0]).sum())
 
 
 def descend(

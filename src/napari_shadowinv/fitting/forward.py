@@ -14,17 +14,15 @@ from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.fft import dct
-from scipy.ndimage import gaussian_filter, laplace
+from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.instrument import EXACT, Imperfect, Part
 from napari_shadowinv.fitting.rays import Pulls, RayModel, TracedBeam, at_rest
 from napari_shadowinv.fitting.unknowns import Prior, PriorTerms, Unknowns
-from napari_shadowinv.instrument.effects import DARKEST, RESPONSES, widen, widening
+from napari_shadowinv.instrument.effects import widen, widening
 
 _T = TypeVar("_T")
 
@@ -300,67 +298,6 @@ class Scene(PriorTerms):
                 for k in range(1 if part.is_common else len(self.images)):
                     yield part, k
 
-    def number_scales(self) -> tuple[FloatArray, FloatArray]:
-        """Return approximate standard deviations of the instrument's numbers, (n,) and (L, n)."""
-        imperfect, weights = self.imperfect, self.weights
-        common, separate = (np.ones(count) for count in imperfect.counts)
-        separate = np.tile(separate, (len(weights), 1))
-        images = np.maximum(self.images, DARKEST)
-        changes = {
-            "blur": imperfect.blur / 2 * laplace(gaussian_filter(images, (0, 1, 1))),
-            "other_field": 0.1 * (images - 1),
-        }
-        for each in RESPONSES:
-            if size := imperfect.responses.get(each.key):
-                _, _, changes[each.key] = each.record(images, size, 0.0)
-        shapes = {each.key: each for each in imperfect.shapes}
-        sides = zip(self.beams.shape[1:], weights.shape[1:], strict=True)
-        around = [(self.pad, beams - self.pad - image) for beams, image in sides]
-        for part in imperfect.parts:
-            if part.key in shapes:
-                curvature = np.stack(
-                    [shapes[part.key].squares(np.pad(each, around)) for each in weights]
-                )
-            else:
-                curvature = np.einsum("lyx,lyx->l", weights, changes[part.key] ** 2)[:, None]
-            curvature = curvature.sum(axis=0) if part.is_common else curvature
-            is_held = part.key in self.held
-            part.of(common, separate)[...] = 0 if is_held else 1 / np.sqrt(1 + curvature)
-        return common, separate
-
-    def beam_cosines(self, longest: int = 24, most: int = 150) -> BeamCosines:
-        """Return the cosines of smooth changes of the beams by their first numbers, by 1.
-
-        Parameters
-        ----------
-        longest : int, default 24
-            Cosines along each axis, of the longest waves.
-        most : int, default 150
-            Numbers of each beam.
-        """
-        lines: list[FloatArray] = []
-        knots: list[FloatArray] = []
-        for n, side in zip(self.rays.shape, self.rays.size, strict=True):
-            place = np.asarray(KNOT * (np.arange(float(n)) - 1) - self.pad)
-            inside = np.clip(np.minimum(place, side - place) / KNOT + 0.5, 0, 1)
-            lines.append(dct(np.diag(inside), axis=0, norm="ortho")[:longest])
-            knots.append(place + self.pad - 0.5)
-        numbers, count = self.nothing(), len(self.images)
-        numbers = numbers.like(np.arange(float(numbers.flat().size)) - numbers.potentials.size)
-        waves = [np.empty((0, len(lines[0]), len(lines[1])))]
-        places, images = [np.empty(0, np.int64)], [np.empty((0, count))]
-        for part, shapes in self.imperfect.shape_parts():
-            if part.key in self.held or not len(shapes.means) or shapes.envelope is not None:
-                continue
-            cosines = shapes.cosines(lines, knots)[:most]
-            rows = np.atleast_2d(part.of(numbers.common, numbers.separate))
-            members = np.ones((1, count)) if part.is_common else np.eye(count)
-            for row, seen in zip(rows, members, strict=True):
-                waves.append(cosines)
-                places.append(row[len(shapes.planes) :][:most].astype(np.int64))
-                images.append(np.tile(seen, (len(cosines), 1)))
-        return BeamCosines(np.concatenate(places), np.concatenate(images), np.concatenate(waves))
-
     def _shots(self, unknowns: Unknowns, counts: list[IntArray] | None) -> Iterator[_Shot]:
         counts = counts or self.ray_counts(unknowns)
         lights = self._lights(unknowns)
@@ -458,18 +395,6 @@ class Scene(PriorTerms):
         if not isinstance(width, float):
             return _spread(padded, width[::-1, ::-1])
         return padded if imperfect.blur else _spread(padded, width)
-
-
-class BeamCosines(NamedTuple):
-    """Cosines of the change of beams by n numbers, within the image.
-
-    `places` (n,) of the numbers among all values but the potentials, `images` (n, L), 1 where a
-    number acts, and `waves` (n, …), the cosines at the knots.
-    """
-
-    places: IntArray
-    images: FloatArray
-    waves: FloatArray
 
 
 class _Shot(NamedTuple):

@@ -76,7 +76,6 @@ _SAME = _ALIKE = 1e-6
 _SAME_STRENGTH = 1.08  # images that differ by less add no information
 _OTHER_UNITS = 3.0  # an image's mean brightness over its source's
 _FREE_SHARE = 0.1  # of the shorter side
-_FREE_TIE = 0.3
 
 
 @dataclass(frozen=True)
@@ -158,8 +157,8 @@ def collect_data(
     )
     units = _means(beams, used)
     in_units = beams / units[:, None, None]
-    around, pad = _strips(shape, options)
-    fill = [(0, 0), *((0, after - pad) for _, after in around)]
+    around, strip = _strips(shape, options)
+    fill = [(0, 0), *((0, after - strip["pad"]) for _, after in around)]
     is_common = _are_proportional(beams)
     single = _is_single(matrix)
     prior = _beam_prior(instrument, beams[0], is_assumed=is_assumed, unknown=unknown)
@@ -185,9 +184,7 @@ def collect_data(
         beams=np.pad(in_units, ((0, 0), *around), mode="edge"),
         psf=[_checked_point_spread(shot.psf, shape) for shot in shots],
         smoothness=np.tile(smoothness, (matrix.shape[1], 1)),
-        pad=pad,
-        tie=_FREE_TIE if options.boundary == "free" else 30.0,
-        decay=(options.decay_length or pad) if options.boundary == "free" else np.inf,
+        **strip,
         free_brightness=free_brightness or unknown or is_dimmed,
         **_alignment(instrument, options),
         fiducials=_checked_fiducials(value_of_first(shots, "fiducials"), shape),
@@ -278,13 +275,19 @@ def _beam_prior(
     return prior
 
 
-def _strips(shape: tuple[int, int], options: FitOptions, usual: int = 16) -> tuple[Around, int]:
-    """Return the strips before and after images along y and x, and the width before them."""
-    if options.boundary == "free":
+def _strips(
+    shape: tuple[int, int], options: FitOptions, usual: int = 16, free_tie: float = 0.3
+) -> tuple[Around, dict[str, Any]]:
+    """Return the strips before and after images along y and x, and how a scene holds them."""
+    is_free = options.boundary == "free"
+    if is_free:
         usual = max(usual, 8 * round(_FREE_SHARE * min(shape) / 8))
     pad = options.margin or usual
     height, width = shape
-    return ((pad, pad + _fill(height, pad)), (pad, pad + _fill(width, pad))), pad
+    around = (pad, pad + _fill(height, pad)), (pad, pad + _fill(width, pad))
+    if not is_free:
+        return around, {"pad": pad}
+    return around, {"pad": pad, "tie": free_tie, "decay": options.decay_length or pad}
 
 
 def _is_single(strengths: FloatArray) -> bool:

@@ -16,7 +16,6 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import (
-    Preconditioner,
     coarser,
     descend,
     finer,
@@ -25,6 +24,7 @@ from napari_shadowinv.fitting.descent import (
 )
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.posterior import Posterior, Response
+from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.poisson import border_mean
