@@ -22,7 +22,7 @@ import numpy as np
 from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import prepare
-from napari_shadowinv.transport.solvers import solve
+from napari_shadowinv.transport.solvers import Target, solve
 from reference import toroid_case
 
 SIZES = (10_000, 20_000, 40_000, 100_000, 200_000, 400_000, 1_000_000)
@@ -50,7 +50,7 @@ def measure(n_sites: int) -> dict[str, float]:
         for peak, noise in SHOTS:
             image = prepare(toroid_case(peak, noise).image, source, options).floored_image
             start = time.perf_counter()
-            solution = solve(plan.levels, image, options)[-1]
+            solution = solve(plan.levels, Target.of(image, options))[-1]
             seconds[str(peak)].append(time.perf_counter() - start)
             if not solution.converged:
                 print(f"{n_sites} sites, {peak}: {solution.reason}", file=sys.stderr)

@@ -24,7 +24,7 @@ from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.transport.minimise import TransportObjective
 from napari_shadowinv.transport.sites import SitePlan
-from napari_shadowinv.transport.solvers import solve
+from napari_shadowinv.transport.solvers import Target, solve
 from reference import toroid_case
 
 
@@ -93,7 +93,9 @@ def threads_row(plan: SitePlan, image: np.ndarray, options: InversionOptions, re
     times = []
     for threads in (1, 2):
         chosen = options.model_copy(update={"threads": threads})
-        times.append(best(lambda chosen=chosen: solve(plan.levels, image, chosen), repeat))
+        times.append(
+            best(lambda chosen=chosen: solve(plan.levels, Target.of(image, chosen)), repeat)
+        )
     return f"{times[0]:.4f} s on one thread, {times[1]:.4f} s on two"
 
 
@@ -122,14 +124,16 @@ def main() -> None:
     for peak, noise in [(97, False), (194, True)]:
         case = toroid_case(peak, noise)
         image = prepare(case.image, source, options).floored_image
-        weights = solve(plan.levels, image, options)[-1].weights
+        weights = solve(plan.levels, Target.of(image, options))[-1].weights
         hull = hull_seconds(plan, weights, repeat)
         works = {
             "one convex hull": hull,
             "diagram, integrals and Hessian after a small change": diagram_seconds(
                 plan, image, weights, repeat
             ),
-            "solve": best(lambda image=image: solve(plan.levels, image, options), repeat),
+            "solve": best(
+                lambda image=image: solve(plan.levels, Target.of(image, options)), repeat
+            ),
             "invert, sites given": best(
                 lambda case=case: invert(case.image, plan=plan, options=options), repeat
             ),

@@ -40,7 +40,7 @@ from napari_shadowinv.preprocessing import (
 )
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import invert_stack, run_stack
-from napari_shadowinv.transport.solvers import solve
+from napari_shadowinv.transport.solvers import Target, solve
 
 SIDE = 96
 
@@ -402,7 +402,7 @@ def test_a_level_that_stalled_has_no_part_in_the_response(threads):
     noise = ImageNoise(prepared.in_units())
     finest = plan.levels[-1]
     assert len(finest.sites) > 4500
-    *coarse, fine = solve(plan.levels, prepared.floored_image, options)
+    *coarse, fine = solve(plan.levels, Target.of(prepared.floored_image, options))
     assert len(coarse) == 2
 
     def flux_of_response(seen):

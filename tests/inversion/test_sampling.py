@@ -62,7 +62,7 @@ def case(request, image):
 def alone(samples, clean, seed):
     """Potential and displacement that one sample changes, by the ways of a single inversion."""
     plan, level = samples.plan, samples.plan.levels[-1]
-    objective = Target.of(clean, plan.margin, samples.options).objective(level)
+    objective = Target.of(clean, samples.options, plan.margin).objective(level)
     laplacian = objective.diagram(samples.start).laplacian()
     ground = objective.ground(samples.start)
     change = np.zeros(level.shape)

@@ -12,7 +12,7 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.transport.minimise import blur_image
 from napari_shadowinv.transport.sites import plan_levels
-from napari_shadowinv.transport.solvers import solve
+from napari_shadowinv.transport.solvers import Target, solve
 
 SIDE = 64
 MIDDLE = (SIDE - 1) / 2
@@ -124,7 +124,7 @@ def test_images_with_jumps_are_solved(name):
     image, source = HARD[name]
     plan = planned(source)
     level = plan.levels[-1]
-    answer = solve(plan.levels, raised(image), InversionOptions(tolerance=1e-3))[-1]
+    answer = solve(plan.levels, Target.of(raised(image), InversionOptions(tolerance=1e-3)))[-1]
     assert answer.converged, answer.reason
     assert residual(level, answer.weights, raised(image)) <= 1e-3
 
@@ -149,7 +149,7 @@ def test_cells_hold_the_same_of_split_pixels(parts):
 def test_structure_thinner_than_a_cell_takes_few_steps(image):
     """Each row of cells that passes a pixel's edge took some steps where pixels were not split."""
     plan = planned(UNIFORM, SIDE**2)
-    answer = solve(plan.levels, raised(image), InversionOptions())[-1]
+    answer = solve(plan.levels, Target.of(raised(image), InversionOptions()))[-1]
     assert answer.converged
     assert answer.iterations < 60
 
@@ -157,7 +157,9 @@ def test_structure_thinner_than_a_cell_takes_few_steps(image):
 def test_stages_agree():
     plan = planned(UNIFORM)
     single, multi = (
-        solve(plan.levels, smooth_image(), InversionOptions(tolerance=1e-6, stages=stages))[-1]
+        solve(
+            plan.levels, Target.of(smooth_image(), InversionOptions(tolerance=1e-6, stages=stages))
+        )[-1]
         for stages in ("single", "multi")
     )
     assert single.converged
@@ -170,7 +172,7 @@ def test_an_unsolved_image_leaves_the_solution_of_a_blurred_one(stages):
     plan = planned(UNIFORM)
     image = raised(one_pixel())
     options = InversionOptions(stages=stages, max_iterations=27)
-    answer = solve(plan.levels, image, options)[-1]
+    answer = solve(plan.levels, Target.of(image, options))[-1]
     assert not answer.converged
     assert "all 27 iterations" in answer.reason
     blur = re.search(r"blurred by (\S+) px", answer.reason)
@@ -189,7 +191,7 @@ def test_the_report_of_an_unsolved_image_names_the_blur():
 def test_unconverged_solution_beats_a_blurred_one():
     """No solver gets below rounding: the tolerance asked for is out of reach."""
     plan = planned(UNIFORM, 500)
-    answer = solve(plan.levels, smooth_image(), InversionOptions(tolerance=1e-16))[-1]
+    answer = solve(plan.levels, Target.of(smooth_image(), InversionOptions(tolerance=1e-16)))[-1]
     assert not answer.converged
     assert answer.residual < 1e-11
     assert "blurred" not in answer.reason
@@ -200,7 +202,7 @@ def test_no_level_takes_more_steps_than_allowed(most):
     plan = planned(UNIFORM)
     for stages in ("single", "multi"):
         options = InversionOptions(max_iterations=most, stages=stages)
-        answers = solve(plan.levels, raised(salt()), options)
+        answers = solve(plan.levels, Target.of(raised(salt()), options))
         assert max(answer.iterations for answer in answers) <= most
         assert f"all {most} iterations" in answers[-1].reason
 
@@ -208,7 +210,7 @@ def test_no_level_takes_more_steps_than_allowed(most):
 def test_steps_on_a_stalled_level_are_reported():
     """The coarser levels' start does not lead to a disc: the finest one is tried twice."""
     plan = planned(UNIFORM)
-    answers = solve(plan.levels, raised(DISC), InversionOptions())
+    answers = solve(plan.levels, Target.of(raised(DISC), InversionOptions()))
     assert [len(answer.weights) for answer in answers] == [500, 2000, 2000]
     assert answers[1].residual > 0.1
     assert answers[1].iterations > 0
@@ -243,8 +245,7 @@ def test_threads_do_not_change_the_way_to_a_sharp_image():
     single, parallel = (
         solve(
             plan.levels[-1:],
-            raised(np.maximum(DISC, 0.1)),
-            InversionOptions(threads=threads),
+            Target.of(raised(np.maximum(DISC, 0.1)), InversionOptions(threads=threads)),
         )[-1]
         for threads in (1, 2)
     )

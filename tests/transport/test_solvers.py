@@ -13,7 +13,7 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.transport.minimise import TransportObjective, blur_image, descend, newton
 from napari_shadowinv.transport.sites import plan_levels
-from napari_shadowinv.transport.solvers import solve
+from napari_shadowinv.transport.solvers import Target, solve
 
 
 def bright_spot(shape=(40, 50)):
@@ -35,7 +35,8 @@ def residual(level, weights, image):
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-8])
 def test_every_cell_holds_its_flux_to_the_tolerance(plan, tolerance):
-    solution = solve(plan.levels, bright_spot(), InversionOptions(tolerance=tolerance))[-1]
+    target = Target.of(bright_spot(), InversionOptions(tolerance=tolerance))
+    solution = solve(plan.levels, target)[-1]
     assert solution.converged
     assert residual(plan.levels[-1], solution.weights, bright_spot()) <= tolerance
     assert solution.weights.mean() == pytest.approx(0, abs=1e-12)
@@ -46,7 +47,8 @@ def test_newton_converges_quadratically_near_the_solution(plan):
     objective = TransportObjective(
         level.triangulation.copy(), level.mass, Density.from_image(bright_spot())
     )
-    start = solve(plan.levels, bright_spot(), InversionOptions(tolerance=1e-2))[-1].weights
+    rough = Target.of(bright_spot(), InversionOptions(tolerance=1e-2))
+    start = solve(plan.levels, rough)[-1].weights
     residuals = [
         newton(objective, start, tolerance=1e-14, max_iterations=steps).residual
         for steps in (0, 1, 2)
@@ -62,9 +64,9 @@ def test_descent_finds_the_weights_that_newton_finds(solver, stages):
     y, x = np.indices((30, 30))
     image = 1 + 0.5 * np.sin(y / 5) * np.cos(x / 4)
     image /= image.mean()
-    by_newton = solve(plan.levels, image, InversionOptions(tolerance=1e-6))[-1]
+    by_newton = solve(plan.levels, Target.of(image, InversionOptions(tolerance=1e-6)))[-1]
     options = InversionOptions(tolerance=1e-6, max_iterations=5000, solver=solver, stages=stages)
-    by_descent = solve(plan.levels, image, options)[-1]
+    by_descent = solve(plan.levels, Target.of(image, options))[-1]
     assert by_descent.converged
     np.testing.assert_allclose(by_descent.weights, by_newton.weights, atol=1e-4)
 
@@ -73,8 +75,8 @@ def test_descent_finds_the_weights_that_newton_finds(solver, stages):
 def test_a_solution_as_start_is_the_answer(plan, solver, steps):
     """Descent always makes a step before it asks how good it is."""
     options = InversionOptions(tolerance=1e-2, solver=solver, max_iterations=3000)
-    cold = solve(plan.levels, bright_spot(), InversionOptions(tolerance=1e-2))
-    (warm,) = solve(plan.levels, bright_spot(), options, start=cold[-1].weights)
+    cold = solve(plan.levels, Target.of(bright_spot(), InversionOptions(tolerance=1e-2)))
+    (warm,) = solve(plan.levels, Target.of(bright_spot(), options), start=cold[-1].weights)
     assert warm.converged
     assert warm.iterations == steps
     np.testing.assert_allclose(warm.weights, cold[-1].weights, rtol=0, atol=0.05 * steps + 1e-9)
@@ -86,8 +88,8 @@ def test_a_start_that_leads_nowhere_has_no_influence(plan):
     folding = bright_spot() ** 3
     image = folding / folding.mean() + 1e-3
     image /= image.mean()
-    cold = solve(plan.levels, image, InversionOptions())
-    warm = solve(plan.levels, image, InversionOptions(), start=nonsense)
+    cold = solve(plan.levels, Target.of(image, InversionOptions()))
+    warm = solve(plan.levels, Target.of(image, InversionOptions()), start=nonsense)
     assert cold[-1].converged
     assert len(warm) == len(cold) > 1
     np.testing.assert_array_equal(warm[-1].weights, cold[-1].weights)
@@ -96,8 +98,8 @@ def test_a_start_that_leads_nowhere_has_no_influence(plan):
 def test_a_start_that_does_not_converge_is_no_worse_than_none(plan):
     options = InversionOptions(tolerance=1e-12, max_iterations=1)
     start = np.zeros(len(plan.levels[-1].sites))
-    cold = solve(plan.levels, bright_spot(), options)[-1]
-    warm = solve(plan.levels, bright_spot(), options, start=start)[-1]
+    cold = solve(plan.levels, Target.of(bright_spot(), options))[-1]
+    warm = solve(plan.levels, Target.of(bright_spot(), options), start=start)[-1]
     assert not warm.converged
     assert warm.residual == cold.residual
 
@@ -107,8 +109,7 @@ def test_a_request_to_stop_ends_a_warm_start(plan):
     with pytest.raises(InversionCancelled, match="transport"):
         solve(
             plan.levels,
-            bright_spot(),
-            InversionOptions(),
+            Target.of(bright_spot(), InversionOptions()),
             Reporter(None, lambda: True),
             start=start,
         )
@@ -127,7 +128,7 @@ def test_a_matrix_that_does_not_fit_is_refused():
 
 def test_an_exhausted_solver_says_how_far_it_got_and_why(plan):
     options = InversionOptions(tolerance=1e-9, max_iterations=1)
-    solution = solve(plan.levels, bright_spot(), options)[-1]
+    solution = solve(plan.levels, Target.of(bright_spot(), options))[-1]
     assert not solution.converged
     assert "all 1 iterations" in solution.reason
     assert residual(plan.levels[-1], solution.weights, bright_spot()) == pytest.approx(
@@ -143,7 +144,9 @@ def test_a_request_to_stop_ends_the_solver(plan):
         return len(steps) > 3
 
     with pytest.raises(InversionCancelled, match="transport"):
-        solve(plan.levels, bright_spot(), InversionOptions(), Reporter(None, after_three))
+        solve(
+            plan.levels, Target.of(bright_spot(), InversionOptions()), Reporter(None, after_three)
+        )
     assert len(steps) == 4
 
 
@@ -155,7 +158,7 @@ def test_threads_do_not_change_the_weights():
     image = 0.3 + np.exp(-(((y - 25) / 9) ** 2) - ((x - 33) / 8) ** 2)
     image /= image.mean()
     single, parallel = (
-        solve(plan.levels, image, InversionOptions(threads=threads))[-1].weights
+        solve(plan.levels, Target.of(image, InversionOptions(threads=threads)))[-1].weights
         for threads in (1, 3)
     )
     np.testing.assert_array_equal(single, parallel)
@@ -177,7 +180,7 @@ def test_a_few_almost_empty_cells_do_not_shorten_the_steps():
     image = synthetic_image(gaussian_blob((100, 100), 280.0, 9.0).displacement)
     image = np.maximum(image, 1e-3)
     plan = plan_levels(np.ones(image.shape), image.size, lloyd_iterations=5)
-    answers = solve(plan.levels, image / image.mean(), InversionOptions())
+    answers = solve(plan.levels, Target.of(image / image.mean(), InversionOptions()))
     assert all(answer.converged for answer in answers)
     # Steps that those cells kept short were 8, 5 and 9.
     assert all(answer.iterations <= 4 for answer in answers[1:])

@@ -436,14 +436,11 @@ def _solve(
         with measure_time("transport", seconds):
             solutions = solve(
                 levels,
-                prepared.floored_image,
-                options,
+                budget.target,
                 report,
                 start=None if start is None else start.weights,
-                margin=plan.margin,
                 needed=partial(problem.needed, levels) if adaptive else None,
                 solved=solutions,
-                target=budget.target,
             )
         answer = solutions[-1]
         if answer.converged:

@@ -144,7 +144,7 @@ class Budget:
     @cached_property
     def target(self) -> Target:
         """The image that the transport solves."""
-        return Target.of(self._prepared.floored_image, self._plan.margin, self.options)
+        return Target.of(self._prepared.floored_image, self.options, self._plan.margin)
 
     def free_target(self, solutions: Sequence[LevelSolution]) -> None:
         """Compute the linear response, which needs the target, and free the target's memory."""

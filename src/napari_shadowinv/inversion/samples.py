@@ -154,9 +154,8 @@ class FullResampling:
         """Return potential and displacement of the noisy image of one seed, (3, H, W)."""
         (seed,) = seeds
         plan, image, scale = self._changed(seed)
-        solution = solve(
-            plan.levels, image, self.options, report, start=self.start, margin=plan.margin
-        )[-1]
+        target = Target.of(image, self.options, plan.margin)
+        solution = solve(plan.levels, target, report, start=self.start)[-1]
         potential, displacement = (
             plan.within(values) for values in read_out(solution, self.options)
         )
@@ -181,7 +180,7 @@ class FullResampling:
         # has moved: where a fifth remains in the worst cell, a sample's field is within 3 % of
         # its change, and the deviation of many within 0.2 %.
         level = self.plan.levels[-1]
-        target = Target.of(self.image(seed), self.plan.margin, self.options)
+        target = Target.of(self.image(seed), self.options, self.plan.margin)
         objective = target.objective(level)
         by_noise = objective.residual(objective.diagram(self.start))
         loosest = min(_SAMPLE_SHARE * by_noise, _LOOSEST_TOLERANCE)
@@ -399,7 +398,7 @@ class LinearResampling:
     ) -> None:
         self._samples, self._image, self._measure = samples, image, measure
         plan, level = samples.plan, samples.plan.levels[-1]
-        objective = Target.of(image, plan.margin, samples.options).objective(level)
+        objective = Target.of(image, samples.options, plan.margin).objective(level)
         diagram = objective.diagram(samples.start)
         self._shares = pixel_shares(diagram, level.shape, threads=threads)
         self._network = diagram.laplacian(), objective.ground(samples.start)

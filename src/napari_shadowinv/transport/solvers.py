@@ -107,34 +107,28 @@ Needed = Callable[[Sequence[LevelSolution]], float]
 
 def solve(
     levels: Levels,
-    image: FloatArray,
-    options: InversionOptions,
+    target: Target,
     report: Reporter | None = None,
     *,
     start: FloatArray | None = None,
-    margin: Margin | None = None,
     needed: Needed | None = None,
     solved: Sequence[LevelSolution] = (),
-    target: Target | None = None,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
-    The image, shape (H, W), is positive everywhere, and has the flux of the source unless there
-    is a margin. With a `start` (weights of the finest level that solve a similar image) it solves
-    on the finest level alone, if that converges. After each coarser level, `needed` returns the
-    factor on the number of sites that would suffice; at 1 or less the solution ends there. Levels
-    that are already `solved` are not solved again. A `target` made of the image may be passed with
-    it. Returns one solution for each level that was tried. If a level stalls, the finest one is
-    solved from zero weights. The last one counts.
+    With a `start` (weights of the finest level that solve a similar image) it solves on the finest
+    level alone, if that converges. After each coarser level, `needed` returns the factor on the
+    number of sites that would suffice; at 1 or less the solution ends there. Levels that are
+    already `solved` are not solved again. Returns one solution for each level that was tried. If a
+    level stalls, the finest one is solved from zero weights. The last one counts.
     """
-    if options.stages == "single":
+    if target.options.stages == "single":
         levels = levels[-1:]
-    target = target or Target.of(image, margin, options)
     if start is not None:
         nearby = _solve_from(start, levels[-1], target, report)
         if nearby is not None:
             return [nearby]
-    with levels.in_background(options.threads) as begin:
+    with levels.in_background(target.options.threads) as begin:
         return _solve_levels(levels, target, report, needed, solved, begin)
 
 
@@ -222,7 +216,7 @@ def fit_flux_factor(
     at_edge = np.abs(margin.edge_distance(few[-1].sites).min(axis=-1)) < few[-1].spacing
 
     def move_at_edge(trial: FloatArray) -> float:
-        solution = solve(few, trial, options, report, margin=margin)[-1]
+        solution = solve(few, Target.of(trial, options, margin), report)[-1]
         return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
 
     factor = 1.0
@@ -265,14 +259,20 @@ def _solve_from(
 
 @dataclass(frozen=True)
 class Target:
-    """The image and its margin, in which the flux arrives."""
+    """The image and its margin, in which the flux arrives.
+
+    The image, shape (H, W), is positive everywhere, and has the flux of the source unless there is
+    a margin.
+    """
 
     density: Density
     margin: Margin | None
     options: InversionOptions
 
     @classmethod
-    def of(cls, image: FloatArray, margin: Margin | None, options: InversionOptions) -> Target:
+    def of(
+        cls, image: FloatArray, options: InversionOptions, margin: Margin | None = None
+    ) -> Target:
         return cls(Density.from_image(image, threads=options.threads), margin, options)
 
     def objective(self, level: SiteLevel) -> TransportObjective:
@@ -294,7 +294,7 @@ class Target:
         if margin is None:
             target = Target(blur_to_density(pixels, blur, options.threads), margin, options)
         else:
-            target = Target.of(blur_image(pixels, blur, options.threads), margin, options)
+            target = Target.of(blur_image(pixels, blur, options.threads), options, margin)
         return target.objective(level)
 
     def solve_blurred_first(
