@@ -60,7 +60,6 @@ HELP = {
     "field": "Result, displacement (2, H, W) in px, potential (H, W) in px², or 3-D field "
     "(openPMD, NetCDF).",
     "truth": "NetCDF file of line integrals.",
-    "seed": "Seed of the particles of a 3-D field.",
     "setup": "TOML file of the prediction's geometry.",
     "recorded_with": "TOML file of the measurement's.",
     "deflector": "Cause of the deflection.",
@@ -203,7 +202,6 @@ class ExperimentFlags:
     source: _flags.SourceFile = None
     channel: _flags.Channel = None
     variable: _flags.Variable = None
-    seed: Annotated[int, Option(help=HELP["seed"])] = 0
 
 
 @notify_errors
@@ -256,8 +254,8 @@ def forward(
             ]
             say(two_columns("Traced field", rows))
         return
-    if chosen.values or truth is not None or flags.seed:
-        names = ", ".join(chosen.values) or "--truth or --seed"
+    if chosen.values or truth is not None:
+        names = ", ".join(chosen.values) or "--truth"
         raise InputError(f"received {names}, but {field} is no 3-D field: leave them out")
     content = field_from(field, flags.variable)
     original, target = choose_setups(content, setup, original, flags.deflector, flags.dispersion)
@@ -399,12 +397,10 @@ def trace_field(
         return trace_file(
             path,
             setup,
-            shape=(view.height, view.width),
             view=view,
             options=settings.change("trace", TraceOptions()),
             source=source,
             iteration=flags.variable,
-            seed=flags.seed,
             **callbacks,
         )
 

@@ -51,7 +51,6 @@ def predict_image(
     deflector: str | None = None,
     dispersion: float = 1.0,
     source: ArrayLike | None = None,
-    shape: tuple[int, int] | None = None,
     rays_per_pixel: int = 16,
     threads: int | None = None,
 ) -> FloatArray:
@@ -63,11 +62,11 @@ def predict_image(
         Displacement in px of `recorded_with`, axis order (y, x), such as `Inversion.displacement`.
     recorded_with, setup : Setup
         The experiment that the displacement belongs to, and the one to predict.
-    deflector, dispersion, shape
+    deflector, dispersion
         As for `transferred_displacement`.
     source : array_like, shape (H', W'), optional
-        Flux of each pixel of `setup` without the object; gives the shape if that is left out.
-        Default: 1.
+        Flux of each pixel of `setup` without the object. Default: 1, in the shape that covers the
+        object.
     rays_per_pixel, threads
         As for `synthetic_image`.
 
@@ -81,9 +80,9 @@ def predict_image(
     InputError
         As `transferred_displacement` and `synthetic_image`.
     """
+    shape = None
     if source is not None:
         source = plain_array(source, "source")
-    if source is not None and shape is None:
         height, width = np.shape(source)[:2] if np.ndim(source) == 2 else (0, 0)
         shape = (height, width)
     moved = transferred_displacement(
@@ -96,7 +95,6 @@ class _Keywords(TypedDict, total=False):
     deflector: str | None
     dispersion: float
     source: ArrayLike | None
-    shape: tuple[int, int] | None
     rays_per_pixel: int
     threads: int | None
 

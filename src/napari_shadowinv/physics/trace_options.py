@@ -72,6 +72,18 @@ class TraceOptions(CheckedModel):
         default=False,
         description="Also return start, landing point and deflection of each particle; for counts.",
     )
+    seed: int = Field(
+        default=0,
+        ge=0,
+        title="Random seed",
+        description="Seed of all random choices; for counts.",
+    )
+    threads: int | None = Field(
+        default=None,
+        ge=1,
+        title="Number of threads",
+        description="Number of threads. Default: all cores. It does not affect the result.",
+    )
 
 
 class GridView(CheckedModel):

@@ -214,8 +214,6 @@ def trace(
     options: TraceOptions | None = None,
     profile: Profile | None = None,
     spectrum: ArrayLike | None = None,
-    seed: int = 0,
-    threads: int | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> TracedImage:
@@ -230,7 +228,7 @@ def trace(
     shape : tuple of int, default (200, 200)
         Height and width of the image in px.
     options : TraceOptions, optional
-        Fluence or counts, source size, energy spread, accuracy.
+        Fluence or counts, source size, energy spread, accuracy, seed, threads.
     profile : array_like of shape (H, W), or callable, optional
         Fluence of the beam on the object plane. An array covers the image and is constant within
         a pixel; a function is called with arrays of y and x in m from the middle of the image,
@@ -238,10 +236,6 @@ def trace(
     spectrum : array_like, shape (2, n), optional
         Energies in MeV, increasing, and the number of particles per MeV there, linear in between;
         for counts. Default: the energy of the setup with the spread of the options.
-    seed : int, default 0
-        Seed of all random choices, 0 or more; for counts.
-    threads : int, optional
-        Threads to use. Default: all cores. The result does not depend on it.
     on_progress, should_stop : callable, optional
         Receives a `Progress`; ends the work when it returns true.
 
@@ -282,9 +276,7 @@ def trace(
     options = as_model(TraceOptions, options, "options")
     shape = checked_shape(shape)
     _check_choices(options, setup, spectrum)
-    if seed < 0:
-        raise InputError(f"seed is {seed}: expected a whole number, 0 or more")
-    report = Reporter(on_progress, should_stop)
+    report, threads = Reporter(on_progress, should_stop), options.threads
     report("field", 0)
     flight = Flight(grid, setup, shape, options, usable_threads(threads), report)
     centres = pixel_centres(*image_range(shape), 1)
@@ -293,7 +285,7 @@ def trace(
     lines = line_integrals(grid, setup, shape, threads=threads)
     reach = _reach(flight, straight.displacement)
     if options.output == "counts":
-        exposure = _count(flight, reach, profile, _energies(flight, spectrum), seed)
+        exposure = _count(flight, reach, profile, _energies(flight, spectrum), options.seed)
     else:
         exposure = _fluence(flight, reach, profile, threads)
     return TracedImage(
@@ -305,7 +297,7 @@ def trace(
         outside=exposure.launched - exposure.landed - exposure.lost,
         setup=setup,
         options=options,
-        seed=seed,
+        seed=options.seed,
         length=grid.length,
         edge_share=grid.edge_share,
     )

@@ -10,7 +10,7 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.physics.trace_options import GridView, TraceOptions
+from napari_shadowinv.physics.trace_options import GridView, SizedView, TraceOptions
 from napari_shadowinv.physics.tracing import TracedImage, trace
 from napari_shadowinv.pipeline.experiment_object import TracedObject, object_of_field
 
@@ -19,12 +19,10 @@ def trace_file(
     path: Path,
     setup: Setup | None,
     *,
-    shape: tuple[int, int] = (200, 200),
-    view: GridView | None = None,
+    view: SizedView | None = None,
     options: TraceOptions | None = None,
     source: ArrayLike | None = None,
     iteration: str | None = None,
-    seed: int = 0,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> TracedImage:
@@ -36,11 +34,10 @@ def trace_file(
         An openPMD or NetCDF 4 file; see `napari_shadowinv.io.field_grids.read_field_grid`.
     setup : Setup or None
         The experiment, of particles.
-    shape : tuple of int, default (200, 200)
-        Height and width of the image in px, if there is no source.
-    view : GridView, optional
-        Direction of the beam. Default: along z, with x to the right.
-    options, seed, on_progress, should_stop
+    view : SizedView, optional
+        Direction of the beam, and the size of the image if there is no source. Default: along z,
+        with x to the right.
+    options, on_progress, should_stop
         As for `napari_shadowinv.trace`.
     source : array_like, shape (H, W), optional
         Undisturbed beam. Default: 1.
@@ -57,16 +54,13 @@ def trace_file(
         As `read_field_grid` and `napari_shadowinv.trace`; or if the setup is none of particles.
     """
     checked = check_particles(setup)
-    if source is not None:
-        shape = getattr(source, "shape", shape)
-    grid = (view or GridView()).apply(read_field_grid(path, iteration=iteration))
+    view = view or SizedView()
     return trace(
-        grid,
+        view.apply(read_field_grid(path, iteration=iteration)),
         checked,
-        shape,
+        getattr(source, "shape", (view.height, view.width)),
         options=options,
         profile=source,
-        seed=seed,
         on_progress=on_progress,
         should_stop=should_stop,
     )

@@ -33,6 +33,7 @@ from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_ima
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
 from napari_shadowinv.physics.setup import Setup, deflector_titles
+from napari_shadowinv.physics.trace_options import SizedView
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.inversion_run import plane_of
 from napari_shadowinv.pipeline.traced_file import trace_file
@@ -85,7 +86,9 @@ class ForwardJob(Job):
         keywords: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
         if isinstance(self.field, GridFile):
             source, shadow = self._source(self.shape)
-            keywords |= {"shape": self.shape, "view": self.field.view, "source": source}
+            height, width = self.shape
+            view = SizedView(**dict(self.field.view), height=height, width=width)
+            keywords |= {"view": view, "source": source}
             traced = trace_file(Path(self.field.path), self.setup, **keywords)
             image, displacement = traced.image, np.nan_to_num(traced.displacement)
             flux = traced.source.sum()
