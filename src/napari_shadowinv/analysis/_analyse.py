@@ -32,7 +32,6 @@ def analyse(
     unit: str | None = None,
     deflector: str | None = None,
     setup: Setup | None = None,
-    seed: int = 0,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> list[ProductResult]:
@@ -60,8 +59,6 @@ def analyse(
         Key of what deflects, such as "E". Of a fit with several fields only this one is analysed.
     setup : Setup, optional
         The experiment, for SI units. Default: the result's.
-    seed : int
-        For the signs of errors that are the same in all samples, such as the discretisation's.
     on_progress, should_stop
         As of `invert`.
 
@@ -112,7 +109,7 @@ def analyse(
         if not task.products:
             continue
         evaluation = task.field.evaluate(task.choose, int(samples), callbacks)
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)  # of errors that are the same in all samples
         results += task.results(evaluation, rng, names[len(results) :], headline)
     return results
 
