@@ -223,12 +223,11 @@ def _not_explained(case: Evidence) -> Answer:
 def _beam_or_object(case: Evidence) -> Answer:
     if not (case.single and case.beam_unknown):
         return None
-    return Assessment(
+    return _doubt(
         Verdict.AMBIGUOUS,
         "one image cannot tell the beam from the object",
+        "many pairs of them explain it",
         "take another energy, or an image of the beam",
-        "one image cannot tell the beam from the object: many pairs of them explain it; take "
-        "another energy, or an image of the beam",
     )
 
 
@@ -243,12 +242,11 @@ def _likely_cause(case: Evidence) -> Answer:
 def _rays_lost(case: Evidence) -> Answer:
     if not case.single or (lost := _share_lost(case.displacement)) <= case.limits.lost_rays:
         return None
-    return Assessment(
+    return _doubt(
         Verdict.AMBIGUOUS,
         f"{percent(lost)} of the rays miss the image",
+        "one image does not show which",
         "record a larger field of view, or another energy",
-        f"the object sends {percent(lost)} of the rays past the image, and one image does not show "
-        "which; record a larger field of view, or take another energy",
     )
 
 
@@ -258,13 +256,12 @@ def _rays_meet(case: Evidence) -> Answer:
     meeting = _share_squeezed(case.jacobian, case.displacement, case.limits.meeting)
     if meeting <= case.limits.few:
         return None
-    return Assessment(
+    return _doubt(
         Verdict.AMBIGUOUS,
         f"rays meet or cross over {percent(meeting)} of the object",
+        "one image does not show which came from where, and the same bright lines come from fields "
+        "with other folds",
         "take another energy",
-        f"rays meet or cross over {percent(meeting)} of the object, and one image does not show "
-        "which came from where: the same bright lines come from fields with other folds; take "
-        "another energy",
     )
 
 
@@ -283,15 +280,12 @@ def _counts_missing(case: Evidence) -> Answer:
     if not pattern.lacks_counts or pattern.missing_counts <= case.limits.missing_counts:
         return None
     share = percent(pattern.missing_counts)
-    return Assessment(
+    return _doubt(
         Verdict.UNCERTAIN,
         f"the noise is {share} smaller than of as many counts",
+        f"a dark level of about {share} seems to be left in images and source, or the response is "
+        "not linear, and either weakens the field, or the counts were averaged, scaled or smoothed",
         "subtract the dark level, or give the noise",
-        f"the noise is {share} smaller than that of as many counts: a dark level of about "
-        f"{share} seems to be left in the images, or the detector's response is not linear, "
-        "and either weakens the field; subtract the dark level from images and source, "
-        "linearise the images, or, if the counts were averaged, scaled or "
-        "smoothed, give their noise",
     )
 
 
@@ -309,13 +303,11 @@ def _other_answers(case: Evidence) -> Answer:
     ]
     if not rivals:
         return None
-    return Assessment(
+    return _doubt(
         Verdict.SEVERAL,
         f"{len(rivals) + 1} fields, up to {percent(max(rivals))} apart, explain the data",
+        "about equally well, so compare them with what is known",
         "take another energy",
-        f"{len(rivals) + 1} different fields explain the data about as well; they differ by "
-        f"up to {percent(max(rivals))} (r.m.s.); take another energy, or compare them with what is "
-        "known",
     )
 
 
@@ -333,38 +325,32 @@ def _errors_large(case: Evidence) -> Answer:
 def _noise_unmeasured(case: Evidence) -> Answer:
     if not (case.single and case.noise is not None and case.noise.is_hidden):
         return None
-    return Assessment(
+    return _doubt(
         Verdict.UNCERTAIN,
         "structure fills the image and hides the noise",
+        "noise that is correlated over a few pixels, as of smoothed or resampled images, looks "
+        "like it",
         "give the noise and its correlation",
-        "the noise was not measured: structure fills the image, and noise that is correlated "
-        "over a few pixels looks like it; give the noise, and its correlation if the image was "
-        "smoothed or resampled",
     )
 
 
 def _search_unfinished(case: Evidence) -> Answer:
     if case.fit.report.converged:
         return None
-    return Assessment(
-        Verdict.UNCERTAIN,
-        f"not converged in {case.fit.report.iterations} steps",
-        "allow more",
-        "the search reached its maximum number of iterations before it ended: allow more",
-    )
+    reason = f"not converged in {case.fit.report.iterations} steps"
+    return Assessment(Verdict.UNCERTAIN, reason, "allow more")
 
 
 def _object_masked(case: Evidence) -> Answer:
     if case.hidden <= case.limits.hidden:
         return None
-    return Assessment(
+    return _doubt(
         Verdict.UNCERTAIN,
         "the mask hides part of the object",
+        f"its image has {percent(case.hidden)} of its strongest contrast there; folds beneath were "
+        "not seen, the field there is the smoothest that the surroundings allow, and the error "
+        "bars do not include that",
         "unmask it, or add an image",
-        f"the mask hides part of the object where its image has {percent(case.hidden)} of its "
-        "strongest contrast: folds beneath were not seen, the field there is the smoothest that "
-        "the surroundings allow, and the error bars do not include that; unmask what is sound, or "
-        "add an image in which it is seen",
     )
 
 
@@ -394,6 +380,10 @@ _RULES = (
     _object_masked,
     _conditional,
 )
+
+
+def _doubt(verdict: Verdict, reason: str, detail: str, advice: str) -> Assessment:
+    return Assessment(verdict, reason, advice, f"{reason}: {detail}; {advice}")
 
 
 def _limited(case: Evidence) -> str:
