@@ -231,7 +231,7 @@ def _find_pattern(
         correlation=data.instrument.noise_correlation,
         noise=data.noise,
     )
-    if pattern.lacks_counts and openness.posterior is not None:
+    if pattern.lacks_counts() and openness.posterior is not None:
         posterior = openness.posterior.reporting(lambda: on_step("samples", refined.objective))
         absorbed = posterior.count_determined(np.random.default_rng(data.options.seed))
         share = pattern.missing_counts - absorbed / np.count_nonzero(minima.scene.weights)

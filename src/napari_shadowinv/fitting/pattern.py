@@ -12,6 +12,7 @@ the noise in each pixel.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from zlib import crc32
 
@@ -25,15 +26,13 @@ from napari_shadowinv.fitting.measurements import FitData, NoiseMatch
 from napari_shadowinv.fitting.search import SMOOTHNESS_RATIO, Minimum, posterior_of, settle_minimum
 from napari_shadowinv.fitting.unknowns import Unknowns
 
-_WIDTHS_PX = (2.0, 4.0, 8.0)
-_SMALLEST_VARIANCE = 1e-12  # of the noise
-_DETAIL_PX, _MOSTLY_USED = 2.0, 0.9  # width of a Gaussian, and its share on used pixels
-_NEAR_PX, _FAR_PX = 1, 4  # distances of the pixels that are compared
-# White noise has a ratio of 1 ± 0.03 on 64 × 64 px; noise blurred by 0.4 px has 0.84.
-_MAX_VARIANCE_RATIO = 0.85
 
-
-def pattern_strength(residual: FloatArray, used: BoolArray, correlation: float = 0.0) -> float:
+def pattern_strength(
+    residual: FloatArray,
+    used: BoolArray,
+    correlation: float = 0.0,
+    widths: Sequence[float] = (2.0, 4.0, 8.0),
+) -> float:
     """Return how far a smoothed residual stands out of smoothed noise of its own r.m.s.
 
     Parameters
@@ -44,22 +43,23 @@ def pattern_strength(residual: FloatArray, used: BoolArray, correlation: float =
         The pixels that were fitted.
     correlation : float, default 0
         Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise.
+    widths : sequence of float, default (2, 4, 8)
+        Standard deviations of the Gaussians that smooth the residual, px.
 
     Returns
     -------
     float
-        Power of the residual smoothed by Gaussians of 2, 4 and 8 px, minus the expected one, in
-        standard deviations of that; the largest. White noise gives about 0 ± 1, and less where the
-        model has absorbed part of it.
+        Power of the smoothed residual, minus the expected one, in standard deviations of that; the
+        largest. White noise gives about 0 ± 1, and less where the model has absorbed part of it.
     """
     values = np.where(used, residual, 0.0)
     variance = float((values**2).sum() / max(used.sum(), 1))
-    if variance < _SMALLEST_VARIANCE:
+    if variance < 1e-12:  # of the noise: rounding
         return 0.0
     inside = used.astype(np.float64)
     pixels = inside.sum()
     strengths = []
-    for width in _WIDTHS_PX:
+    for width in widths:
         smooth = gaussian_filter(values, width, mode="constant")
         power = float((smooth[used] ** 2).sum()) / variance
         # The kernel's square is a Gaussian, too, narrower by √2.
@@ -74,30 +74,31 @@ def pattern_strength(residual: FloatArray, used: BoolArray, correlation: float =
     return float(max(strengths))
 
 
-def correlation_length(residual: FloatArray, used: BoolArray) -> float:
+def correlation_length(
+    residual: FloatArray, used: BoolArray, apart: tuple[int, int] = (1, 4), most: float = 0.85
+) -> float:
     """Return the standard deviation in px of the Gaussian that has blurred white noise.
 
-    Differences of neighbouring pixels are compared with differences of pixels four apart. Medians
-    are taken, so that bright lines that the model misses do not count. 0 if the noise is white.
+    Differences of pixels are compared over two distances. Medians are taken, so that bright lines
+    that the model misses do not count. 0 if the noise is white.
 
     Parameters
     ----------
     residual, used : ndarray, shape (H, W)
         As for `pattern_strength`.
+    apart : tuple of int, default (1, 4)
+        Distances, px.
+    most : float, default 0.85
+        Largest ratio of their variances for noise that is not white. White noise has 1 ± 0.03 on
+        64 × 64 px, noise blurred by 0.4 px 0.84.
     """
-    near = _squared_difference(residual, used, _NEAR_PX)
-    far = _squared_difference(residual, used, _FAR_PX)
-    if not far > 0:
-        return 0.0
-    ratio = near / far
-    if ratio > _MAX_VARIANCE_RATIO:
+    near, far = (_squared_difference(residual, used, distance) for distance in apart)
+    if not far > 0 or near / far > most:
         return 0.0
     # The correlation of blurred noise at a distance d is exp(-d² / 4c²).
     lengths = np.geomspace(0.2, 20.0, 400)
-    ratios = (1 - np.exp(-(_NEAR_PX**2) / (4 * lengths**2))) / (
-        1 - np.exp(-(_FAR_PX**2) / (4 * lengths**2))
-    )
-    return float(np.interp(-ratio, -ratios, lengths))
+    of_near, of_far = (1 - np.exp(-(distance**2) / (4 * lengths**2)) for distance in apart)
+    return float(np.interp(-near / far, -of_near / of_far, lengths))
 
 
 def noise_amplification(correlation: float) -> float:
@@ -129,7 +130,9 @@ def blur_score(residuals: FloatArray, roots: FloatArray, made: FloatArray) -> fl
     return float((residuals * change).sum()) / size if size > 0 else 0.0
 
 
-def lack_of_noise(residuals: FloatArray, used: BoolArray) -> tuple[float, float]:
+def lack_of_noise(
+    residuals: FloatArray, used: BoolArray, width: float = 2.0, mostly: float = 0.9
+) -> tuple[float, float]:
     """Return by how much the variance of white residuals is below 1, and its standard deviation.
 
     Structure of more than a few pixels, of which a fit absorbs the noise, is left out.
@@ -140,14 +143,18 @@ def lack_of_noise(residuals: FloatArray, used: BoolArray) -> tuple[float, float]
         Image minus model over the standard deviation of the noise.
     used : ndarray of bool, shape (L, H, W)
         The pixels to use.
+    width : float, default 2
+        Standard deviation of the Gaussian that finds structure, px.
+    mostly : float, default 0.9
+        Least share of it on used pixels.
     """
-    inside = used.astype(np.float64)
-    near = np.maximum(gaussian_filter(inside, (0, _DETAIL_PX, _DETAIL_PX), mode="nearest"), 1e-9)
+    inside, around = used.astype(np.float64), (0, width, width)
+    near = np.maximum(gaussian_filter(inside, around, mode="nearest"), 1e-9)
     values = np.where(used, residuals, 0.0)
-    details = values - gaussian_filter(values, (0, _DETAIL_PX, _DETAIL_PX), mode="nearest") / near
+    details = values - gaussian_filter(values, around, mode="nearest") / near
     # Shares of the variance that the Gaussian takes, and that it returns.
-    share = 1 / (2 * np.pi * _DETAIL_PX**2)
-    details = details[used & (near > _MOSTLY_USED)] / np.sqrt(1 - 2 * share + share / 2)
+    share = 1 / (2 * np.pi * width**2)
+    details = details[used & (near > mostly)] / np.sqrt(1 - 2 * share + share / 2)
     if not details.size:
         return 0.0, np.inf
     return 1 - float((details**2).mean()), float(np.sqrt(2 / details.size))
@@ -167,8 +174,6 @@ SUSPECT_PATTERN = 5.0
 """Standard deviations of a smoothed residual beyond which the model is wrong."""
 # Of fits with a right model it is -5 to 2, once 4.2: a deep fold at 30 counts a pixel. With a beam
 # that is 2 % off it is 31 and more, with absorption of 5 % 5.4 to 12.6.
-_MIN_COUNTS = 5.0  # a pixel
-_LACKING = 4.0  # standard deviations
 
 
 @dataclass(frozen=True)
@@ -215,10 +220,9 @@ class Pattern:
         """Whether the pattern shows that the model is wrong."""
         return self.largest > SUSPECT_PATTERN
 
-    @property
-    def lacks_counts(self) -> bool:
-        """Whether the noise is certainly smaller than counts would make it."""
-        return self.missing_counts > _LACKING * self.counts_deviation
+    def lacks_counts(self, deviations: float = 4.0) -> bool:
+        """Return whether the noise is smaller than counts make it, by so many deviations."""
+        return self.missing_counts > deviations * self.counts_deviation
 
 
 def find_pattern(
@@ -229,10 +233,12 @@ def find_pattern(
     is_counted: bool = False,
     correlation: float | None = None,
     noise: NoiseMatch | None = None,
+    least_counts: float = 5.0,
 ) -> Pattern:
     """Test the residuals of all images, the first `size` pixels of the scene, for structure.
 
-    Of images that `is_counted` calls counts, the noise is tested, too. Their `correlation` in px is
+    Of images that `is_counted` calls counts, the noise is tested, too, where the model has
+    `least_counts` in a pixel. Their `correlation` in px is
     measured unless it is stated, in the residuals and before, as `noise`.
     """
     height, width = size
@@ -253,7 +259,7 @@ def find_pattern(
     if is_counted and not correlation:
         # The weight of a pixel is one over the variance of its counts in units of the beam.
         expected = 1.0 if noise is None else np.sqrt(noise.expected_chi2)[:, None, None]
-        is_bright = roots * models > np.sqrt(_MIN_COUNTS)
+        is_bright = roots * models > np.sqrt(least_counts)
         missing, deviation = lack_of_noise(residuals / expected, is_bright)
     return Pattern(
         strengths=np.array(strengths),

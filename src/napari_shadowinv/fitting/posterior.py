@@ -39,18 +39,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.inversion.samples import Pairs, stratified_numbers
 from napari_shadowinv.physics.poisson import border_mean
 
-_ROUGHLY, _CLOSELY = 0.05, 0.002  # the longest waves, which noise moves most, are found last
-# Fields and numbers of an instrument that explain an image alike are found last of all.
-_IN_VALLEY = 1e-4
-_MOVED_BY_BEAMS = _MOVED_BY_NUMBERS = 0.01
-_RESPONSE, _RESPONSE_SEED = 0.01, 2  # of fields to numbers of an instrument
-_REFITTED = 0.02
-_MOST_STEPS = 600
-# Of the objective: directions that the data barely determine gain ½ by one standard deviation.
-_SOLVING_STEPS, _SOLVED_GAIN = 20, 0.05
-_PROBES, _LANCZOS = 8, 25
-_LEAST_DETERMINED = 1e-3  # coefficients
-_OVERSHOOT, _MOST_CHANGE = 1.7, 15.0  # of λ in a step; it would approach its end too slowly
+_BEAM_SEED = 1
 
 
 @dataclass(frozen=True)
@@ -126,11 +115,14 @@ class Posterior:
         roots = np.sqrt(self.scene.weights)
         return np.divide(1, roots, out=np.zeros_like(roots), where=roots > 0)
 
-    def likely_smoothness(self) -> tuple[FloatArray, float]:
+    def likely_smoothness(
+        self, *, tolerance: float = 0.05, overshoot: float = 1.7, most_change: float = 15.0
+    ) -> tuple[FloatArray, float]:
         """Return λ and κ nearer to the likeliest, shape (M, 2), and by how much they have changed.
 
         Each holds as much against the field as there are coefficients that the data determine and
-        it would. The change is the logarithm's, weighted with that number.
+        it would. The change is the logarithm's, weighted with that number. It is taken `overshoot`
+        times, as it approaches its end too slowly, but is a factor of `most_change` before.
         """
         prior, smoothness = self.scene.prior, self.scene.smoothness
         determined, energy = np.empty(smoothness.shape), np.empty(smoothness.shape)
@@ -139,26 +131,34 @@ class Posterior:
             signs = self._rng.choice([-1.0, 1.0], roughness.shape)
             slope = self._unknowns.zeros()
             slope.potentials[m] = prior.root_of_smoothness(m, signs)
-            solved = self._change(slope, _ROUGHLY)
+            solved = self._change(slope, tolerance)
             open_part = np.sqrt(roughness) * signs * dctn(solved.potentials[m], norm="ortho")
             shares = np.divide(each, roughness, out=np.zeros_like(each), where=roughness > 0)
-            determined[m] = np.maximum(
-                (shares * (1 - open_part)).sum(axis=(1, 2)), _LEAST_DETERMINED
-            )
+            determined[m] = np.maximum((shares * (1 - open_part)).sum(axis=(1, 2)), 1e-3)
             waves = dctn(self._unknowns.potentials[m], norm="ortho")
             energy[m] = (each * waves**2).sum(axis=(1, 2))
-        ratio = np.clip(determined / np.maximum(energy, 1e-300), 1 / _MOST_CHANGE, _MOST_CHANGE)
-        change = np.log(ratio) * _OVERSHOOT
+        ratio = np.clip(determined / np.maximum(energy, 1e-300), 1 / most_change, most_change)
+        change = np.log(ratio) * overshoot
         weights = determined / determined.sum(axis=1, keepdims=True)
         return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
 
-    def draw_samples(self, count: int, tolerance: float | None = None) -> list[Sample]:
+    def draw_samples(
+        self,
+        count: int,
+        tolerance: float | None = None,
+        *,
+        closely: float = 0.002,
+        in_valley: float = 1e-4,
+    ) -> list[Sample]:
         """Return random changes of the unknowns, as large as the data leave possible.
 
         Numbers of the instrument that are held are drawn first; all other unknowns respond to them.
+        The tolerance is that of the equations. By default they are solved `closely`, as the longest
+        waves, which noise moves most, are found last; even more so `in_valley`, where fields and
+        numbers of an instrument explain an image alike.
         """
         if tolerance is None:
-            tolerance = _IN_VALLEY if self._scales.has_rough_numbers else _CLOSELY
+            tolerance = in_valley if self._scales.has_rough_numbers else closely
         spread = self.scene.spread
         # Each moves the whole field: a few samples have it spread as evenly as many.
         normal = stratified_numbers(self._rng, count, 0 if spread is None else len(spread))
@@ -196,11 +196,15 @@ class Posterior:
         threads = available_threads(self.scene.threads)
         return first + run_in_parallel(works, threads, self._after_step)
 
-    def solve(self, samples: Sequence[Sample], steps: int = _SOLVING_STEPS) -> list[Sample]:
+    def solve(
+        self, samples: Sequence[Sample], steps: int = 20, least_gain: float = 0.05
+    ) -> list[Sample]:
         """Return samples with the change that explains their images and prior in full.
 
         Each minimises the objective for images with its noise, in at most `steps` steps from its
-        change to first order (randomize then optimize); the best unknowns are settled before.
+        change to first order (randomize then optimize); the best unknowns are settled before. The
+        steps end at the least gain of the objective: directions that the data barely determine gain
+        ½ by one standard deviation.
         """
         scene = self.scene
 
@@ -209,7 +213,7 @@ class Posterior:
                 scene,
                 start,
                 steps=steps,
-                least_gain=_SOLVED_GAIN,
+                least_gain=least_gain,
                 after_step=lambda _: self._after_step(),
                 modes=self._modes,
             )
@@ -235,7 +239,9 @@ class Posterior:
                 block[...] = self._rng.normal(size=block.shape)
         return numbers
 
-    def response(self, pairs: int) -> Response:
+    def response(
+        self, pairs: int, *, tolerance: float = 0.01, refitted: float = 0.02, seed: int = 2
+    ) -> Response:
         """Return how well the images determine numbers that change the response to fields.
 
         Fields and such numbers together are likeliest for the instrument through which the fewest
@@ -244,13 +250,14 @@ class Posterior:
         present unknowns with fresh noise: pairs of opposite noise, which leaves out its mean.
 
         Derivatives are taken along a number and what responds to it, so that it matters little
-        whether the rest has settled; one linear step is enough for each of these fits.
+        whether the rest has settled; one linear step is enough for each of these fits, to the
+        tolerance `refitted`.
         """
         scene, unknowns = self.scene, self._unknowns
-        rng = np.random.default_rng(_RESPONSE_SEED)
+        rng = np.random.default_rng(seed)
         units = scene.response_units()
         changes = [
-            self._change(self._linear.pull(-self._linear.push(unit)), _RESPONSE).plus(unit)
+            self._change(self._linear.pull(-self._linear.push(unit)), tolerance).plus(unit)
             for unit in units
         ]
         pushed = np.stack([self._linear.push(change).ravel() for change in changes])
@@ -270,9 +277,9 @@ class Posterior:
             noise = deviations * rng.normal(size=model.shape)
             for sign in (1, -1):
                 images = model + sign * noise
-                step = self._change(gradient(images, unknowns), _REFITTED)
-                refitted = unknowns.plus(unknowns.like(-step.flat()))
-                expected += along(gradient(images, refitted)) / (2 * pairs)
+                step = self._change(gradient(images, unknowns), refitted)
+                there = unknowns.plus(unknowns.like(-step.flat()))
+                expected += along(gradient(images, there)) / (2 * pairs)
         return Response(
             changes,
             numbers=numbers,
@@ -281,7 +288,7 @@ class Posterior:
             curvature=np.einsum("ix,jx->ij", pushed, pushed),
         )
 
-    def effects(self, sample: Sample) -> dict[str, Unknowns]:
+    def effects(self, sample: Sample, tolerance: float = 0.02) -> dict[str, Unknowns]:
         """Return a sample's change by each imperfection of the instrument, and by the noise.
 
         Common and separate changes of the beams are one.
@@ -300,12 +307,12 @@ class Posterior:
         rest, effects = sample.change, {}
         for key, moved in numbers.items():
             pull = self._linear.pull(-self._linear.push(moved))
-            effects[key] = held._change(pull, _PARTS)
+            effects[key] = held._change(pull, tolerance)
             rest = rest.plus(moved.like(-effects[key].flat()))
         return {"noise": rest, **effects}
 
     def responses(
-        self, rng: np.random.Generator, *, asked: bool = False
+        self, rng: np.random.Generator, *, asked: bool = False, tolerance: float = 0.01
     ) -> dict[str, tuple[Unknowns, float]]:
         """Return the response to each imperfection, of smooth fields to a random one, and its size.
 
@@ -332,7 +339,7 @@ class Posterior:
             of_part = part.of(slope.common, slope.separate)
             slopes.append(float((block * of_part).sum()))
         slope = slope._replace(common=none.common, separate=none.separate)
-        changes = held._changes(list(pulls.values()), _MOVED_BY_NUMBERS)
+        changes = held._changes(list(pulls.values()), tolerance)
         responses = {}
         for key, change, square, along in zip(pulls, changes, squares, slopes, strict=True):
             flat = change.flat()
@@ -348,12 +355,14 @@ class Posterior:
         posterior._scales, posterior._modes = self._scales.held(), SoftModes()
         return posterior
 
-    def count_determined(self, rng: np.random.Generator) -> float:
+    def count_determined(self, rng: np.random.Generator, tolerance: float = 0.05) -> float:
         """Estimate how many numbers the data determine: so much of Σχ² the fit absorbs of noise."""
         slope = self._linear.pull(rng.normal(size=self.scene.images.shape))
-        return product(slope.flat(), self._change(slope, _ROUGHLY).flat())
+        return product(slope.flat(), self._change(slope, tolerance).flat())
 
-    def moved_by_beams(self, variations: Sequence[FloatArray]) -> list[Unknowns]:
+    def moved_by_beams(
+        self, variations: Sequence[FloatArray], tolerance: float = 0.01
+    ) -> list[Unknowns]:
         """Return the changes of the unknowns if the beams differ from their sources.
 
         Parameters
@@ -365,13 +374,16 @@ class Posterior:
             self._linear.pull(self.scene.changed_by_beams(self._unknowns, self._counts, each))
             for each in variations
         ]
-        return self._changes(slopes, _MOVED_BY_BEAMS)
+        return self._changes(slopes, tolerance)
 
-    def log_volume(self, chances: Sequence[np.random.Generator]) -> float:
+    def log_volume(
+        self, chances: Sequence[np.random.Generator], probes: int = 8, powers: int = 25
+    ) -> float:
         """Return half the log-determinant of the Hessian relative to the prior of potentials.
 
-        By stochastic Lanczos quadrature, with the same probes for both, and for each field those
-        of its own generator: a field that the data do not show adds nothing to others.
+        By stochastic Lanczos quadrature in the space of so many powers of the Hessian, with the
+        same probes for both, and for each field those of its own generator: a field that the data
+        do not show adds nothing to others.
         """
         # What is fixed has no scale, and no part in the volume; nor what nothing holds.
         ones = self._unknowns.like(np.ones(self._unknowns.flat().size))
@@ -381,15 +393,15 @@ class Posterior:
         free = moved.flat() != 0
         is_potential = np.arange(free.size) < ones.potentials.size
         total = 0.0
-        for _ in range(_PROBES):
+        for _ in range(probes):
             of_fields = [chance.choice([-1.0, 1.0], free.size) for chance in chances]
             probe = self._unknowns.like(of_fields[0])
             for m, of_field in enumerate(of_fields):
                 probe.potentials[m] = self._unknowns.like(of_field).potentials[0]
             signs = free * probe.flat()
-            total += self._log_determinant(self._times, signs)
-            total -= self._log_determinant(self._prior_times, is_potential * signs)
-        return total / _PROBES / 2 - self._scales.log_size()
+            total += self._log_determinant(self._times, signs, powers)
+            total -= self._log_determinant(self._prior_times, is_potential * signs, powers)
+        return total / probes / 2 - self._scales.log_size()
 
     def log_evidence(self, chances: Sequence[np.random.Generator]) -> float:
         """Return the logarithm of how likely the model makes the data, but for a constant.
@@ -403,11 +415,11 @@ class Posterior:
         self._after_step()
         return self._scales.hessian_times(self._linear, flat)
 
-    def _change(self, slope: Unknowns, tolerance: float) -> Unknowns:
+    def _change(self, slope: Unknowns, tolerance: float, most_steps: int = 600) -> Unknowns:
         """The change of the unknowns that undoes a slope."""
         right = self._scales.transpose_times(slope).flat()
         scaled = solve(
-            self._times, right, tolerance=tolerance, iterations=_MOST_STEPS, modes=self._modes
+            self._times, right, tolerance=tolerance, iterations=most_steps, modes=self._modes
         )
         return self._scales.times(self._unknowns.like(scaled))
 
@@ -421,13 +433,13 @@ class Posterior:
         return like.zeros()._replace(potentials=turned).flat()
 
     def _log_determinant(
-        self, times: Callable[[FloatArray], FloatArray], signs: FloatArray
+        self, times: Callable[[FloatArray], FloatArray], signs: FloatArray, powers: int
     ) -> float:
         """Estimate the trace of a matrix's logarithm from a probe."""
         size = float(np.abs(signs).sum())
         # Diagonal and off-diagonal of the matrix in the space of its first powers.
         vectors, diagonal, beside = [signs / np.sqrt(size)], [], []
-        for _ in range(_LANCZOS):
+        for _ in range(powers):
             image = times(vectors[-1])
             diagonal.append(product(image, vectors[-1]))
             for vector in vectors:
@@ -439,9 +451,6 @@ class Posterior:
             vectors.append(image / length)
         values, eigenvectors = eigh_tridiagonal(diagonal, beside[: len(diagonal) - 1])
         return size * float((eigenvectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
-
-
-_WAVES = 60
 
 
 @dataclass(frozen=True)
@@ -488,7 +497,7 @@ class BeamError:
 
 
 def draw_variations(
-    scene: Scene, length: float, count: int, rng: np.random.Generator
+    scene: Scene, length: float, count: int, rng: np.random.Generator, waves: int = 60
 ) -> FloatArray:
     """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image.
 
@@ -502,6 +511,8 @@ def draw_variations(
         Number of fields.
     rng : numpy.random.Generator
         For the waves.
+    waves : int, default 60
+        Number of waves in each field.
 
     Returns
     -------
@@ -511,22 +522,16 @@ def draw_variations(
     inside = np.s_[scene.pad : height - scene.pad, scene.pad : width - scene.pad]
     fields = np.empty((count, height, width))
     for field in fields:
-        waves = rng.normal(size=(2, _WAVES)) / length
-        phases = rng.uniform(0, 2 * np.pi, _WAVES)
-        along_y = np.arange(height)[:, None] * waves[0] + phases
-        along_x = np.arange(width)[:, None] * waves[1]
+        numbers = rng.normal(size=(2, waves)) / length
+        phases = rng.uniform(0, 2 * np.pi, waves)
+        along_y = np.arange(height)[:, None] * numbers[0] + phases
+        along_x = np.arange(width)[:, None] * numbers[1]
         # cos(a + b) of each wave, without BLAS, whose idle threads spin.
         field[:] = np.einsum("yw,xw->yx", np.cos(along_y), np.cos(along_x))
         field -= np.einsum("yw,xw->yx", np.sin(along_y), np.sin(along_x))
         field -= field[inside].mean()
         field /= np.sqrt((field[inside] ** 2).mean())
     return fields
-
-
-_PART_SAMPLES, _PARTS = 3, 0.02
-_BEAM_SAMPLES, _BEAM_SEED = 3, 1  # least number of changes
-_SAMPLES_PER_BEAM = 2
-_SMOOTHED_ERRORS = 4.0  # px
 
 
 def compare_samples(scene: Scene, linear: Sequence[Sample], solved: Sequence[Sample]) -> Pairs:
@@ -538,15 +543,19 @@ def compare_samples(scene: Scene, linear: Sequence[Sample], solved: Sequence[Sam
 
 
 def errors_by_part(
-    scene: Scene, posterior: Posterior, samples: Sequence[Sample], size: tuple[int, int]
+    scene: Scene,
+    posterior: Posterior,
+    samples: Sequence[Sample],
+    size: tuple[int, int],
+    most: int = 3,
 ) -> dict[str, FloatArray]:
     """Return standard deviations of each field's displacement by noise and by imperfections.
 
-    From a few samples, of which each costs a solution for an imperfection.
+    From at most so many samples, of which each costs a solution for an imperfection.
     """
     if not scene.imperfect.parts:
         return {}
-    effects = [posterior.effects(sample) for sample in samples[:_PART_SAMPLES]]
+    effects = [posterior.effects(sample) for sample in samples[:most]]
     return {
         key: displacement_errors(scene, [each[key] for each in effects], size)
         for key in (effects[0] if effects else ())
@@ -557,7 +566,7 @@ def displacement_errors(
     scene: Scene,
     changes: Sequence[Unknowns],
     size: tuple[int, int],
-    width: float = _SMOOTHED_ERRORS,
+    width: float = 4.0,
 ) -> FloatArray:
     """Return the r.m.s. displacement of each field by changes, smoothed over a width in px."""
     height, across = size
@@ -582,11 +591,15 @@ class BeamShifts:
 
 
 def shifts_by_beam(
-    data: FitData, scene: Scene, posterior: Posterior, samples: Sequence[Sample]
+    data: FitData,
+    scene: Scene,
+    posterior: Posterior,
+    samples: Sequence[Sample],
+    least: int = 3,
 ) -> BeamShifts | None:
     """Return the effect of beams that differ from their sources; None if beams are fitted.
 
-    `samples` are the posterior's.
+    Half as many beams are drawn as there are `samples` of the posterior, but at `least` so many.
     """
     if not samples or scene.imperfect.parts:
         return None
@@ -599,7 +612,7 @@ def shifts_by_beam(
         np.broadcast_to(
             draw_variations(middle, length / middle.bin, count, rng), middle.beams.shape
         )
-        for _ in range(max(_BEAM_SAMPLES, len(samples) // _SAMPLES_PER_BEAM))
+        for _ in range(max(least, len(samples) // 2))
     ]
     changes = posterior.moved_by_beams([0.01 * each for each in variations])
     by_percent = displacement_errors(scene, changes, data.size, length / 3)

@@ -277,7 +277,7 @@ def _pattern_left(case: Evidence) -> Answer:
 
 def _counts_missing(case: Evidence) -> Answer:
     pattern = case.pattern
-    if not pattern.lacks_counts or pattern.missing_counts <= case.limits.missing_counts:
+    if not pattern.lacks_counts() or pattern.missing_counts <= case.limits.missing_counts:
         return None
     share = percent(pattern.missing_counts)
     return _doubt(
