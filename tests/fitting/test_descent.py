@@ -12,7 +12,7 @@ from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import solve
-from napari_shadowinv.fitting.descent import coarser, descend, finer, settle
+from napari_shadowinv.fitting.descent import NewtonSteps, coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import FITTED_VARIANCE, Imperfect
 from napari_shadowinv.fitting.preconditioner import Preconditioner
@@ -273,7 +273,9 @@ def test_a_rough_search_ends_at_a_step_that_gains_what_was_expected(scene: Scene
     near = truth._replace(potentials=0.97 * truth.potentials)
     before, _ = target.value_and_gradient(near, target.ray_counts(near))
     _, least, most, _ = settle(target, near, steps=8, least_gain=1e-3)
-    _, value, steps, ended = settle(target, near, steps=8, least_gain=1e-3, is_rough=True)
+    _, value, steps, ended = settle(
+        target, near, steps=8, least_gain=1e-3, limits=NewtonSteps(is_rough=True)
+    )
     assert ended
     assert steps < most
     assert value - least < 0.02 * (before - least)

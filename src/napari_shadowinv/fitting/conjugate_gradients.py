@@ -21,14 +21,6 @@ from scipy.linalg import eigh_tridiagonal
 
 from napari_shadowinv._typing import AnyArray, FloatArray
 
-_SOFT, _STIFF = 0.5, 4.0  # eigenvalues below and above, where most are about 1
-_MOST_MODES = 120
-_OUTDATED_STEPS = 100  # of a solution with so many modes: they belong to another matrix
-_WORTH_STEPS = 12  # of a solution from which modes are taken
-_MOST_NUMBERS = 8_000_000  # in each list of vectors that is kept of a solution
-_FOUND = 0.5  # residual of an eigenvector over its eigenvalue
-_INDEPENDENT = 1e-4  # least eigenvalue of the vectors' products; rounding makes copies of some
-
 
 def product(first: FloatArray, second: FloatArray) -> float:
     """Scalar product without BLAS, whose idle threads spin and whose sums depend on them."""
@@ -40,9 +32,37 @@ class SoftModes:
 
     `solve` uses them, and adds those that have cost it many steps. What they are changes the number
     of steps, not the solution beyond its tolerance.
+
+    Parameters
+    ----------
+    most : int, default 120
+        Modes that are kept.
+    soft, stiff : float, default 0.5 and 4
+        Eigenvalues below and above which directions are modes; most are about 1.
+    worth : int, default 12
+        Least steps of a solution from which modes are taken.
+    outdated : int, default 100
+        Steps of a solution with as many modes as are kept, from which they belong to another
+        matrix.
+    found : float, default 0.5
+        Largest residual of an eigenvector over its eigenvalue.
+    independent : float, default 1e-4
+        Least eigenvalue of the vectors' products; rounding makes copies of some.
     """
 
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        most: int = 120,
+        *,
+        soft: float = 0.5,
+        stiff: float = 4.0,
+        worth: int = 12,
+        outdated: int = 100,
+        found: float = 0.5,
+        independent: float = 1e-4,
+    ) -> None:
+        self.worth, self._most, self._outdated = worth, most, outdated
+        self._soft, self._stiff, self._found, self._independent = soft, stiff, found, independent
         self._vectors = np.empty((0, 0))
         self._weights = np.empty(0)
 
@@ -59,21 +79,21 @@ class SoftModes:
 
     def learn(self, history: _History) -> None:
         """Add the modes that a solution has met; begin anew if others are of no use."""
-        if len(history) < _WORTH_STEPS:
+        if len(history) < self.worth:
             return
         matrix = history.matrix()
         values, mixing = _tridiagonal_eigensystem(matrix[:-1, :-1])
         errors = np.abs(matrix[-1, -2] * mixing[-1])
-        is_far = (values < _SOFT) | (values > _STIFF)
-        chosen = np.flatnonzero(is_far & (errors < _FOUND * values))
-        size, is_outdated = history.size, len(history) > _OUTDATED_STEPS
+        is_far = (values < self._soft) | (values > self._stiff)
+        chosen = np.flatnonzero(is_far & (errors < self._found * values))
+        size, is_outdated = history.size, len(history) > self._outdated
         if self._vectors.shape[1] != size:
             self._vectors, self._weights = np.empty((0, size)), np.empty(0)
-        elif is_outdated and len(self) == _MOST_MODES:
+        elif is_outdated and len(self) == self._most:
             self._vectors, self._weights = np.empty((0, size)), np.empty(0)
             # Their lengths are those with the old modes: less of a stiff one could become negative.
-            chosen = chosen[values[chosen] < _SOFT]
-        chosen = chosen[: _MOST_MODES - len(self)]
+            chosen = chosen[values[chosen] < self._soft]
+        chosen = chosen[: self._most - len(self)]
         if not chosen.size:
             return
         mixing = mixing[:, chosen]
@@ -85,7 +105,8 @@ class SoftModes:
         overlaps = np.einsum("in,jn->ij", vectors, untouched)
         energies = np.einsum("in,jn->ij", vectors, images)
         sizes, turn = eigensystem(overlaps + overlaps.T)
-        turn = turn[:, sizes > _INDEPENDENT] / np.sqrt(sizes[sizes > _INDEPENDENT] / 2)
+        is_new = sizes > self._independent
+        turn = turn[:, is_new] / np.sqrt(sizes[is_new] / 2)
         turned_energies = np.einsum("jk,ji->ki", turn, energies + energies.T)
         values, inner = eigensystem(np.einsum("ki,ij->kj", turned_energies, turn) / 2)
         inner, values = inner[:, values > 0], values[values > 0]
@@ -135,9 +156,9 @@ def eigensystem(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 class _History:
     """Steps of conjugate gradients: vectors in whose space the matrix is simple."""
 
-    def __init__(self, size: int) -> None:
-        most = _MOST_NUMBERS // size
-        self.size, self._most = size, most if most >= _WORTH_STEPS else 0
+    def __init__(self, size: int, worth: int, most_numbers: int = 8_000_000) -> None:
+        most = most_numbers // size  # in each list of vectors
+        self.size, self._most = size, most if most >= worth else 0
         self.residuals: list[AnyArray] = []  # Lanczos vectors
         self.turned: list[AnyArray] = []  # the same preconditioned
         self._shares: list[float] = []
@@ -190,7 +211,7 @@ def solve(
         Of nearly the same matrix; modes of this solution are added.
     """
     modes = SoftModes() if modes is None else modes
-    history = _History(right.size)
+    history = _History(right.size, modes.worth)
     solution, residual = np.zeros_like(right), right
     goal = tolerance**2 * product(residual, residual)
     turned = modes.precondition(residual)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,10 +23,6 @@ from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, sol
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
-
-_PAIRS = 20  # of steps and changes of the gradient that are kept
-_DECREASE, _SLOPE = 1e-4, 0.9  # Wolfe's conditions
-_TRIALS = 12  # steps tried along a line
 
 Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 
@@ -38,6 +34,7 @@ def minimise(
     iterations: int,
     least_gain: float,
     after_step: Callable[[float], None] | None = None,
+    kept: int = 20,
 ) -> tuple[FloatArray, float, int]:
     """Minimise by L-BFGS, starting with the identity as Hessian.
 
@@ -53,6 +50,8 @@ def minimise(
         Ends once five steps lower the value by less.
     after_step : callable, optional
         Receives the value.
+    kept : int, default 20
+        Pairs of steps and changes of the gradient that are kept.
 
     Returns
     -------
@@ -63,14 +62,14 @@ def minimise(
     point = start
     value, gradient = objective(point)
     values = [value]
-    pairs: deque[tuple[FloatArray, FloatArray, float]] = deque(maxlen=_PAIRS)
+    pairs: deque[tuple[FloatArray, FloatArray, float]] = deque(maxlen=kept)
     step = 1.0
     for _ in range(iterations):
         direction = -_times_inverse_hessian(gradient, pairs)
         slope = product(direction, gradient)
         if not slope < 0:
             break
-        step_taken = _step_along(objective, point, direction, value, slope, step)
+        step_taken = _step_along(objective, point, direction, (value, slope), step)
         if step_taken is None:
             if not pairs:
                 break
@@ -111,37 +110,51 @@ def _step_along(
     objective: Objective,
     point: FloatArray,
     direction: FloatArray,
-    value: float,
-    slope: float,
+    here: tuple[float, float],
     step: float,
+    *,
+    trials: int = 12,
+    decrease: float = 1e-4,
+    remaining: float = 0.9,
 ) -> tuple[float, float, FloatArray] | None:
-    """A step that lowers the value enough and leaves less slope: bisection."""
+    """A step that lowers the value enough and leaves less slope, as Wolfe has it: bisection.
+
+    It begins `here`, at a value and a slope.
+    """
     shortest, longest = 0.0, np.inf
-    best = None
-    for _ in range(_TRIALS):
+    best, (value, slope) = None, here
+    for _ in range(trials):
         trial_value, gradient = objective(point + step * direction)
-        if not trial_value <= value + _DECREASE * step * slope:
+        if not trial_value <= value + decrease * step * slope:
             longest = step
         else:
             best = step, trial_value, gradient
-            if product(gradient, direction) >= _SLOPE * slope:
+            if product(gradient, direction) >= remaining * slope:
                 return best
             shortest = step
         step = (shortest + longest) / 2 if np.isfinite(longest) else 2 * step
     return best
 
 
-_DESCENTS = 3  # with fixed numbers of rays each
-_FEW = 10  # steps, after which the numbers of rays still fit
-_MOST_NEWTON, _MOST_SHORTENED, _SHARES_OF_STEP = 8, 2, (1.0, 0.5, 0.25)  # of Gauss and Newton
-_NEWTON, _MOST_SOLVING = 0.02, 200  # how exactly each is found, and in how many steps
-_NEXT_GAIN = 0.7  # of the least gain; a step gains up to twice what is expected
-# Fields and numbers of an instrument that explain an image alike lie along a flat valley.
-_NEWTON_IN_VALLEY, _MOST_IN_VALLEY, _GAIN_IN_VALLEY = 2e-3, 400, 0.1
-# Numbers of rays are renewed after steps that gain more; other numbers change the objective by 1.
-_RENEWING_GAIN = 5.0
-_AS_EXPECTED = 0.2  # of a gain
-_MOST_PIXELS = 2_000_000  # of all images
+@dataclass(frozen=True)
+class NewtonSteps:
+    """How steps of Gauss and Newton are found and when they end, as chosen by benchmarks/fit.py.
+
+    Fields and numbers of an instrument that explain an image alike lie along a flat valley.
+    """
+
+    is_rough: bool = False  # whether a step that gains what it was expected to is the last
+    most: int = 8
+    most_shortened: int = 2
+    shares: tuple[float, ...] = (1.0, 0.5, 0.25)  # of a step that are tried
+    solved: tuple[float, int] = (0.02, 200)  # how exactly each is found, and in how many steps
+    solved_in_valley: tuple[float, int] = (2e-3, 400)
+    gain_in_valley: float = 0.1  # of the least gain
+    next_gain: float = 0.7  # of the least gain; a step gains up to twice what is expected
+    # Numbers of rays are renewed after steps that gain more; others change the objective by 1.
+    renewing_gain: float = 5.0
+    as_expected: float = 0.2  # of a gain
+    most_pixels: int = 2_000_000  # of all images; Jacobians of more would fill the memory
 
 
 def descend(
@@ -151,6 +164,8 @@ def descend(
     iterations: int,
     least_gain: float,
     after_step: Callable[[float], None] | None = None,
+    descents: int = 3,
+    few: int = 10,
 ) -> tuple[Unknowns, float, int]:
     """Minimise a scene's objective; the numbers of rays are renewed between descents.
 
@@ -164,6 +179,10 @@ def descend(
         Ends where five steps lower the objective by less; chance changes it by about 1.
     after_step : callable, optional
         Receives the objective after each step.
+    descents : int, default 3
+        Most descents.
+    few : int, default 10
+        Steps after which the numbers of rays still fit.
 
     Returns
     -------
@@ -174,7 +193,7 @@ def descend(
     """
     scales = Preconditioner(scene)
     unknowns, steps, value = start, 0, np.inf
-    for _ in range(_DESCENTS):
+    for _ in range(descents):
         counts, base = scene.ray_counts(unknowns), unknowns
 
         def objective(flat: FloatArray) -> tuple[float, FloatArray]:
@@ -191,7 +210,7 @@ def descend(
         )
         unknowns = base.plus(scales.times(base.like(flat)))
         steps += taken
-        if steps >= iterations or taken < _FEW:
+        if steps >= iterations or taken < few:
             break
     return unknowns, value, steps
 
@@ -205,7 +224,7 @@ def settle(
     after_step: Callable[[float], None] | None = None,
     modes: SoftModes | None = None,
     linear: Linear | None = None,
-    is_rough: bool = False,
+    limits: NewtonSteps = NewtonSteps(),
 ) -> tuple[Unknowns, float, int, bool]:
     """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
 
@@ -223,8 +242,8 @@ def settle(
         Of the Hessians of this scene, from scenes of the same pixels and priors.
     linear : Linear, optional
         The scene to first order near the start: used for all steps while these succeed.
-    is_rough : bool, default False
-        Whether a Gauss-Newton step that gains what it was expected to is the last.
+    limits : NewtonSteps, optional
+        Of the Gauss-Newton steps.
 
     Returns
     -------
@@ -235,20 +254,17 @@ def settle(
     ended : bool
         Whether steps were left.
     """
-    tolerance, solving = _NEWTON, _MOST_SOLVING
     scales = Preconditioner(scene)
     # Scales of numbers that fields may replace, and of frames, are rough.
     is_scaled = not (scales.has_rough_numbers or scene.free_frames.any())
-    if scales.has_rough_numbers:
-        tolerance, solving = _NEWTON_IN_VALLEY, _MOST_IN_VALLEY
+    solved = limits.solved_in_valley if scales.has_rough_numbers else limits.solved
     if scene.has_free_numbers:
-        least_gain *= _GAIN_IN_VALLEY
+        least_gain *= limits.gain_in_valley
     modes = SoftModes() if modes is None else modes
     now = start
     counts = scene.ray_counts(now)
     value, slope = scene.value_and_gradient(now, counts)
-    # Jacobians of many pixels would fill the memory.
-    newton = min(_MOST_NEWTON, steps) if scene.images.size <= _MOST_PIXELS else 0
+    newton = min(limits.most, steps) if scene.images.size <= limits.most_pixels else 0
     taken = shortened = 0
 
     def newton_step(here: Linear, down: FloatArray) -> FloatArray:
@@ -257,16 +273,16 @@ def settle(
                 after_step(value)
             return scales.hessian_times(here, flat)
 
-        return solve(times, down, tolerance=tolerance, iterations=solving, modes=modes)
+        return solve(times, down, tolerance=solved[0], iterations=solved[1], modes=modes)
 
-    while taken < newton and shortened < _MOST_SHORTENED:
+    while taken < newton and shortened < limits.most_shortened:
         down = -scales.transpose_times(slope).flat()
         is_new = linear is None
         linear = linear or scene.linear(now, counts)
         step = newton_step(linear, down)
         expected_gain = product(down, step) / 2
         change = scales.times(now.like(step))
-        for share in _SHARES_OF_STEP:
+        for share in limits.shares:
             trial = now.plus(now.like(share * change.flat()))
             trial_value, trial_slope = scene.value_and_gradient(trial, counts)
             if trial_value < value:
@@ -279,18 +295,18 @@ def settle(
         taken, shortened = taken + 1, shortened + (share < 1)
         gain = value - trial_value
         now, value, slope = trial, trial_value, trial_slope
-        is_as_expected = abs(gain - expected_gain) < _AS_EXPECTED * expected_gain
-        if is_rough and is_as_expected:
+        is_as_expected = abs(gain - expected_gain) < limits.as_expected * expected_gain
+        if limits.is_rough and is_as_expected:
             return now, scene.value(now), taken, True
         # What the next step would gain is about the preconditioned square of the slope.
         after = scales.transpose_times(slope).flat()
         next_gain = product(after, modes.precondition(after)) / 2
-        if gain < least_gain or (next_gain < _NEXT_GAIN * least_gain and is_scaled):
+        if gain < least_gain or (next_gain < limits.next_gain * least_gain and is_scaled):
             return now, scene.value(now), taken, True
         # Where little is left to gain, Jacobians from nearby serve.
-        if share < 1 or (is_new and next_gain > _RENEWING_GAIN):
+        if share < 1 or (is_new and next_gain > limits.renewing_gain):
             linear = None
-        if gain > _RENEWING_GAIN:
+        if gain > limits.renewing_gain:
             counts = scene.ray_counts(now)
             value, slope = scene.value_and_gradient(now, counts)
     remaining_steps = steps - taken

@@ -16,6 +16,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import (
+    NewtonSteps,
     coarser,
     descend,
     finer,
@@ -30,28 +31,14 @@ from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.poisson import border_mean
 
 FIRST_SMOOTHNESS = np.array([50.0, 2000.0])  # λ and κ
-_COARSE_SMOOTHNESS = 3.0  # times that, before the data have told
-_COARSE_STEPS, COARSE_GAIN, _FINE_GAIN = 60, 3.0, 2.0
-_LAST_GAIN = 0.5  # in pixels of two, where it costs little
-_HOPELESS, _CONTINUED = 3.0, 3  # times the best objective; at most so many go on
-_COARSE_SPACING = 1 / 3
-_BLURRED, _SPACING_OF_BLURRED = 2.0, 0.5  # px: so wide a blur hides how far apart rays are
-_SPACINGS, _EXPLAINED = (0.2, 0.14), 1.05  # px, and the χ² for which the first is dense enough
+_USUAL, _ROUGH = NewtonSteps(), NewtonSteps(is_rough=True)
+COARSE_GAIN = 3.0
 # With numbers that resemble fields, an error of the model far below the noise changes the field.
 SPACING_WITH_NUMBERS = 0.1  # px
 SMALL_PX = 80  # shorter side of images with too few pixels for an instrument's numbers
-_MOST_RECORDED = 300_000  # pixels of all images
-_ROUNDS, _ROUND_STEPS, _SETTLED = 6, 40, 0.25  # of λ and κ; and by what share they may still change
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
 SMOOTHNESS_RATIO = 0.1  # of them
-# Of opposite noise; and the share of the expected slopes that is uncertain: objects whose fields
-# are smoothed twice show it to a fifth.
-_PAIRS, _UNSURE_SLOPES = 2, 0.25
-_RESPONSE_ROUNDS, _NUMBERS_SETTLED = 8, 0.05  # squared distance in standard deviations
-_NEAR_ROUNDS = 2
-_LIKELY_NUMBER = 1.0  # where numbers begin, at most
-_SAME_FIELD = 0.03  # of the displacement, r.m.s.
 
 
 @dataclass(frozen=True)
@@ -114,16 +101,19 @@ class _Descent(NamedTuple):
     minimum: Minimum
     stages: Sequence[tuple[int, float]]
 
-    def run(self, scene: Scene, on_step: OnStep) -> Minimum:
-        """Return the minimum at the end of the stages."""
+    def run(
+        self, scene: Scene, on_step: OnStep, steps: int = 60, spacing: float = 1 / 3
+    ) -> Minimum:
+        """Return the minimum at the end of the stages, each of at most so many steps."""
         end = replace(self.minimum, start=self.start.name)
         for factor, blur in self.stages:
-            spacing = _COARSE_SPACING if blur < _BLURRED else _SPACING_OF_BLURRED
-            now = replace(coarser(scene, factor), blur=blur, spacing=spacing)
+            # So wide a blur hides how far apart rays are.
+            spacing_px = spacing if blur < 2 else 0.5
+            now = replace(coarser(scene, factor), blur=blur, spacing=spacing_px)
             unknowns, value, _ = descend(
                 now,
                 Preconditioner(now).damp(end.in_pixels(factor)),
-                iterations=_COARSE_STEPS,
+                iterations=steps,
                 least_gain=COARSE_GAIN,
                 after_step=partial(on_step, end.start),
             )
@@ -131,14 +121,22 @@ class _Descent(NamedTuple):
         return end
 
 
-def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minimum]:
+def search(
+    scene: Scene,
+    starts: Sequence[Start],
+    on_step: OnStep,
+    *,
+    stiffness: float = 3.0,
+    most: int = 3,
+) -> list[Minimum]:
     """Descend from each start to pixels of two; return the distinct minima, best first.
 
     Starts without a field share their first stage if it is the same. Of those that have come to the
-    same stage before the last, the best go on.
+    same stage before the last, at most so many, the best, go on. Before the data have told λ and κ,
+    they are `stiffness` times the first ones.
     """
     rough = replace(
-        scene, smoothness=_COARSE_SMOOTHNESS * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
+        scene, smoothness=stiffness * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
     )
 
     def begin(start: Start) -> Minimum:
@@ -167,7 +165,7 @@ def search(scene: Scene, starts: Sequence[Start], on_step: OnStep) -> list[Minim
     descents = [
         _Descent(replace(by_name[end.start], beam_held=False), end, starts[0].stages[-1:])
         for rivals in halfway.values()
-        for end in (_distinct_minima(rivals)[:_CONTINUED] if len(rivals) > 1 else rivals)
+        for end in (_distinct_minima(rivals)[:most] if len(rivals) > 1 else rivals)
     ]
     return _distinct_minima(_descend_together(rough, descents, on_step))
 
@@ -183,13 +181,15 @@ def _descend_together(scene: Scene, descents: Sequence[_Descent], on_step: OnSte
     return run_in_parallel(works, available_threads(scene.threads), on_step)
 
 
-def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:
-    """Those that differ and are not hopeless, best first."""
+def _distinct_minima(
+    minima: list[Minimum], differing: float = 0.03, hopeless: float = 3.0
+) -> list[Minimum]:
+    """Those that differ by a share, and are not hopeless times the best, best first."""
     distinct: list[Minimum] = []
     for candidate in sorted(minima, key=lambda each: each.value):
-        if all(better.distance(candidate) > _SAME_FIELD for better in distinct):
+        if all(better.distance(candidate) > differing for better in distinct):
             distinct.append(candidate)
-    return [candidate for candidate in distinct if candidate.value < _HOPELESS * distinct[0].value]
+    return [candidate for candidate in distinct if candidate.value < hopeless * distinct[0].value]
 
 
 def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
@@ -202,12 +202,18 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
 
 
 def estimate_smoothness(
-    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep, *, is_near: bool = False
+    scene: Scene,
+    end: Minimum,
+    rng: np.random.Generator,
+    on_step: OnStep,
+    *,
+    is_near: bool = False,
+    most_pixels: int = 300_000,
 ) -> tuple[Scene, Minimum]:
     """Find λ and κ, unless they are given, and the unknowns that belong to them.
 
-    Numbers of an instrument that change the response to fields are found, too, and held; quickly
-    in larger pixels.
+    Numbers of an instrument that change the response to fields are found, too, and held. That is in
+    recorded pixels where these matter, and all images have at most so many.
     """
     is_fixed = bool(scene.smoothness.any())
     smoothness = scene.smoothness
@@ -224,50 +230,57 @@ def estimate_smoothness(
         # How rough a field is hardly depends on numbers that all images share.
         shared = {part.key for part in scene.imperfect.parts if part.is_common}
         free, scene = scene.held, replace(scene, held=scene.held | shared)
-        end = settle_minimum(scene, end, on_step, is_rough=True)
+        end = settle_minimum(scene, end, on_step, limits=_ROUGH)
         smoothness, end = _likely_smoothness(scene, end, rng, on_step)
         scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness, held=free)
     if scene.imperfect.resembles_fields and not is_near:
         scene = replace(scene, spacing=SPACING_WITH_NUMBERS)
-        if scene.images.size <= _MOST_RECORDED:
+        if scene.images.size <= most_pixels:
             # In larger pixels fine structure is lost by which a blur differs from a smooth object,
             # and which a field that replaces the beams would move.
             end = in_recorded_pixels(scene, end)
-    least_gain = COARSE_GAIN if is_near else _LAST_GAIN
+    # In pixels of two, the last gain costs little.
+    least_gain, rounds = (COARSE_GAIN, 2) if is_near else (0.5, 8)
     end = settle_minimum(scene, end, on_step, least_gain=least_gain)
     if not response:
         return scene, end
-    rounds = _NEAR_ROUNDS if is_near else _RESPONSE_ROUNDS
     return _settle_response(scene, end, rng, on_step, rounds=rounds, least_gain=least_gain)
 
 
 def _likely_smoothness(
-    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+    scene: Scene,
+    end: Minimum,
+    rng: np.random.Generator,
+    on_step: OnStep,
+    *,
+    rounds: int = 6,
+    settled: float = 0.25,
 ) -> tuple[FloatArray, Minimum]:
     """Return λ and κ nearer to the likeliest, and the minimum that moves with them.
 
-    It moves so little that the scene to first order serves in all rounds.
+    They have `settled` where they change by less, as a share. The minimum moves so little that the
+    scene to first order serves in all rounds.
     """
     linear = end.coarsen(scene).linear(end.unknowns)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         linear = replace(linear, scene=end.coarsen(scene))
         report = partial(on_step, "smoothness", end.value)
         posterior = Posterior(linear.scene, end.unknowns, rng, report, end.modes, linear)
         estimate, change = posterior.likely_smoothness()
         smoothness = estimate / smoothness_in_pixels(end.bin)
-        if change < _SETTLED:
+        if change < settled:
             break
         scene = replace(scene, smoothness=smoothness)
-        end = settle_minimum(scene, end, on_step, is_rough=True, linear=linear)
+        end = settle_minimum(scene, end, on_step, linear=linear, limits=_ROUGH)
     return smoothness, end
 
 
-def _with_likely_numbers(scene: Scene, end: Minimum) -> Minimum:
+def _with_likely_numbers(scene: Scene, end: Minimum, most: float = 1.0) -> Minimum:
     """Move numbers of the response, which a search with smooth fields carries far away, nearer."""
     unknowns = end.unknowns
     for unit in coarser(scene, end.bin).response_units():
         number = product(unit.flat(), unknowns.flat())
-        shift = float(np.clip(number, -_LIKELY_NUMBER, _LIKELY_NUMBER)) - number
+        shift = float(np.clip(number, -most, most)) - number
         unknowns = unknowns.plus(unknowns.like(shift * unit.flat()))
     return replace(end, unknowns=unknowns)
 
@@ -280,17 +293,23 @@ def _settle_response(
     *,
     rounds: int,
     least_gain: float,
+    pairs: int = 2,
+    settled: float = 0.05,
 ) -> tuple[Scene, Minimum]:
-    """Find the numbers that change the response to fields, and how uncertain they are."""
+    """Find the numbers that change the response to fields, and how uncertain they are.
+
+    They follow from `pairs` of opposite noise. They have `settled` where the square of their
+    distance in standard deviations is less.
+    """
     turns, before = 1, None
     for _ in range(rounds):
-        response = posterior_of(scene, end, rng, on_step).response(_PAIRS)
+        response = posterior_of(scene, end, rng, on_step).response(pairs)
         mean, precision = _mean_of_numbers(response)
         remaining = np.maximum(mean, scene.least_numbers()) - response.numbers
         # Steps that turn back hover about their end: their mean is nearer to it.
         turns += before is not None and bool(remaining @ precision @ before < 0)
         step = remaining / max(turns, float(np.abs(remaining).max()))
-        is_settled = step @ precision @ step < _NUMBERS_SETTLED
+        is_settled = step @ precision @ step < settled
         before = remaining
         unknowns = end.unknowns
         for each, share in zip(response.changes, step, strict=True):
@@ -304,12 +323,16 @@ def _settle_response(
     return replace(scene, spread=np.asarray(np.linalg.cholesky(covariance))), end
 
 
-def _mean_of_numbers(response: Response) -> tuple[FloatArray, FloatArray]:
-    """The likeliest numbers of an instrument, and the inverse of their covariance."""
+def _mean_of_numbers(response: Response, unsure: float = 0.25) -> tuple[FloatArray, FloatArray]:
+    """The likeliest numbers of an instrument, and the inverse of their covariance.
+
+    A share of the expected slopes is `unsure`: objects whose fields are smoothed twice show it to a
+    fifth.
+    """
     unit = np.eye(len(response.numbers))
     curvature = response.curvature + 1e-9 * (1 + np.trace(response.curvature)) * unit
-    unsure = _UNSURE_SLOPES * response.expected
-    weights = curvature @ np.linalg.inv(curvature + np.outer(unsure, unsure))
+    slopes = unsure * response.expected
+    weights = curvature @ np.linalg.inv(curvature + np.outer(slopes, slopes))
     pull = curvature @ response.numbers - (response.slopes - response.expected)
     precision = unit + weights @ curvature
     return np.linalg.solve(precision, weights @ pull), precision
@@ -330,20 +353,22 @@ def settle_minimum(
     on_step: OnStep,
     name: str = "smoothness",
     least_gain: float = COARSE_GAIN,
-    is_rough: bool = False,
+    *,
     linear: Linear | None = None,
+    limits: NewtonSteps = _USUAL,
+    steps: int = 40,
 ) -> Minimum:
     """Return where a descent ends with other λ and κ, in the minimum's pixels, without blur."""
     middle = minimum.coarsen(scene)
     unknowns, value, _, _ = settle(
         middle,
         minimum.unknowns,
-        steps=_ROUND_STEPS,
+        steps=steps,
         least_gain=least_gain,
         after_step=lambda now: on_step(name, now),
         modes=minimum.modes,
         linear=replace(linear, scene=middle) if linear else None,
-        is_rough=is_rough,
+        limits=limits,
     )
     return replace(
         minimum, unknowns=unknowns, value=value, displacement=middle.displacement(unknowns)
@@ -361,13 +386,25 @@ class FineMinimum(NamedTuple):
 
 
 def refine_minimum(
-    scene: Scene, minimum: Minimum, options: FitOptions, on_step: OnStep, *, is_near: bool = False
+    scene: Scene,
+    minimum: Minimum,
+    options: FitOptions,
+    on_step: OnStep,
+    *,
+    is_near: bool = False,
+    spacings: Sequence[float] = (0.2, 0.14),
+    explained: float = 1.05,
+    least_gain: float = 2.0,
 ) -> FineMinimum:
-    """Descend with the pixels as recorded, with rays as dense as the data need."""
+    """Descend with the pixels as recorded, with rays as dense as the data need.
+
+    The first of the `spacings`, px, is dense enough for images that it explains to a χ² of
+    `explained`.
+    """
     minimum, steps = in_recorded_pixels(scene, minimum), 0
     unknowns, modes = minimum.unknowns, minimum.modes
     has_dense_rays = scene.imperfect.resembles_fields and not is_near
-    usual = [SPACING_WITH_NUMBERS] if has_dense_rays else list(_SPACINGS)
+    usual = [SPACING_WITH_NUMBERS] if has_dense_rays else list(spacings)
     denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))
     scene = replace(scene, spacing=denser.pop(0))
@@ -376,13 +413,13 @@ def refine_minimum(
             scene,
             unknowns,
             steps=min(most, options.max_iterations - steps),
-            least_gain=_FINE_GAIN,
+            least_gain=least_gain,
             after_step=lambda now: on_step("full size", now),
             modes=modes,
         )
         steps += taken
-        explained = not denser or scene.chi2(scene.model(unknowns)).max() < _EXPLAINED
-        if steps >= options.max_iterations or (ended and explained):
+        is_explained = not denser or scene.chi2(scene.model(unknowns)).max() < explained
+        if steps >= options.max_iterations or (ended and is_explained):
             return FineMinimum(scene, unknowns, value, steps, ended)
-        if not explained:
+        if not is_explained:
             scene = replace(scene, spacing=denser.pop(0))
