@@ -193,7 +193,7 @@ def test_three_energies_tell_a_magnetic_field_from_an_electric_one() -> None:
     setups = [ProtonSetup(energy=energy, **lengths) for energy in (5, 14.7, 40)]
     images = [
         counted(lambda y, x: b * magnetic(y, x) + e * electric(y, x), SIZE)  # noqa: B023
-        for b, e in strengths_of(setups, ("B", "E"), 3)
+        for b, e in strengths_of(setups, ("B", "E"))
     ]
     shots = shots_of(noisy(images, 0.02), setup=setups, source=np.ones(SIZE), noise=0.02)
     result = fit(shots, fields=("B", "E"), options=PLAIN)

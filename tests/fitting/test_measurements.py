@@ -78,7 +78,7 @@ def nearly_all_masked() -> FloatArray:
             "strength is nan: expected a finite number",
         ),
         ({"strength": [0, 1]}, r"strengths of the first image are \[0.0\]: all fields must act"),
-        ({"strength": [(1, 1), (0.5, 0.5)]}, "2 strengths each, and 1 fields are fitted: give one"),
+        ({"strength": [(1, 1), (0.5, 0.5)]}, "and 1 fields are fitted: expected one number for"),
         (
             {"strength": [(1, 1), (0.5, 0.5)], "fields": ("B", "E")},
             "2 fields cannot be distinguished by images",
@@ -113,7 +113,7 @@ def nearly_all_masked() -> FloatArray:
         ({"psf": np.ones((2, 3))}, r"psf has shape \(2, 3\): expected a kernel"),
         ({"psf": [1.0, "wide"]}, "psf is 'wide': expected numbers"),
         ({"strength": "strong"}, "strength is 'strong': expected numbers"),
-        ({"strength": [[1, 2], [3]]}, r"strengths are \(1.0, 2.0\), \(3.0,\): expected one number"),
+        ({"strength": [[1, 2], [3]]}, r"strengths are \(1.0, 2.0\), \(3.0,\), and 1 fields"),
         ({"source": "beam.tif"}, "source is the file beam.tif, expected an array"),
         ({"noise": [0.1, [1, [2]]]}, "noise is .*: expected numbers"),
         ({"fiducials": [[1, 2, 3], [4]]}, "fiducials is .*: expected numbers"),
@@ -318,7 +318,7 @@ def momentum_and_velocity(energy: float) -> tuple[float, float]:
 def test_strengths_follow_from_momenta_and_velocities() -> None:
     """A magnetic field deflects by 1 / p, an electric one by 1 / pβ."""
     energies = (3.0, 14.7, 60.0)
-    strengths = strengths_of([protons(energy) for energy in energies], ("B", "E"), 3)
+    strengths = strengths_of([protons(energy) for energy in energies], ("B", "E"))
     p, beta = np.transpose([momentum_and_velocity(energy) for energy in energies])
     np.testing.assert_allclose(strengths[:, 0], p[0] / p, rtol=1e-9)
     np.testing.assert_allclose(strengths[:, 1], (p * beta)[0] / (p * beta), rtol=1e-9)
@@ -330,22 +330,23 @@ def test_strengths_grow_with_the_distance_over_which_rays_drift() -> None:
     far = protons(10, object_image_distance=0.4, pixel_size=None, detector_pixel_size=2e-6 * 41)
     assert near.object_pixel_size == pytest.approx(far.object_pixel_size)
     expected = (0.4 / 41) / (0.2 / 21)
-    np.testing.assert_allclose(strengths_of([near, far], ("B",), 2)[:, 0], [1, expected])
+    np.testing.assert_allclose(strengths_of([near, far], ("B",))[:, 0], [1, expected])
 
 
 def test_plasma_deflects_light_with_the_square_of_the_wavelength() -> None:
     lengths = {"object_image_distance": 0.1, "pixel_size": 1e-6}
     setups = [OpticalSetup(wavelength=length, **lengths) for length in (800e-9, 400e-9)]
-    np.testing.assert_allclose(strengths_of(setups, ("plasma",), 2)[:, 0], [1, 0.25])
+    np.testing.assert_allclose(strengths_of(setups, ("plasma",))[:, 0], [1, 0.25])
 
 
 def test_fields_that_do_not_bend_the_beam_are_refused() -> None:
     with pytest.raises(InputError, match="plasma"):
-        strengths_of([protons(3), protons(15)], ("plasma",), 2)
+        strengths_of([protons(3), protons(15)], ("plasma",))
 
 
 def test_one_image_needs_no_setup() -> None:
-    np.testing.assert_array_equal(strengths_of(None, ("B",), 1), [[1]])
+    alone = given(images=images(1), strength=None)
+    np.testing.assert_array_equal(alone.scene.strengths, [[1]])
 
 
 def test_a_source_blurs_by_its_size_behind_the_object_and_the_detector_by_its_own() -> None:

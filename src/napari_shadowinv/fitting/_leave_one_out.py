@@ -42,20 +42,6 @@ from napari_shadowinv.fitting.starts import collect_starts
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.options import FitOptions, Instrument
 
-_LEAST_AGREEING = 2
-_LAST_GAIN = 0.5
-_SAMPLES, _SAMPLE_TOLERANCE = 2, 0.05  # of the Gaussian around the unknowns of a fit
-_MAX_SAMPLED_PIXELS = 2_000_000  # of all images; more are sampled in pixels of two
-# Folds are deeper in the image that is displaced most than in those that predict it.
-_RAY_SPACING_RATIO, _DENSE_STEPS = 0.5, 4
-_RAY_VARIANCE_RATIO = 2.5
-_MAX_FITTED_SHARE = 0.9  # of the noise in an image with few pixels in use
-# Of χ², and of the variance of a prediction: the squared error is about as large, but up to four
-# times in deep folds of narrow objects.
-_MAX_NOISE_RATIO, _MAX_VARIANCE_RATIO = 1.15, 5.0
-_WORSE_IN_MIDDLE = 1.3  # the same in pixels of two, where a misfit counts four times
-_FRAME_STEPS = 4
-
 _T = TypeVar("_T")
 
 
@@ -153,6 +139,9 @@ class _Work:
     """Context of all steps: inputs, the callback for progress, and what earlier steps have found.
 
     That is the `scene` of all images, the field that they have in `common`, and a `joint` fit.
+    Folds are deeper in the image that is displaced most than in those that predict it, hence the
+    `dense` rays: shares of their usual distance. Fits of more than `most_sampled` pixels of all
+    images are sampled in pixels of two.
     """
 
     data: FitData
@@ -160,6 +149,8 @@ class _Work:
     scene: Scene
     common: Minimum
     joint: _JointFit | None = None
+    dense: float = 0.5
+    most_sampled: int = 2_000_000
 
     @property
     def _all(self) -> list[int]:
@@ -198,13 +189,17 @@ class _Work:
         members = [image for image in group if image != k]
         return self._settle_members(minimum, members, f"without image {k + 1}")
 
-    def _find_group(self, left: list[int], alone: dict[int, Minimum]) -> list[int]:
-        """Images that one field explains, after removing the worst one by one."""
+    def _find_group(
+        self, left: list[int], alone: dict[int, Minimum], *, fewest: int = 2, worse: float = 1.3
+    ) -> list[int]:
+        """Images that one field explains, after removing the worst one by one.
+
+        In pixels of two, where a misfit counts four times, χ² is `worse` than alone by less.
+        """
         least = np.array([self._chi2_in_middle(alone[k], [k])[0] for k in self._all])
         together = self._settle_members(self.common, left, "all images")
-        while len(left) > _LEAST_AGREEING:
-            worse = self._chi2_in_middle(together, left) / least[left]
-            if worse.max() < _WORSE_IN_MIDDLE:
+        while len(left) > fewest:
+            if (self._chi2_in_middle(together, left) / least[left]).max() < worse:
                 break
             without = partial(_Work._settle_without, minimum=together, group=left)
             tried = self._run_for_each(left, without)
@@ -252,37 +247,50 @@ class _Work:
 
     def _with_joint_fit(self, members: list[int]) -> _Work:
         """Fit images with dense rays, unless they are too many for Jacobians."""
-        if self.scene.only(members).images.size > _MAX_SAMPLED_PIXELS:
+        if self.scene.only(members).images.size > self.most_sampled:
             return self
         _, fine, unknowns, _ = self._fit_densely(members)
         of_all = finer(self.common.unknowns).with_images(members, unknowns)
         return replace(self, joint=_JointFit(members, fine.linear(unknowns), of_all))
 
-    def _fit_densely(self, members: list[int]) -> tuple[Minimum, Scene, Unknowns, float]:
+    def _fit_densely(
+        self, members: list[int], least_gain: float = 0.5
+    ) -> tuple[Minimum, Scene, Unknowns, float]:
         """Fit some images; return where that ends in pixels of two, and with dense rays."""
-        coarse = self._settle_members(self.common, members, _name(members), _LAST_GAIN)
+        coarse = self._settle_members(self.common, members, _name(members), least_gain)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
         scene = self.scene.only(members)
         fine, unknowns, *_ = refine_minimum(scene, first, self.data.options, self.on_step)
-        # Folds are deeper in the image that is left out if it is displaced most.
-        fine = replace(fine, spacing=_RAY_SPACING_RATIO * fine.spacing)
+        fine = replace(fine, spacing=self.dense * fine.spacing)
         return coarse, fine, *self._settle_densely(fine, unknowns, members)
 
     def _settle_densely(
-        self, fine: Scene, unknowns: Unknowns, members: list[int], linear: Linear | None = None
+        self,
+        fine: Scene,
+        unknowns: Unknowns,
+        members: list[int],
+        linear: Linear | None = None,
+        *,
+        steps: int = 4,
+        least_gain: float = 0.5,
     ) -> tuple[Unknowns, float]:
         unknowns, value, *_ = settle(
             fine,
             unknowns,
-            steps=_DENSE_STEPS,
-            least_gain=_LAST_GAIN,
+            steps=steps,
+            least_gain=least_gain,
             after_step=partial(self.on_step, _name(members)),
             linear=linear,
         )
         return unknowns, value
 
-    def _sample_fit(self, members: list[int]) -> _SampledFit:
-        """Fit some images, from a joint fit of these and others if there is one."""
+    def _sample_fit(
+        self, members: list[int], *, count: int = 2, tolerance: float = 0.05
+    ) -> _SampledFit:
+        """Fit some images, from a joint fit of these and others if there is one.
+
+        So many samples show how far the images leave the unknowns open.
+        """
         linear = self._linear_of(members)
         large = False
         if linear is not None and self.joint is not None:
@@ -292,22 +300,35 @@ class _Work:
         else:
             coarse, fine, unknowns, value = self._fit_densely(members)
             start, sampled = finer(coarse.unknowns), (fine, unknowns)
-            large = fine.images.size > _MAX_SAMPLED_PIXELS
+            large = fine.images.size > self.most_sampled
             if large:
                 sampled = coarse.coarsen(self.scene.only(members)), coarse.unknowns.only(members)
         rng = np.random.default_rng(self.data.options.seed)
         report = partial(self.on_step, _name(members), value)
         posterior = Posterior(*sampled, rng, report, linear=linear)
-        samples = posterior.draw_samples(_SAMPLES, _SAMPLE_TOLERANCE)
+        samples = posterior.draw_samples(count, tolerance)
         changes = [sample.change for sample in samples]
         if large:
             changes = [finer(change) for change in changes]
         return _SampledFit(fine, start.with_images(members, unknowns), changes)
 
     def _predict(
-        self, k: int, others: list[int], fit: _SampledFit, alone: tuple[float, float]
+        self,
+        k: int,
+        others: list[int],
+        fit: _SampledFit,
+        alone: tuple[float, float],
+        *,
+        most_noise: float = 1.15,
+        most_variance: float = 5.0,
+        of_rays: float = 2.5,
     ) -> _Prediction:
-        """One image, as others predict it."""
+        """One image, as others predict it.
+
+        Its χ² may be `most_noise`, and `most_variance` times the variance of the prediction: the
+        squared error is about as large, but up to four times in deep folds of narrow objects. That
+        variance includes `of_rays` times the change by denser rays.
+        """
         scene = replace(self.scene, spacing=fit.scene.spacing)
         unknowns = fit.unknowns
         if scene.free_frames.any():
@@ -315,26 +336,29 @@ class _Work:
         unknowns = unknowns.only([k])._replace(brightness=np.zeros(1))
         scene = scene.only([k])
         (rough,) = scene.model(unknowns)
-        scene = replace(scene, spacing=_RAY_SPACING_RATIO * scene.spacing)
+        scene = replace(scene, spacing=self.dense * scene.spacing)
         (image,) = scene.model(unknowns)
         brightness, weights = self._match_brightness(k, image, scene)
         chi2 = _chi2(brightness * image, scene.images[0], weights)
         variance = fit.variance_in(self._linear_of([k]) or scene.linear(unknowns))
-        variance += _RAY_VARIANCE_RATIO * _chi2(brightness * image, brightness * rough, weights)
-        limit = _MAX_NOISE_RATIO + _MAX_VARIANCE_RATIO * variance
+        variance += of_rays * _chi2(brightness * image, brightness * rough, weights)
+        limit = most_noise + most_variance * variance
         own_chi2, noise_chi2 = alone
         return _Prediction(
             brightness * image, weights, brightness, chi2, own_chi2, limit * noise_chi2
         )
 
-    def _fit_alone(self, k: int) -> tuple[float, float]:
-        """χ² of an image with a field of its own, and of the noise in it."""
+    def _fit_alone(self, k: int, most_fitted: float = 0.9) -> tuple[float, float]:
+        """χ² of an image with a field of its own, and of the noise in it.
+
+        Of few pixels in use the field fits `most_fitted` of the noise, as a share.
+        """
         fit = self._sample_fit([k])
         unknowns = fit.unknowns.only([k])
         chi2 = float(fit.scene.chi2(fit.scene.model(unknowns))[0])
         # A field of an image's own follows the noise by as much as it is left open.
         variance = fit.variance_in(self._linear_of([k]) or fit.scene.linear(unknowns))
-        share = min(variance, _MAX_FITTED_SHARE)
+        share = min(variance, most_fitted)
         return chi2, chi2 / (1 - share)
 
     def _match_brightness(self, k: int, made: FloatArray, one: Scene) -> tuple[float, FloatArray]:
@@ -373,7 +397,7 @@ def _name(members: list[int]) -> str:
     return f"images {', '.join(str(k + 1) for k in members)}"
 
 
-def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknowns:
+def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int, steps: int = 4) -> Unknowns:
     """Find where an image lies, and its brightness, beside one whose place is known."""
     pair = scene.only([first, k])
     weights = np.append(np.where(scene.free_frames, scene.prior.frame_weights, 0.0), 1.0)
@@ -384,7 +408,7 @@ def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int) -> Unknow
     for unit, place in zip(units, places, strict=False):
         unit.frames[1, place] = 1
     units[-1].brightness[1] = 1
-    for _ in range(_FRAME_STEPS):
+    for _ in range(steps):
         counts = pair.ray_counts(now)
         linear = pair.linear(now, counts)
         columns = [linear.push(unit)[1].ravel() for unit in units]

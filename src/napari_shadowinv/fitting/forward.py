@@ -27,8 +27,6 @@ from napari_shadowinv.instrument.effects import widen, widening
 _T = TypeVar("_T")
 
 _SIGMAS = 4.0  # how far Gaussians reach
-_MOST_PIXELS_SIDE_BY_SIDE = 1 << 16  # more than one larger image at a time takes much memory
-_IMAGES_PER_THREAD = 2  # of fewer, the last one would leave threads without work
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -216,11 +214,20 @@ class Scene(PriorTerms):
         value = float(np.einsum("yx,yx", residual, residual)) / 2
         return value, np.einsum("yx,yx", pull, model), view, scaled, of_rays
 
-    def _of_each(self, function: Callable[[_Shot], _T], shots: Sequence[_Shot]) -> list[_T]:
-        """Call a function for each image, side by side if these are small and many."""
+    def _of_each(
+        self,
+        function: Callable[[_Shot], _T],
+        shots: Sequence[_Shot],
+        most_pixels: int = 1 << 16,
+    ) -> list[_T]:
+        """Call a function for each image, side by side if these are small and many.
+
+        More than one larger image at a time takes much memory; of few images, the last one would
+        leave threads without work.
+        """
         threads = available_threads(self.rays.threads)
-        is_small = math.prod(self.rays.seen) <= _MOST_PIXELS_SIDE_BY_SIDE
-        if not is_small or len(shots) < _IMAGES_PER_THREAD * threads:
+        is_small = math.prod(self.rays.seen) <= most_pixels
+        if not is_small or len(shots) < 2 * threads:
             threads = 1  # here; the kernels have all of them
         return results_of([partial(function, shot) for shot in shots], threads)
 

@@ -35,8 +35,6 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "noise": (_NOISE, _PLANES, FLUX_DENSITY, "Standard deviation of the noise"),  # or of images
 }
 _SENTENCE = "left_out"
-_LARGE = 100.0
-_LEAST_IMAGES = 3
 
 
 @dataclass(frozen=True)
@@ -175,11 +173,11 @@ class LeaveOneOut:
         )
 
 
-def check_count(count: int) -> None:
+def check_count(count: int, least: int = 3) -> None:
     """Reject with an `InputError` images that are too few for one of them to be left out."""
-    if count < _LEAST_IMAGES:
+    if count < least:
         raise InputError(
-            f"received {count} image{'s' * (count != 1)}: leaving one out needs {_LEAST_IMAGES} or "
+            f"received {count} image{'s' * (count != 1)}: leaving one out needs {least} or "
             "more, so that two or more predict it"
         )
 
@@ -204,9 +202,7 @@ def explanation_of(
             f"one static field explains all {len(chi2)} images: each is predicted by the others "
             f"(χ² {chi2.min():.2f} to {chi2.max():.2f})"
         )
-    values = ", ".join(
-        f"{value:.1f}" if value < _LARGE else f"{value:.0f}" for value in chi2[wrong]
-    )
+    values = ", ".join(f"{value:.1f}" if value < 100 else f"{value:.0f}" for value in chi2[wrong])
     images = f"image{'s' * (len(wrong) > 1)} {_called(wrong, setups, names)}"
     if len(wrong) < len(chi2) / 2:
         verb = "are" if len(wrong) > 1 else "is"

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,12 +26,13 @@ from napari_shadowinv._system.arrays import (
     unpack_mask,
 )
 from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._system.validation import as_model, check_instance
+from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import imperfect_instrument
+from napari_shadowinv.fitting.noise_match import NoiseMatch, match_noise
 from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.fitting.references import smooth_references
 from napari_shadowinv.fitting.shots import (
@@ -45,7 +46,7 @@ from napari_shadowinv.fitting.shots import (
 )
 from napari_shadowinv.fitting.unknowns import Fiducials
 from napari_shadowinv.instrument.shapes import Around
-from napari_shadowinv.inversion.noise import estimated_noise, measure_correlation
+from napari_shadowinv.inversion.noise import estimated_noise
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
@@ -54,28 +55,12 @@ from napari_shadowinv.options import (
     FitOptions,
     Instrument,
 )
-from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.shot import Shot
 
-_MIN_SIGMA_PX = 1e-6  # of a fiducial; the square of less overflows
-_BLOCK = 8  # px; sides are filled up to a multiple of it, for pixels four times as wide
-# Transforms of 251 or 307 numbers take five times as long as of 255 and 315.
-_MOST_FILL, _FAST_PRIME = 0.03, 19  # share of a side; largest prime factor of a length
-_SMALLEST_SIDE = 32
-_BYTES_PER_PIXEL, _BYTES_PER_PIXEL_AND_IMAGE = 2000, 600  # measured peak
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about
-_LARGEST_NOISE = 1e6  # of the beam, of the least noisy pixel
 _LEAST_COUNTS = 1.0
-_TOO_LARGE = 2.5  # times the variance that is measured
-_HIDDEN_TIMES = 9.0  # the same
-_SMOOTHED = 5  # px, over which images are averaged for the standard deviation of their noise
-_DARKEST = 1e-3  # of an image's mean
-_SAME = _ALIKE = 1e-6
-_SAME_STRENGTH = 1.08  # images that differ by less add no information
-_OTHER_UNITS = 3.0  # an image's mean brightness over its source's
-_FREE_SHARE = 0.1  # of the shorter side
 
 
 @dataclass(frozen=True)
@@ -219,17 +204,18 @@ def displacements_of(
     shots: Sequence[Shot], names: Sequence[str], fields: Sequence[str]
 ) -> tuple[FloatArray, tuple[Setup, ...] | None]:
     """Return strengths relative to the first image, and the setups from which they follow."""
-    setups, strengths = values_of(shots, "setup"), values_of(shots, "strength")
-    if strengths is None:
-        return _relative_strengths(strengths_of(setups, fields, len(shots), names)), setups
-    matrix = _checked_strengths(strengths)
     check_fields(fields)
-    if matrix.shape[1] != len(fields):
+    setups, strengths = values_of(shots, "setup"), values_of(shots, "strength")
+    if strengths is not None:
+        return _relative_strengths(_checked_strengths(strengths, len(fields))), None
+    if setups is not None:
+        return _relative_strengths(strengths_of(setups, fields, names)), setups
+    if len(shots) > 1:
         raise InputError(
-            f"images have {matrix.shape[1]} strengths each, and {len(fields)} fields are fitted: "
-            "give one strength for each field"
+            f"received {len(shots)} images and neither strengths nor setups: give the setup of "
+            "each image, or how much each is displaced relative to the first"
         )
-    return _relative_strengths(matrix), None
+    return _relative_strengths(np.ones((1, len(fields)))), None
 
 
 def _other_strengths(
@@ -238,7 +224,7 @@ def _other_strengths(
     """Return displacements by an electric field that is equal to a magnetic one in image 1."""
     if setups is None or tuple(fields) != ("B",):
         return strengths
-    return strengths_of(setups, ("E",), len(setups))
+    return strengths_of(setups, ("E",))
 
 
 def _refuse_ambiguous(shots: Sequence[Shot], options: FitOptions) -> None:
@@ -276,12 +262,20 @@ def _beam_prior(
 
 
 def _strips(
-    shape: tuple[int, int], options: FitOptions, usual: int = 16, free_tie: float = 0.3
+    shape: tuple[int, int],
+    options: FitOptions,
+    *,
+    usual: int = 16,
+    free_share: float = 0.1,
+    free_tie: float = 0.3,
 ) -> tuple[Around, dict[str, Any]]:
-    """Return the strips before and after images along y and x, and how a scene holds them."""
+    """Return the strips before and after images along y and x, and how a scene holds them.
+
+    A free boundary has a strip of a share of the shorter side, and a µ of its own.
+    """
     is_free = options.boundary == "free"
     if is_free:
-        usual = max(usual, 8 * round(_FREE_SHARE * min(shape) / 8))
+        usual = max(usual, 8 * round(free_share * min(shape) / 8))
     pad = options.margin or usual
     height, width = shape
     around = (pad, pad + _fill(height, pad)), (pad, pad + _fill(width, pad))
@@ -290,15 +284,15 @@ def _strips(
     return around, {"pad": pad, "tie": free_tie, "decay": options.decay_length or pad}
 
 
-def _is_single(strengths: FloatArray) -> bool:
-    """Return whether there is one image, or several with the same information."""
+def _is_single(strengths: FloatArray, same: float = 1.08) -> bool:
+    """Return whether there is one image, or several with strengths within a factor."""
     spread = np.linalg.norm(strengths, axis=1)
-    return len(spread) == 1 or bool(spread.max() < _SAME_STRENGTH * spread.min())
+    return len(spread) == 1 or bool(spread.max() < same * spread.min())
 
 
-def _are_proportional(beams: FloatArray) -> bool:
+def _are_proportional(beams: FloatArray, same: float = 1e-6) -> bool:
     shapes = [beam / beam.mean() for beam in beams]
-    return all(np.allclose(beam, shapes[0], rtol=_SAME, atol=0) for beam in shapes[1:])
+    return all(np.allclose(beam, shapes[0], rtol=same, atol=0) for beam in shapes[1:])
 
 
 def _alignment(instrument: Instrument, options: FitOptions) -> dict[str, Any]:
@@ -363,10 +357,7 @@ def check_fields(fields: Sequence[str]) -> None:
 
 
 def strengths_of(
-    setups: Sequence[Setup] | None,
-    fields: Sequence[str],
-    count: int,
-    names: Sequence[str] | None = None,
+    setups: Sequence[Setup], fields: Sequence[str], names: Sequence[str] | None = None
 ) -> FloatArray:
     """Return the displacement by each field in each image relative to the first, shape (L, M).
 
@@ -376,33 +367,18 @@ def strengths_of(
         One for each image, with pixels of the same size at the object.
     fields : sequence of str
         Keys of `deflector_titles`.
-    count : int
-        Number of images.
     names : sequence of str, optional
         Names in messages. Default: their numbers.
 
     Raises
     ------
     InputError
-        If a field is unknown or does not bend the beam, or setups do not fit the images.
+        If a field does not bend the beam, or pixels differ.
     """
-    check_fields(fields)
-    titles = deflector_titles()
-    if setups is None:
-        if count > 1:
-            raise InputError(
-                f"received {count} images and neither strengths nor setups: give the setup of each "
-                "image, or how much each is displaced relative to the first"
-            )
-        return np.ones((1, len(fields)))
-    if len(setups) != count:
-        raise InputError(f"received {count} images and {len(setups)} setups: expected one each")
-    for setup in setups:
-        check_instance(setup, BeamSetup, "setup")
-    first = setups[0]
+    first, titles = setups[0], deflector_titles()
     for k, setup in enumerate(setups):
         ratio = setup.object_pixel_size / first.object_pixel_size
-        if abs(ratio - 1) > _SAME:
+        if abs(ratio - 1) > 1e-6:
             name = names[k] if names else f"image {k + 1}"
             raise InputError(
                 f"{name} has pixels of {setup.object_pixel_size * 1e6:.6g} µm at the "
@@ -421,108 +397,25 @@ def strengths_of(
     )
 
 
-@dataclass(frozen=True)
-class NoiseMatch:
-    """Noise that is given or estimated, against that of the images' calm parts.
-
-    Weights are made for the power of the noise on long waves, where it bends fields: correlated
-    noise has more of it than white noise of the same pixels, smoothed counts less per pixel.
-
-    Attributes
-    ----------
-    factors : ndarray, shape (L,)
-        The variance that is used over that which is given or estimated from single pixels.
-    expected_chi2 : ndarray, shape (L,)
-        Variance of a pixel over the one that is used.
-    correlation : float
-        Standard deviation of the Gaussian that has blurred the noise, px; 0 for white noise.
-    is_estimated, is_hidden : bool
-        Whether the noise was estimated, and whether structure may hide much more than that.
-    """
-
-    factors: FloatArray
-    expected_chi2: FloatArray
-    correlation: float
-    is_estimated: bool
-    is_hidden: bool
-
-    def relative_chi2(self, chi2: FloatArray) -> FloatArray:
-        """Return χ² over the expected one; residuals below the stated noise are no misfit."""
-        relative = chi2 / self.expected_chi2
-        if self.is_estimated:
-            return relative
-        return np.maximum(self.factors * chi2, np.minimum(relative, 1.0))
-
-    def with_long_waves(self, more: FloatArray) -> NoiseMatch:
-        """Return the match with noise that is seen on long waves alone, as shares of the variance.
-
-        Parameters
-        ----------
-        more : ndarray, shape (L,)
-            Its variance in pixels of white noise that are as noisy on long waves.
-        """
-        factors, expected = self.factors * (1 + more), self.expected_chi2 / (1 + more)
-        return replace(self, factors=factors, expected_chi2=expected)
-
-    @property
-    def stated_times(self) -> float:
-        """How many times the noise was stated too large; 1 if it was not."""
-        return float(np.sqrt(1 / self.factors.min(initial=1.0)))
-
-
-def match_noise(
-    deviations: FloatArray,
-    excess: FloatArray,
-    brightness: FloatArray,
-    used: BoolArray,
-    width: float | None,
-    *,
-    is_estimated: bool,
-) -> NoiseMatch:
-    """Compare the noise of images with its standard deviations, all in units of the beams.
-
-    Parameters
-    ----------
-    deviations, excess, brightness : ndarray, shape (L, H, W)
-        Standard deviations, images less beams, images.
-    used : ndarray of bool, shape (L, H, W)
-    width : float or None
-        Standard deviation of the blur that correlates the noise, px, if it is stated.
-    is_estimated : bool
-        Whether the standard deviations are those of differences between neighbouring pixels.
-    """
-    factors, expected = np.ones((2, len(excess)))
-    correlation, is_hidden = 0.0, False
-    for k, planes in enumerate(zip(excess, brightness, used, strict=True)):
-        noise = measure_correlation(*planes, width)
-        variance = float(np.median(deviations[k][used[k]] ** 2))
-        if noise.is_bound:
-            is_hidden |= is_estimated and noise.white_variance > _HIDDEN_TIMES * variance
-            continue
-        is_too_large = variance > _TOO_LARGE * noise.variance > 0
-        if noise.blurred and noise.white < variance / 2 and (is_estimated or not is_too_large):
-            factors[k] = noise.white_variance / variance
-        elif is_too_large:
-            factors[k] = min(noise.white_variance / variance, 1.0)
-        else:
-            continue
-        expected[k] = noise.variance / (factors[k] * variance)
-        correlation = max(correlation, noise.width)
-    return NoiseMatch(factors, expected, correlation, is_estimated, is_hidden)
-
-
 def _checked_planes(
-    shots: Sequence[Shot], names: Sequence[str]
+    shots: Sequence[Shot],
+    names: Sequence[str],
+    *,
+    smallest: int = 32,
+    bytes_of: tuple[int, int] = (2000, 600),
 ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
-    """Return images, sources if there are any, and usable pixels, each of shape (L, H, W)."""
+    """Return images, sources if there are any, and usable pixels, each of shape (L, H, W).
+
+    A fit takes so many bytes of memory for a pixel, and for a pixel of each image.
+    """
     common_values(names, [shot.beam_unknown or None for shot in shots], "unknown source")
     sources = common_values(names, [None if s.beam_unknown else s.source for s in shots], "source")
     images: list[AnyArray] = []
     masks: list[BoolArray] = []
-    needed = _BYTES_PER_PIXEL + len(shots) * _BYTES_PER_PIXEL_AND_IMAGE
+    needed = bytes_of[0] + len(shots) * bytes_of[1]
     for shot, name in zip(shots, names, strict=True):
         image, exposed = unpack_array(shot.image, name)
-        images.append(check_plane(image, name, _SMALLEST_SIDE))
+        images.append(check_plane(image, name, smallest))
         check_memory(images[0].shape, needed, "a fit")
         check_shape(name, images[-1].shape, images[0].shape, names[0])
         try:
@@ -577,12 +470,12 @@ def _common_noise(noises: Sequence[Any] | None) -> Any:
     return noises[0] if isinstance(noises[0], str) else noises
 
 
-def _checked_strengths(strengths: Sequence[tuple[float, ...]]) -> FloatArray:
+def _checked_strengths(strengths: Sequence[tuple[float, ...]], count: int) -> FloatArray:
     """Return strengths of images that have one for each field, shape (L, M)."""
-    if len(set(map(len, strengths))) > 1:
+    if set(map(len, strengths)) != {count}:
         raise InputError(
-            f"strengths are {', '.join(map(str, strengths))}: expected one number for each field "
-            "in all images"
+            f"strengths are {', '.join(map(str, strengths))}, and {count} fields are fitted: "
+            "expected one number for each field in all images"
         )
     return np.array(strengths)
 
@@ -630,14 +523,14 @@ def _refuse_what_is_given_twice(
                 )
 
 
-def _are_alike(first: FloatArray, second: FloatArray) -> bool:
+def _are_alike(first: FloatArray, second: FloatArray, rounding: float = 1e-6) -> bool:
     """Whether two images are the same but for a factor and rounding to 32 bits, and not flat."""
     if not first.size or first.mean() <= 0 or second.mean() <= 0:
         return False
     first_relative, second_relative = first / first.mean(), second / second.mean()
     return bool(
-        np.abs(first_relative - second_relative).max() <= _ALIKE
-        and np.ptp(first_relative) > 2 * _ALIKE
+        np.abs(first_relative - second_relative).max() <= rounding
+        and np.ptp(first_relative) > 2 * rounding
     )
 
 
@@ -659,11 +552,16 @@ def _means(planes: FloatArray, used: BoolArray) -> FloatArray:
     return np.array([plane[use].mean() for plane, use in zip(planes, used, strict=True)])
 
 
-def _fill(side: int, pad: int) -> int:
-    """Return how many pixels to add to a side, for whole blocks and fast transforms."""
-    least = -side % _BLOCK
-    for fill in range(least, least + int(_MOST_FILL * side) + 1, _BLOCK):
-        if _largest_prime_factor(RayModel((side + fill, side + fill), pad).shape[0]) <= _FAST_PRIME:
+def _fill(side: int, pad: int, block: int = 8, most: float = 0.03, prime: int = 19) -> int:
+    """Return how many pixels to add to a side, for whole blocks and fast transforms.
+
+    Pixels of the first stages are half a block wide. Lengths with a larger prime factor are avoided
+    where that adds at most a share of the side: transforms of 251 or 307 numbers take five times as
+    long as of 255 and 315.
+    """
+    least = -side % block
+    for fill in range(least, least + int(most * side) + 1, block):
+        if _largest_prime_factor(RayModel((side + fill, side + fill), pad).shape[0]) <= prime:
             return fill
     return least
 
@@ -678,9 +576,9 @@ def _largest_prime_factor(number: int) -> int:
     return number
 
 
-def _refuse_other_units(brightness: FloatArray, names: Sequence[str]) -> None:
+def _refuse_other_units(brightness: FloatArray, names: Sequence[str], most: float = 3.0) -> None:
     for name, ratio in zip(names, brightness, strict=True):
-        if not 1 / _OTHER_UNITS < ratio < _OTHER_UNITS:
+        if not 1 / most < ratio < most:
             raise InputError(
                 f"{name} is {ratio:.3g} times as bright as its source: expected the same units; "
                 "state the brightness, or let it be free"
@@ -716,23 +614,27 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
     return np.array([np.broadcast_to(sigma, data.shape[1:]) for sigma in sigmas])
 
 
-def _refuse_hopeless_noise(deviations: FloatArray, used: BoolArray, names: Sequence[str]) -> None:
+def _refuse_hopeless_noise(
+    deviations: FloatArray, used: BoolArray, names: Sequence[str], most: float = 1e6
+) -> None:
     """Refuse noise, relative to the beam, that hides any image; single pixels may have it."""
     for name, plane, use in zip(names, deviations, used, strict=True):
-        if (least := float(plane[use].min())) > _LARGEST_NOISE:
+        if (least := float(plane[use].min())) > most:
             raise InputError(
                 f"{name}: the noise is {least:.3g} times the beam or more: expected standard "
                 "deviations in the unit of the image"
             )
 
 
-def _smoothed(image: FloatArray, used: BoolArray) -> FloatArray:
+def _smoothed(
+    image: FloatArray, used: BoolArray, width: int = 5, darkest: float = 1e-3
+) -> FloatArray:
     """Means over the used pixels around each, at least a fraction of the overall mean."""
-    sums = uniform_filter(np.where(used, image, 0.0), _SMOOTHED)
+    sums = uniform_filter(np.where(used, image, 0.0), width)
     means = np.divide(
-        sums, uniform_filter(used.astype(np.float64), _SMOOTHED), out=sums * 0, where=used
+        sums, uniform_filter(used.astype(np.float64), width), out=sums * 0, where=used
     )
-    return np.asarray(np.maximum(means, _DARKEST * image[used].mean()))
+    return np.asarray(np.maximum(means, darkest * image[used].mean()))
 
 
 def _start_of(
@@ -763,20 +665,19 @@ def check_fiducials(fiducials: ArrayLike) -> FloatArray:
     return table
 
 
-def _checked_fiducials(fiducials: ArrayLike | None, size: tuple[int, int]) -> Fiducials | None:
+def _checked_fiducials(
+    fiducials: ArrayLike | None, size: tuple[int, int], least_error: float = 1e-6
+) -> Fiducials | None:
     if fiducials is None:
         return None
     table = check_fiducials(fiducials)
     places, displacements, errors = table[:, :2], table[:, 2:4], table[:, 4]
     if ((places < -0.5) | (places > np.array(size) - 0.5)).any() or not (errors > 0).all():
         raise InputError("fiducials lie outside the image or have no positive σ: check their rows")
-    if (
-        np.abs(displacements).max(initial=0.0) > max(size)
-        or errors.min(initial=1.0) < _MIN_SIGMA_PX
-    ):
+    if np.abs(displacements).max(initial=0.0) > max(size) or errors.min(initial=1.0) < least_error:
         raise InputError(
             f"fiducials are displaced by more than the image's {max(size)} px, or have a σ below "
-            f"{_MIN_SIGMA_PX:g} px: check their rows"
+            f"{least_error:g} px: check their rows"
         )
     # A pixel's centre is at its index; the rays count from the image's corner.
     return Fiducials(places + 0.5, displacements, errors)

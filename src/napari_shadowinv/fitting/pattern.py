@@ -22,7 +22,8 @@ from scipy.ndimage import gaussian_filter, laplace
 from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.measurements import FitData, NoiseMatch
+from napari_shadowinv.fitting.measurements import FitData
+from napari_shadowinv.fitting.noise_match import NoiseMatch
 from napari_shadowinv.fitting.search import SMOOTHNESS_RATIO, Minimum, posterior_of, settle_minimum
 from napari_shadowinv.fitting.unknowns import Unknowns
 

@@ -7,7 +7,7 @@ prior has the standard deviation s and the images leave σ open, about (`log_shr
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -33,6 +33,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.instrument.effects import Absorption, LitObject
 from napari_shadowinv.instrument.shapes import Shapes, beam_shapes, shapes_between
 from napari_shadowinv.options import UNKNOWN_BEAM_RMS, BeamPrior
+from napari_shadowinv.physics.setup import Setup
 
 _CAUSES = {
     "beam": "a beam that differs from its source: record a reference, or fit the beam as unknown",
@@ -197,7 +198,7 @@ def _rivals(data: FitData, scene: Scene, best: Minimum) -> Iterator[Rival]:
     if not scene.free_brightness:
         yield Rival(("brightness",), replace(scene, free_brightness=True), best.unknowns)
     if data.setups and data.fields == ("B",):
-        yield from _with_electric_field(scene, best, data)
+        yield from _with_electric_field(scene, best, data.setups)
 
 
 def _with_imperfections(data: FitData, scene: Scene, best: Minimum) -> Iterator[Rival]:
@@ -236,8 +237,8 @@ def _with_imperfections(data: FitData, scene: Scene, best: Minimum) -> Iterator[
         yield with_shapes(("brightness", "absorption"), transmission_of(data, best, 0.3))
 
 
-def _with_electric_field(scene: Scene, best: Minimum, data: FitData) -> Iterator[Rival]:
-    strengths = strengths_of(data.setups, ("B", "E"), len(scene.images))
+def _with_electric_field(scene: Scene, best: Minimum, setups: Sequence[Setup]) -> Iterator[Rival]:
+    strengths = strengths_of(setups, ("B", "E"))
     strengths = strengths / strengths[0]
     if np.linalg.matrix_rank(strengths, tol=0.02) < 2:
         return

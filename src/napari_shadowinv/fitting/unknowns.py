@@ -90,9 +90,7 @@ class Fiducials(NamedTuple):
 
 POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
 
-_BRIGHTNESS_WEIGHT = 1.0  # 1 / s² of their logarithm
 _NORMAL = np.array(1.0)  # 1 / s² of the numbers of an instrument
-_STRETCH_SPREAD = 0.05  # of turns, magnifications and shears
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,6 +109,8 @@ class PriorTerms:
         Side of a pixel in recorded pixels.
     shift_spread : float
         Standard deviation of an image's shift, px of the recorded image.
+    stretch_spread, brightness_spread : float
+        Of turns, magnifications and shears, and of the logarithm of the brightness.
     """
 
     smoothness: FloatArray
@@ -119,6 +119,8 @@ class PriorTerms:
     fiducials: Fiducials | None = None
     bin: int = 1
     shift_spread: float = 5.0
+    stretch_spread: float = 0.05
+    brightness_spread: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,14 +236,14 @@ class Prior(PriorTerms):
     @cached_property
     def _weights(self) -> list[FloatArray]:
         """1 / s² of the values of each block but the potentials."""
-        return [_NORMAL, np.array(_BRIGHTNESS_WEIGHT), self.frame_weights, _NORMAL]
+        return [_NORMAL, 1 / np.array(self.brightness_spread) ** 2, self.frame_weights, _NORMAL]
 
     @cached_property
     def frame_weights(self) -> FloatArray:
         """1 / s² of a frame's numbers."""
         shift = self.shift_spread / self.bin
         # Where images lie well, their corners do, too.
-        stretch = min(_STRETCH_SPREAD, shift / (max(self.rays.size) / 4))
+        stretch = min(self.stretch_spread, shift / (max(self.rays.size) / 4))
         return 1 / np.array([shift, stretch, stretch, shift, stretch, stretch]) ** 2
 
     @cached_property

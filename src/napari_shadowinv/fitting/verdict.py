@@ -16,7 +16,7 @@ from scipy import ndimage
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Assessment, Verdict, limit_text, percent, to_figures
 from napari_shadowinv.fitting.instrument import TITLES
-from napari_shadowinv.fitting.measurements import NoiseMatch
+from napari_shadowinv.fitting.noise_match import NoiseMatch
 from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX

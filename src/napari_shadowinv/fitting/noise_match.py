@@ -1,0 +1,105 @@
+"""Noise that is given or estimated, against that of the images: `match_noise`, `NoiseMatch`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.inversion.noise import measure_correlation
+
+
+@dataclass(frozen=True)
+class NoiseMatch:
+    """Noise that is given or estimated, against that of the images' calm parts.
+
+    Weights are made for the power of the noise on long waves, where it bends fields: correlated
+    noise has more of it than white noise of the same pixels, smoothed counts less per pixel.
+
+    Attributes
+    ----------
+    factors : ndarray, shape (L,)
+        The variance that is used over that which is given or estimated from single pixels.
+    expected_chi2 : ndarray, shape (L,)
+        Variance of a pixel over the one that is used.
+    correlation : float
+        Standard deviation of the Gaussian that has blurred the noise, px; 0 for white noise.
+    is_estimated, is_hidden : bool
+        Whether the noise was estimated, and whether structure may hide much more than that.
+    """
+
+    factors: FloatArray
+    expected_chi2: FloatArray
+    correlation: float
+    is_estimated: bool
+    is_hidden: bool
+
+    def relative_chi2(self, chi2: FloatArray) -> FloatArray:
+        """Return χ² over the expected one; residuals below the stated noise are no misfit."""
+        relative = chi2 / self.expected_chi2
+        if self.is_estimated:
+            return relative
+        return np.maximum(self.factors * chi2, np.minimum(relative, 1.0))
+
+    def with_long_waves(self, more: FloatArray) -> NoiseMatch:
+        """Return the match with noise that is seen on long waves alone, as shares of the variance.
+
+        Parameters
+        ----------
+        more : ndarray, shape (L,)
+            Its variance in pixels of white noise that are as noisy on long waves.
+        """
+        factors, expected = self.factors * (1 + more), self.expected_chi2 / (1 + more)
+        return replace(self, factors=factors, expected_chi2=expected)
+
+    @property
+    def stated_times(self) -> float:
+        """How many times the noise was stated too large; 1 if it was not."""
+        return float(np.sqrt(1 / self.factors.min(initial=1.0)))
+
+
+def match_noise(
+    deviations: FloatArray,
+    excess: FloatArray,
+    brightness: FloatArray,
+    used: BoolArray,
+    width: float | None,
+    *,
+    is_estimated: bool,
+    too_large: float = 2.5,
+    hidden: float = 9.0,
+) -> NoiseMatch:
+    """Compare the noise of images with its standard deviations, all in units of the beams.
+
+    Parameters
+    ----------
+    deviations, excess, brightness : ndarray, shape (L, H, W)
+        Standard deviations, images less beams, images.
+    used : ndarray of bool, shape (L, H, W)
+    width : float or None
+        Standard deviation of the blur that correlates the noise, px, if it is stated.
+    is_estimated : bool
+        Whether the standard deviations are those of differences between neighbouring pixels.
+    too_large, hidden : float, default 2.5 and 9
+        A variance that is stated is too large, and one that was estimated hides noise, where it is
+        so many times that of the calm parts, or these have so many times its own.
+    """
+    factors, expected = np.ones((2, len(excess)))
+    correlation, is_hidden = 0.0, False
+    for k, planes in enumerate(zip(excess, brightness, used, strict=True)):
+        noise = measure_correlation(*planes, width)
+        variance = float(np.median(deviations[k][used[k]] ** 2))
+        if noise.is_bound:
+            is_hidden |= is_estimated and noise.white_variance > hidden * variance
+            continue
+        is_too_large = variance > too_large * noise.variance > 0
+        if noise.blurred and noise.white < variance / 2 and (is_estimated or not is_too_large):
+            factors[k] = noise.white_variance / variance
+        elif is_too_large:
+            factors[k] = min(noise.white_variance / variance, 1.0)
+        else:
+            continue
+        expected[k] = noise.variance / (factors[k] * variance)
+        correlation = max(correlation, noise.width)
+    return NoiseMatch(factors, expected, correlation, is_estimated, is_hidden)
