@@ -9,7 +9,7 @@ from napari_shadowinv.fitting.unknowns import Unknowns
 
 def some(seed: int) -> Unknowns:
     rng = np.random.default_rng(seed)
-    shapes = ((2, 4, 5), (4,), (2,), (2, 6), (2, 3), (2, 1))
+    shapes = ((2, 4, 5), (4,), (2,), (2, 6), (2, 3))
     return Unknowns(*(rng.normal(size=shape) for shape in shapes))
 
 
