@@ -221,16 +221,7 @@ def _find_pattern(
     data: FitData, minima: _Minima, refined: FineMinimum, openness: Openness, on_step: OnStep
 ) -> Pattern:
     """Find a pattern that the fit leaves, and how much of the noise of counts is missing."""
-    # A fit of one image absorbs too much of its noise for the counts to be tested.
-    is_counted = data.counted and not data.single
-    pattern = find_pattern(
-        refined.scene,
-        refined.unknowns,
-        data.size,
-        is_counted=is_counted,
-        correlation=data.instrument.noise_correlation,
-        noise=data.noise,
-    )
+    pattern = find_pattern(data, refined.scene, refined.unknowns)
     if pattern.lacks_counts() and openness.posterior is not None:
         posterior = openness.posterior.reporting(lambda: on_step("samples", refined.objective))
         absorbed = posterior.count_determined(np.random.default_rng(data.options.seed))

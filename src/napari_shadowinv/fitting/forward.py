@@ -231,21 +231,6 @@ class Scene(PriorTerms):
             threads = 1  # here; the kernels have all of them
         return results_of([partial(function, shot) for shot in shots], threads)
 
-    def changed_by_beams(
-        self, unknowns: Unknowns, counts: list[IntArray], variations: FloatArray
-    ) -> FloatArray:
-        """Return the change of all residuals by changes of the beams, shape (L, H, W).
-
-        `variations` are shares of the beams; an image is linear in its beam.
-        """
-        changes = np.empty_like(self.images)
-        for k, shot in enumerate(self._shots(unknowns, counts)):
-            slope = self._seen(unknowns, shot).slope if self.imperfect.responses else 1.0
-            changed = shot.traced._replace(beam=variations[k] * shot.traced.beam)
-            bare = slope * self._spread(k, self.rays.image(changed), unknowns)
-            changes[k] = np.sqrt(self.weights[k]) * np.exp(unknowns.brightness[k]) * bare
-        return changes
-
     def linear(
         self, unknowns: Unknowns, counts: list[IntArray] | None = None, *, of_held: bool = False
     ) -> Linear:

@@ -23,7 +23,6 @@ from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
-from napari_shadowinv.fitting.noise_match import NoiseMatch
 from napari_shadowinv.fitting.search import SMOOTHNESS_RATIO, Minimum, posterior_of, settle_minimum
 from napari_shadowinv.fitting.unknowns import Unknowns
 
@@ -227,45 +226,37 @@ class Pattern:
 
 
 def find_pattern(
-    scene: Scene,
-    unknowns: Unknowns,
-    size: tuple[int, int],
-    *,
-    is_counted: bool = False,
-    correlation: float | None = None,
-    noise: NoiseMatch | None = None,
-    least_counts: float = 5.0,
+    data: FitData, scene: Scene, unknowns: Unknowns, least_counts: float = 5.0
 ) -> Pattern:
-    """Test the residuals of all images, the first `size` pixels of the scene, for structure.
+    """Test the residuals of all images for structure, and for the noise of counts.
 
-    Of images that `is_counted` calls counts, the noise is tested, too, where the model has
-    `least_counts` in a pixel. Their `correlation` in px is
-    measured unless it is stated, in the residuals and before, as `noise`.
+    That is where the model has `least_counts` in a pixel. The noise is as correlated as it is
+    stated, else as it is measured in the residuals and before.
     """
-    height, width = size
+    height, width = data.size
     roots = np.sqrt(scene.weights[:, :height, :width])
     seen = scene.model(unknowns)
     models = seen[:, :height, :width]
     residuals = roots * (scene.images[:, :height, :width] - models)
     used = roots > 0
+    correlation = data.instrument.noise_correlation
     if correlation is None:
-        before = 0.0 if noise is None else noise.correlation
-        correlation = max(before, *map(correlation_length, residuals, used))
+        correlation = max(data.noise.correlation, *map(correlation_length, residuals, used))
     strengths = [
         pattern_strength(residual, use, correlation)
         for residual, use in zip(residuals, used, strict=True)
     ]
-    chi2 = scene.chi2(seen)
     missing, deviation = 0.0, np.inf
-    if is_counted and not correlation:
+    # A fit of one image absorbs too much of its noise for the counts to be tested.
+    if data.counted and not data.single and not correlation:
         # The weight of a pixel is one over the variance of its counts in units of the beam.
-        expected = 1.0 if noise is None else np.sqrt(noise.expected_chi2)[:, None, None]
+        expected = np.sqrt(data.noise.expected_chi2)[:, None, None]
         is_bright = roots * models > np.sqrt(least_counts)
         missing, deviation = lack_of_noise(residuals / expected, is_bright)
     return Pattern(
         strengths=np.array(strengths),
         correlation=correlation,
-        chi2=float((chi2 if noise is None else noise.relative_chi2(chi2)).max()),
+        chi2=float(data.noise.relative_chi2(scene.chi2(seen)).max()),
         blur_score=blur_score(residuals, roots, models),
         missing_counts=missing,
         counts_deviation=deviation,

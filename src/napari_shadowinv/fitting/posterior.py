@@ -368,12 +368,14 @@ class Posterior:
         Parameters
         ----------
         variations : sequence of ndarray, shape (L, …)
-            Differences as shares of the beams, of the shape of the scene's beams.
+            Differences as shares of the beams, of the shape of the scene's beams, in which the
+            images are linear.
+        tolerance : float, default 0.01
+            Of the equations.
         """
-        slopes = [
-            self._linear.pull(self.scene.changed_by_beams(self._unknowns, self._counts, each))
-            for each in variations
-        ]
+        changed = (replace(self.scene, beams=each * self.scene.beams) for each in variations)
+        images = (each.model(self._unknowns, self._counts) for each in changed)
+        slopes = [self._linear.pull(np.sqrt(self.scene.weights) * each) for each in images]
         return self._changes(slopes, tolerance)
 
     def log_volume(

@@ -16,7 +16,6 @@ import numpy as np
 
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnStep, run_in_parallel
-from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import FITTED_VARIANCE, Imperfect
@@ -185,8 +184,10 @@ def transmission_of(data: FitData, minimum: Minimum, rms: float) -> Shapes:
 
 def _rivals(data: FitData, scene: Scene, best: Minimum) -> Iterator[Rival]:
     for width in (1.5, 3.0):  # px
-        widths = [np.hypot(psf, width) if isinstance(psf, float) else psf for psf in scene.psf]
-        blurred = replace(scene, psf=list(map(_as_width, widths)))
+        widths = [
+            float(np.hypot(psf, width)) if isinstance(psf, float) else psf for psf in scene.psf
+        ]
+        blurred = replace(scene, psf=widths)
         yield Rival(("blur",), blurred, best.unknowns, tried=1)
     yield from _with_imperfections(data, scene, best)
     if data.single:
@@ -246,7 +247,3 @@ def _with_electric_field(scene: Scene, best: Minimum, setups: Sequence[Setup]) -
     both = replace(scene, strengths=strengths, smoothness=smoothness)
     potentials = np.concatenate([best.unknowns.potentials, 0 * best.unknowns.potentials])
     yield Rival(("energy", "electric field"), both, best.unknowns._replace(potentials=potentials))
-
-
-def _as_width(width: float | FloatArray) -> float | FloatArray:
-    return width if isinstance(width, np.ndarray) else float(width)

@@ -146,12 +146,13 @@ def search(
             unknowns.potentials[0] = _splines_of(first, start.potential)
         return Minimum(start.name, unknowns, np.inf, first.displacement(unknowns), first.bin)
 
-    firsts = {(start.stages[0], start.beam_held): start for start in starts if _is_shared(start)}
+    without_field = [start for start in starts if start.potential is None]
+    firsts = {(start.stages[0], start.beam_held): start for start in without_field}
     descents = [_Descent(start, begin(start), start.stages[:1]) for start in firsts.values()]
     shared = dict(zip(firsts, _descend_together(rough, descents, on_step), strict=True))
     descents = []
     for start in starts:
-        if _is_shared(start):
+        if start.potential is None:
             minimum = shared[start.stages[0], start.beam_held]
             descents.append(_Descent(start, minimum, start.stages[1:-1]))
         else:
@@ -168,11 +169,6 @@ def search(
         for end in (_distinct_minima(rivals)[:most] if len(rivals) > 1 else rivals)
     ]
     return _distinct_minima(_descend_together(rough, descents, on_step))
-
-
-def _is_shared(start: Start) -> bool:
-    """Whether starts with the same first stage may share it: those without a field."""
-    return start.potential is None and len(start.stages) > 1
 
 
 def _descend_together(scene: Scene, descents: Sequence[_Descent], on_step: OnStep) -> list[Minimum]:
