@@ -242,11 +242,17 @@ def _bright_sources(
 ) -> tuple[FloatArray, FloatArray, bool]:
     """Return sources as bright as their images, by which factors, and whether these are fitted."""
     means = _means(data, used)
-    is_free, factors = _checked_brightness(values_of(shots, "brightness"), len(shots))
+    brightness = values_of(shots, "brightness") or (1.0,) * len(shots)
+    are_free = [isinstance(each, str) for each in brightness]
+    if any(are_free) and not all(are_free):
+        raise InputError(
+            f"brightness is {', '.join(map(repr, brightness))}: expected a number for each image, "
+            "or 'free' for all"
+        )
     if recorded is None:
         recorded = np.ones(data.shape) * means[:, None, None]
-    if is_free:
-        factors = means / _means(recorded, used)
+    is_free = all(are_free)
+    factors = means / _means(recorded, used) if is_free else np.array(brightness, dtype=np.float64)
     recorded = factors[:, None, None] * recorded
     _refuse_other_units(means / _means(recorded, used), names_of(shots))
     return recorded, factors, is_free
@@ -532,19 +538,6 @@ def _are_alike(first: FloatArray, second: FloatArray, rounding: float = 1e-6) ->
         np.abs(first_relative - second_relative).max() <= rounding
         and np.ptp(first_relative) > 2 * rounding
     )
-
-
-def _checked_brightness(brightness: Sequence[Any] | None, count: int) -> tuple[bool, FloatArray]:
-    if brightness is None:
-        return False, np.ones(count)
-    if all(isinstance(each, str) for each in brightness):
-        return True, np.ones(count)
-    if any(isinstance(each, str) for each in brightness):
-        raise InputError(
-            f"brightness is {', '.join(map(repr, brightness))}: expected a number for each image, "
-            "or 'free' for all"
-        )
-    return False, np.array(brightness, dtype=np.float64)
 
 
 def _means(planes: FloatArray, used: BoolArray) -> FloatArray:
