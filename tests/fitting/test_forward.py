@@ -110,8 +110,7 @@ def test_the_gradient_is_that_of_the_value(scene: Scene, part: str, force: bool)
     change = only(part, change)
     step = 1e-6
     ahead, behind = (
-        scene.value_and_gradient(unknowns.plus(unknowns.like(s * change.flat())), counts)[0]
-        for s in (step, -step)
+        scene.value_and_gradient(unknowns.plus(change, s), counts)[0] for s in (step, -step)
     )
     assert along(slope, change) == pytest.approx((ahead - behind) / 2 / step, rel=1e-4)
 
@@ -159,9 +158,7 @@ def test_pushed_is_the_change_of_residuals(scene: Scene) -> None:
     change = random_like(unknowns, 2)
     change.frames[0] = 0
     step = 1e-6
-    ahead, behind = (
-        scene.model(unknowns.plus(unknowns.like(s * change.flat())), counts) for s in (step, -step)
-    )
+    ahead, behind = (scene.model(unknowns.plus(change, s), counts) for s in (step, -step))
     expected = np.sqrt(scene.weights) * (ahead - behind) / (2 * step)
     pushed = scene.linear(unknowns, counts).push(change)
     assert np.abs(pushed - expected).max() < 1e-4 * np.abs(expected).max()
@@ -224,7 +221,7 @@ def test_normal_products_of_sharp_images_are_pulled_pushes(
     assert sharp.rays.seen == SIZE
     unknowns = sharp.nothing()
     unknowns.potentials[:] = some(scene).potentials
-    unknowns = unknowns.plus(unknowns.like(0.1 * random_like(unknowns, 6).flat()))
+    unknowns = unknowns.plus(random_like(unknowns, 6), 0.1)
     unknowns.frames[0] = at_rest()
     linear = sharp.linear(unknowns, sharp.ray_counts(unknowns))
     change = sharp._only_free(random_like(unknowns, 7))
@@ -245,8 +242,7 @@ def test_the_hessian_is_the_change_of_the_gradient_where_images_are_explained(
     change.frames[0] = 0
     step = 1e-6
     (_, ahead), (_, behind) = (
-        explained.value_and_gradient(unknowns.plus(unknowns.like(s * change.flat())), counts)
-        for s in (step, -step)
+        explained.value_and_gradient(unknowns.plus(change, s), counts) for s in (step, -step)
     )
     expected = (ahead.flat() - behind.flat()) / (2 * step)
     product = hessian_times(explained.linear(unknowns, counts), change).flat()

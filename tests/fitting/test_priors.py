@@ -63,9 +63,7 @@ def test_the_slope_is_that_of_the_value(prior: Prior) -> None:
     point, change = random(prior, 0), random(prior, 1)
     _, slope = prior.value_and_slope(point)
     step = 1e-4
-    ahead, behind = (
-        prior.value_and_slope(point.plus(point.like(s * change.flat())))[0] for s in (step, -step)
-    )
+    ahead, behind = (prior.value_and_slope(point.plus(change, s))[0] for s in (step, -step))
     assert along(slope, change) == pytest.approx((ahead - behind) / 2 / step, rel=1e-6)
 
 

@@ -421,7 +421,7 @@ def _align_image(scene: Scene, unknowns: Unknowns, first: int, k: int, steps: in
             matrix + np.diag(weights[free]), -slope - weights[free] * about_rest[free]
         )
         for unit, share in zip(units, step, strict=True):
-            now = now.plus(now.like(share * unit.flat()))
+            now = now.plus(unit, float(share))
     return unknowns.with_images([k], now.only([1]))
 
 

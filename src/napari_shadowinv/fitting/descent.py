@@ -283,7 +283,7 @@ def settle(
         expected_gain = product(down, step) / 2
         change = scales.times(now.like(step))
         for share in limits.shares:
-            trial = now.plus(now.like(share * change.flat()))
+            trial = now.plus(change, share)
             trial_value, trial_slope = scene.value_and_gradient(trial, counts)
             if trial_value < value:
                 break

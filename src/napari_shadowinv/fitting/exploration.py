@@ -155,7 +155,7 @@ def explore(
         by_part=by_part,
         by_beam=by_beam,
         assumed={
-            key: change.like(size * change.flat())
+            key: change.zeros().plus(change, size)
             for key, (change, size) in responses.items()
             if key in ASSUMED and not is_linear
         },

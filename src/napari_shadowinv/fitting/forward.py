@@ -168,7 +168,7 @@ class Scene(PriorTerms):
         if self.force is None:
             return value, slope
         value -= sum(float(np.sum(a * b)) for a, b in zip(self.force, unknowns, strict=True))
-        return value, slope.plus(slope.like(-self.force.flat()))
+        return value, slope.plus(self.force, -1)
 
     def _misfit(self, unknowns: Unknowns, shot: _Shot) -> tuple[_Seen, FloatArray, FloatArray]:
         """An image as it is seen, its model, and its residual in units of the noise."""

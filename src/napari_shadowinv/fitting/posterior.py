@@ -224,7 +224,7 @@ class Posterior:
             images = scene.images + self._deviations * sample.noise
             noisy = replace(scene, images=images, force=sample.force)
             end = settled(noisy, base.plus(sample.change))
-            solved.append(replace(sample, change=end.like(end.flat() - base.flat())))
+            solved.append(replace(sample, change=end.plus(base, -1)))
         return solved
 
     def _draw_held(self, normal: FloatArray) -> Unknowns:
@@ -278,8 +278,7 @@ class Posterior:
             for sign in (1, -1):
                 images = model + sign * noise
                 step = self._change(gradient(images, unknowns), refitted)
-                there = unknowns.plus(unknowns.like(-step.flat()))
-                expected += along(gradient(images, there)) / (2 * pairs)
+                expected += along(gradient(images, unknowns.plus(step, -1))) / (2 * pairs)
         return Response(
             changes,
             numbers=numbers,
@@ -308,7 +307,7 @@ class Posterior:
         for key, moved in numbers.items():
             pull = self._linear.pull(-self._linear.push(moved))
             effects[key] = held._change(pull, tolerance)
-            rest = rest.plus(moved.like(-effects[key].flat()))
+            rest = rest.plus(effects[key], -1)
         return {"noise": rest, **effects}
 
     def responses(
@@ -622,7 +621,7 @@ def shifts_by_beam(
         return BeamShifts(by_percent, 0 * by_percent)
     scale = 100 * variation
     each = scale / np.sqrt(len(changes))
-    scaled = tuple(change.like(each * change.flat()) for change in changes)
+    scaled = tuple(change.zeros().plus(change, each) for change in changes)
     return BeamShifts(by_percent, scale * by_percent, scaled)
 
 

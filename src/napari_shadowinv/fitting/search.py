@@ -277,7 +277,7 @@ def _with_likely_numbers(scene: Scene, end: Minimum, most: float = 1.0) -> Minim
     for unit in coarser(scene, end.bin).response_units():
         number = product(unit.flat(), unknowns.flat())
         shift = float(np.clip(number, -most, most)) - number
-        unknowns = unknowns.plus(unknowns.like(shift * unit.flat()))
+        unknowns = unknowns.plus(unit, shift)
     return replace(end, unknowns=unknowns)
 
 
@@ -309,7 +309,7 @@ def _settle_response(
         before = remaining
         unknowns = end.unknowns
         for each, share in zip(response.changes, step, strict=True):
-            unknowns = unknowns.plus(unknowns.like(share * each.flat()))
+            unknowns = unknowns.plus(each, float(share))
         end = replace(end, unknowns=unknowns)
         end = settle_minimum(scene, end, on_step, least_gain=least_gain)
         if is_settled:

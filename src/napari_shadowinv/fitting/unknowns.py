@@ -1,8 +1,7 @@
 """The unknowns of a fit, and their prior.
 
 - all numbers that a fit determines: `Unknowns`; displacements known beforehand: `Fiducials`
-- light that adds to each image, such as a background: `AdditiveBlock`, listed in `ADDITIVE`
-- the prior of potentials, instrument, brightness, frames and light: `Prior`
+- the prior of potentials, instrument, brightness and frames: `Prior`
 
 The prior is quadratic; for the potentials it is
 
@@ -67,9 +66,9 @@ class Unknowns(NamedTuple):
             block[list(numbers)] = new
         return Unknowns(*part[:_COMMON], *blocks)
 
-    def plus(self, other: Unknowns) -> Unknowns:
-        """Return the sum of both."""
-        return Unknowns(*map(np.add, self, other))
+    def plus(self, other: Unknowns, times: float = 1.0) -> Unknowns:
+        """Return the sum with so many times another."""
+        return Unknowns(*(a + times * b for a, b in zip(self, other, strict=True)))
 
     def zeros(self) -> Unknowns:
         """Return as many zeros."""
