@@ -139,7 +139,8 @@ class Scene(PriorTerms):
 
     def model(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> FloatArray:
         """Return the images that the unknowns make, shape (L, H, W), by `ray_counts` or others."""
-        lit = (self._seen(unknowns, shot).image for shot in self._shots(unknowns, counts))
+        shots = enumerate(self._traced(unknowns, counts))
+        lit = (self._seen(unknowns, k, traced).image for k, traced in shots)
         return np.stack([np.exp(log) * f for log, f in zip(unknowns.brightness, lit, strict=True)])
 
     def beam(self, unknowns: Unknowns) -> FloatArray:
@@ -157,8 +158,8 @@ class Scene(PriorTerms):
     def value(self, unknowns: Unknowns, counts: list[IntArray] | None = None) -> float:
         """Return the objective, at fixed numbers of rays if these are given."""
         value, _ = self._priors(unknowns)
-        shots = list(self._shots(unknowns, counts))
-        for _, _, residual in self._of_each(partial(self._misfit, unknowns), shots):
+        beams = self._traced(unknowns, counts)
+        for _, _, residual in self._of_each(partial(self._misfit, unknowns), beams):
             value += float(np.einsum("yx,yx", residual, residual)) / 2
         return value
 
@@ -170,11 +171,13 @@ class Scene(PriorTerms):
         value -= sum(float(np.sum(a * b)) for a, b in zip(self.force, unknowns, strict=True))
         return value, slope.plus(self.force, -1)
 
-    def _misfit(self, unknowns: Unknowns, shot: _Shot) -> tuple[_Seen, FloatArray, FloatArray]:
+    def _misfit(
+        self, unknowns: Unknowns, k: int, traced: TracedBeam
+    ) -> tuple[_Seen, FloatArray, FloatArray]:
         """An image as it is seen, its model, and its residual in units of the noise."""
-        view = self._seen(unknowns, shot)
-        model = np.exp(unknowns.brightness[shot.number]) * view.image
-        residual = np.sqrt(self.weights[shot.number]) * (model - self.images[shot.number])
+        view = self._seen(unknowns, k, traced)
+        model = np.exp(unknowns.brightness[k]) * view.image
+        residual = np.sqrt(self.weights[k]) * (model - self.images[k])
         return view, model, blurred(residual, self.blur)
 
     def value_and_gradient(
@@ -183,8 +186,8 @@ class Scene(PriorTerms):
         """Return the objective at fixed numbers of rays, and its derivatives."""
         value, slope = self._priors(unknowns)
         strengths = self.strengths_with(unknowns)
-        shots = list(self._shots(unknowns, counts))
-        differentiated = self._of_each(partial(self._pulls, unknowns), shots)
+        beams = self._traced(unknowns, counts)
+        differentiated = self._of_each(partial(self._pulls, unknowns), beams)
         for k, (of_image, of_brightness, view, scaled, pulls) in enumerate(differentiated):
             value += of_image
             slope.brightness[k] += of_brightness
@@ -193,20 +196,19 @@ class Scene(PriorTerms):
             slope.frames[k] += pulls.frame
         if self._frees_light:
             of_beams = [pulls.beam for *_, pulls in differentiated]
-            entering = self._entering(unknowns, [shot.traced.beam for shot in shots])
+            entering = self._entering(unknowns, [traced.beam for traced in beams])
             self._add_beam_pulls(slope, of_beams, entering)
         return value, self._only_free(slope)
 
     def _pulls(
-        self, unknowns: Unknowns, shot: _Shot
+        self, unknowns: Unknowns, k: int, traced: TracedBeam
     ) -> tuple[float, float, _Seen, FloatArray, Pulls]:
         """Differentiate an image's part of the objective: by log brightness, image and rays."""
-        k = shot.number
-        view, model, residual = self._misfit(unknowns, shot)
+        view, model, residual = self._misfit(unknowns, k, traced)
         pull = np.sqrt(self.weights[k]) * blurred(residual, self.blur)
         scaled = np.exp(unknowns.brightness[k]) * pull
         of_rays = self.rays.gradient(
-            shot.traced,
+            traced,
             self._spread_back(k, view.slope * scaled, unknowns),
             of_beam=self._frees_light,
             of_frame=k > 0 and bool(self.free_frames.any()),
@@ -216,8 +218,8 @@ class Scene(PriorTerms):
 
     def _of_each(
         self,
-        function: Callable[[_Shot], _T],
-        shots: Sequence[_Shot],
+        function: Callable[[int, TracedBeam], _T],
+        beams: Sequence[TracedBeam],
         most_pixels: int = 1 << 16,
     ) -> list[_T]:
         """Call a function for each image, side by side if these are small and many.
@@ -227,28 +229,28 @@ class Scene(PriorTerms):
         """
         threads = available_threads(self.rays.threads)
         is_small = math.prod(self.rays.seen) <= most_pixels
-        if not is_small or len(shots) < 2 * threads:
+        if not is_small or len(beams) < 2 * threads:
             threads = 1  # here; the kernels have all of them
-        return results_of([partial(function, shot) for shot in shots], threads)
+        return results_of([partial(function, k, traced) for k, traced in enumerate(beams)], threads)
 
     def linear(
         self, unknowns: Unknowns, counts: list[IntArray] | None = None, *, of_held: bool = False
     ) -> Linear:
         """Return the scene to first order around unknowns; by light that is held only if asked."""
-        shots = list(self._shots(unknowns, counts))
+        beams = self._traced(unknowns, counts)
         of_beam = self._frees_light or (of_held and bool(self.imperfect.shapes))
         of_frame = bool(self.free_frames.any())
 
-        def differentiate(shot: _Shot) -> csr_array:
-            of_its_frame = shot.number > 0 and of_frame
-            return self.rays.jacobian(shot.traced, of_beam=of_beam, of_frame=of_its_frame)
+        def differentiate(k: int, traced: TracedBeam) -> csr_array:
+            return self.rays.jacobian(traced, of_beam=of_beam, of_frame=k > 0 and of_frame)
 
-        jacobians = self._of_each(differentiate, shots)
+        jacobians = self._of_each(differentiate, beams)
         if not of_beam and not of_frame:
             columns = math.prod(self.rays.shape)
             for jacobian in jacobians:
                 jacobian.resize(jacobian.shape[0], columns)
-        return Linear(self, unknowns, jacobians, [self._seen(unknowns, shot) for shot in shots])
+        seen = [self._seen(unknowns, k, traced) for k, traced in enumerate(beams)]
+        return Linear(self, unknowns, jacobians, seen)
 
     @cached_property
     def _is_sharp(self) -> bool:
@@ -290,11 +292,11 @@ class Scene(PriorTerms):
                 for k in range(1 if part.is_common else len(self.images)):
                     yield part, k
 
-    def _shots(self, unknowns: Unknowns, counts: list[IntArray] | None) -> Iterator[_Shot]:
+    def _traced(self, unknowns: Unknowns, counts: list[IntArray] | None) -> list[TracedBeam]:
+        """The beam of each image behind its potential."""
         counts = counts or self.ray_counts(unknowns)
-        lights = self._lights(unknowns)
-        for k, psi in enumerate(self.potentials(unknowns)):
-            yield _Shot(k, TracedBeam(psi, counts[k], lights[k], unknowns.frames[k]))
+        of_each = self.potentials(unknowns), counts, self._lights(unknowns), unknowns.frames
+        return list(map(TracedBeam, *of_each))
 
     def _lights(self, unknowns: Unknowns) -> FloatArray:
         """The light that enters for each image."""
@@ -305,10 +307,10 @@ class Scene(PriorTerms):
         ]
         return np.stack(light) * np.exp(self.imperfect.shape_changes(common, separate))
 
-    def _seen(self, unknowns: Unknowns, shot: _Shot) -> _Seen:
+    def _seen(self, unknowns: Unknowns, k: int, traced: TracedBeam) -> _Seen:
         """An image without its brightness, and its derivatives."""
-        imperfect, k = self.imperfect, shot.number
-        rays = self.rays.image(shot.traced)
+        imperfect = self.imperfect
+        rays = self.rays.image(traced)
         image, slope = self._spread(k, rays, unknowns), np.ones(())
         derivatives: dict[str, FloatArray] = {}
         for part, each, size, number in imperfect.detector(unknowns.common, unknowns.separate[k]):
@@ -387,13 +389,6 @@ class Scene(PriorTerms):
         if not isinstance(width, float):
             return _spread(padded, width[::-1, ::-1])
         return padded if imperfect.blur else _spread(padded, width)
-
-
-class _Shot(NamedTuple):
-    """The number of an image, and its rays."""
-
-    number: int
-    traced: TracedBeam
 
 
 class _Effects(list[tuple[Part, FloatArray]]):
