@@ -185,20 +185,17 @@ class Scene(PriorTerms):
     ) -> tuple[float, Unknowns]:
         """Return the objective at fixed numbers of rays, and its derivatives."""
         value, slope = self._priors(unknowns)
-        strengths = self.strengths_with(unknowns)
         beams = self._traced(unknowns, counts)
         differentiated = self._of_each(partial(self._pulls, unknowns), beams)
-        for k, (of_image, of_brightness, view, scaled, pulls) in enumerate(differentiated):
+        for k, (of_image, of_brightness, view, scaled, _) in enumerate(differentiated):
             value += of_image
             slope.brightness[k] += of_brightness
             view.effects.add_pulls(slope, k, scaled)
-            self._add_potential_pulls(slope, unknowns, strengths[k], k, pulls.potential)
-            slope.frames[k] += pulls.frame
+        entering: list[_Entering] = []
         if self._frees_light:
-            of_beams = [pulls.beam for *_, pulls in differentiated]
             entering = self._entering(unknowns, [traced.beam for traced in beams])
-            self._add_beam_pulls(slope, of_beams, entering)
-        return value, self._only_free(slope)
+        pulls = [of_rays for *_, of_rays in differentiated]
+        return value, self._with_pulls(slope, unknowns, pulls, entering)
 
     def _pulls(
         self, unknowns: Unknowns, k: int, traced: TracedBeam
@@ -332,15 +329,6 @@ class Scene(PriorTerms):
         width = self.psf[k]
         return width**2 if isinstance(width, float) else 0.0
 
-    def _add_potential_pulls(
-        self, slope: Unknowns, unknowns: Unknowns, strengths: FloatArray, k: int, pull: FloatArray
-    ) -> None:
-        """Add derivatives by the potentials of an image's own, which have `strengths` in it."""
-        slope.potentials[:] += strengths[:, None, None] * pull
-        if (other := self.imperfect.other_strengths) is not None:
-            along = np.einsum("m,myx,yx->", other[k], unknowns.potentials, pull)
-            slope.common[self.imperfect.place("other_field")] += along
-
     def _entering(self, unknowns: Unknowns, lights: Sequence[FloatArray]) -> list[_Entering]:
         """The light of each image's beam, and its relative changes by the instrument's numbers."""
         changes = (
@@ -351,22 +339,34 @@ class Scene(PriorTerms):
             _Entering(light, _Effects(each)) for light, each in zip(lights, changes, strict=True)
         ]
 
-    def _add_beam_pulls(
-        self, slope: Unknowns, pulls: Sequence[FloatArray], entering: Sequence[_Entering]
-    ) -> None:
-        """Add derivatives by the light that enters."""
-        of_logarithm = np.stack(pulls) * np.stack([each.light for each in entering])
-        for k, each in enumerate(entering):
-            each.effects.add_pulls(slope, k, of_logarithm[k])
-        self.imperfect.pull_shapes(of_logarithm, slope.common, slope.separate)
+    def _with_pulls(
+        self,
+        slope: Unknowns,
+        unknowns: Unknowns,
+        pulls: Sequence[Pulls],
+        entering: Sequence[_Entering],
+    ) -> Unknowns:
+        """Add derivatives by the rays of each image, and return those by what is free.
 
-    def _only_free(self, slope: Unknowns) -> Unknowns:
+        The light that enters is left out where it is known.
+        """
+        strengths, other = self.strengths_with(unknowns), self.imperfect.other_strengths
+        for k, each in enumerate(pulls):
+            slope.potentials[:] += strengths[k][:, None, None] * each.potential
+            slope.frames[k] += each.frame
+            if other is not None:
+                along = np.einsum("m,myx,yx->", other[k], unknowns.potentials, each.potential)
+                slope.common[self.imperfect.place("other_field")] += along
+        if entering:
+            of_logarithm = np.stack([each.beam for each in pulls])
+            of_logarithm = of_logarithm * np.stack([each.light for each in entering])
+            for k, light in enumerate(entering):
+                light.effects.add_pulls(slope, k, of_logarithm[k])
+            self.imperfect.pull_shapes(of_logarithm, slope.common, slope.separate)
         frames = np.where(self.free_frames, slope.frames, 0.0)
         frames[0] = 0
-        return slope._replace(
-            brightness=np.where(self.free_brightness, slope.brightness, 0.0),
-            frames=frames,
-        )
+        brightness = np.where(self.free_brightness, slope.brightness, 0.0)
+        return slope._replace(brightness=brightness, frames=frames)
 
     def _inner(self, image: FloatArray) -> FloatArray:
         inner = self.rays.beyond
@@ -506,16 +506,16 @@ class Linear:
 
     def _with_columns(self, slope: Unknowns, columns: Sequence[FloatArray]) -> Unknowns:
         """Add derivatives by the columns of each Jacobian, and return those that are free."""
-        scene = self.scene
-        size = math.prod(scene.rays.shape)
-        for k, each in enumerate(columns):
-            psi = each[:size].reshape(scene.rays.shape)
-            scene._add_potential_pulls(slope, self.unknowns, self._strengths[k], k, psi)
-        if self._has_others:
-            of_beams = [each[size:-6].reshape(scene.beams.shape[1:]) for each in columns]
-            scene._add_beam_pulls(slope, of_beams, self._entering)
-            slope.frames[:] = [each[-6:] for each in columns]
-        return scene._only_free(slope)
+        scene, (inner, outer) = self.scene, (self.scene.rays.shape, self.scene.beams.shape[1:])
+        if not self._has_others:
+            pulls = [Pulls(each.reshape(inner), np.zeros(0), np.zeros(6)) for each in columns]
+            return scene._with_pulls(slope, self.unknowns, pulls, [])
+        size = math.prod(inner)
+        pulls = [
+            Pulls(each[:size].reshape(inner), each[size:-6].reshape(outer), each[-6:])
+            for each in columns
+        ]
+        return scene._with_pulls(slope, self.unknowns, pulls, self._entering)
 
     def _light_change(self, change: Unknowns, k: int) -> FloatArray:
         """The change of an image by numbers that act where it is seen."""
