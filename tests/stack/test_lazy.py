@@ -190,7 +190,7 @@ def test_a_source_for_each_shot(night, plans_made):
     assert "site" not in ragged.dims
     alone = invert(night.images[4], source=sources[4], options=free)
     np.testing.assert_array_equal(ragged.potential[4], alone.potential)
-    with pytest.raises(InputError, match=r"'site_flux' \(sites differ between shots"):
+    with pytest.raises(InputError, match=r"'site_flux' \(shots differ"):
         invert_stack(night.images, Recipe(options=free), source=sources, variables=["site_flux"])
     with pytest.raises(InputError, match="got 2 sources for 6 shots"):
         invert_stack(night.images, Recipe(options=OPTIONS), source=sources[:2])

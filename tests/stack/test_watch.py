@@ -60,24 +60,6 @@ def test_watch_equals_a_run(folder, out, tmp_path):
         assert (watched[name] > 0).all()
 
 
-def test_the_accuracy_decides_once_how_many_sites_all_shots_get(folder, out):
-    put(folder, 0, 1, 2)
-    options = InversionOptions(accuracy=0.3)
-    watched_once(folder, out, options=options)
-    chosen = StackStore(out).attributes["chosen_sites"]
-    put(folder, 3)
-    watched_once(folder, out, options=options)
-    store = StackStore(out)
-    assert store.attributes["chosen_sites"] == chosen
-    assert {report["n_sites"] for report in store.reports()} == {chosen}
-    from napari_shadowinv import run_stack
-
-    files = [folder / f"shot_{index}.npy" for index in range(3)]
-    run_store = out.with_name("run.shadowinv.zarr")
-    run_stack(files, run_store, Recipe(options=options), source=SOURCE)
-    assert StackStore(run_store).attributes["chosen_sites"] == chosen
-
-
 def test_file_that_pauses_half_written_is_inverted_again(folder, out):
     data = whole(1)
     put(folder, 0)
@@ -310,7 +292,6 @@ def test_it_is_said_once_that_the_folder_is_watched(folder, out):
         *("--set=run.max_shots=2", f"--set=run.settle={SETTLE}"),
     )
     assert result.stdout.count("Watching") == 1
-    assert "How many sites the first shots need" in result.stderr
 
 
 @pytest.mark.parametrize(("files", "code"), [(1, 0), (3, 130)])

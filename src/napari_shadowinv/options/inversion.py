@@ -50,9 +50,8 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
     accuracy: _Fraction = Field(
         default=0.01,
         description="Target discretisation error of the displacement (relative r.m.s.). Sites are "
-        "added until it is reached or falls below a fifth of the noise error; in a stack, the "
-        "first shots decide for all. Ignored with a number of sites, 'single' stages or a solver "
-        "other than 'newton'.",
+        "added until it is reached or falls below a fifth of the noise error. Ignored with a "
+        "number of sites, 'single' stages or a solver other than 'newton'.",
     )
     max_error: MaxError = 0.05
     floor: _Fraction = Field(

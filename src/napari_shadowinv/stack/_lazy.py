@@ -24,11 +24,9 @@ from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._plan import (
     Stack,
     attributes_of,
-    choose_sites,
     coordinates_of,
     describe_stack,
     dtype_of,
-    values_of_beam,
 )
 from napari_shadowinv.stack._shots import ArrayExposure, Exposure, Reader, read_shot
 from napari_shadowinv.stack._worker import AnyTask, Beam
@@ -153,11 +151,10 @@ def invert_stack(
     xarray.Dataset
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
         chunk, and ``converged``, ``flux_residual``, ``image_residual``, ``noise_error``,
-        ``discretisation_error`` and ``iterations``. Nothing is computed yet, except the first
-        shots if they decide the number of sites for the accuracy. Sites have no dimension
-        ``shot`` if all shots share a source. They are omitted if their number differs: with
-        a source for each shot and a free boundary or an automatic number of sites, or with
-        different masks. For a table, ``setup`` contains the setup of each shot as JSON.
+        ``discretisation_error`` and ``iterations``. Nothing is computed yet. Sites are omitted
+        where shots may differ in their number: without `InversionOptions.n_sites`, with masks of
+        their own, or with sources of their own and a free boundary. For a table, ``setup``
+        contains the setup of each shot as JSON.
 
     Raises
     ------
@@ -185,7 +182,7 @@ def invert_stack(
             "leave the section out"
         )
     stack = describe_stack(shots, recipe, source, mask, source_mask, reader, variables)
-    return _lazy_dataset(choose_sites(stack))
+    return _lazy_dataset(stack)
 
 
 def _invert(
@@ -265,17 +262,11 @@ def _lazy_dataset(stack: Stack) -> xarray.Dataset:
             meta=np.empty((0,) * (1 + len(dims)), dtype),
         )
 
-    shared = delayed(values_of_beam, pure=True)(beam, stack.task.recipe.options)
     variables: dict[str, Any] = {}
     for name, (dims, labels) in stack.task.labels.items():
         if name not in stack.task.variables:
             continue
-        if stack.is_shared(name):
-            shape = tuple(stack.sizes[dim] for dim in dims)
-            values = da.from_delayed(shared[name], shape, dtype=dtype_of(name))
-            variables[name] = (dims, values, labels)
-        else:
-            variables[name] = (("shot", *dims), of_each_shot(name, dims, dtype_of(name)), labels)
+        variables[name] = (("shot", *dims), of_each_shot(name, dims, dtype_of(name)), labels)
     setups = stack.setups
     if setups is not None:
         variables["setup"] = (("shot",), da.from_array(np.array(setups, "O"), 1), SETUPS_LABEL)

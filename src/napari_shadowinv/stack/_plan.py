@@ -1,7 +1,4 @@
-"""Plan of a stack before any shot is inverted: `describe_stack` returns a `Stack`.
-
-Its number of sites follows from the accuracy: `choose_sites`.
-"""
+"""Plan of a stack before any shot is inverted: `describe_stack` returns a `Stack`."""
 
 from __future__ import annotations
 
@@ -24,17 +21,15 @@ from napari_shadowinv._system.arrays import (
     unpack_array,
     unpack_mask,
 )
-from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import count_sites
-from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source, number_of_sites
+from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, split_address, text_of
 from napari_shadowinv.io.formats import format_of
 from napari_shadowinv.io.store import FORMAT
-from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline.fit_run import check_fit
@@ -61,13 +56,7 @@ from napari_shadowinv.stack._worker import (
     Beam,
     FitTask,
     InvertTask,
-    shared_plan,
-    threads_here,
-    try_shot,
 )
-
-MAX_TRIED_SHOTS = 10  # at the beginning of a stack
-_DECIDING_SHOTS = 3
 
 # Variables that are stored of an inversion, and of a fit, by default.
 STORED = ("potential", "displacement", "caustic", "mask")
@@ -78,8 +67,7 @@ FITTED = ("potential", "displacement", "displacement_uncertainty")
 class Stack:
     """Plan of a stack: its shots, the task of each, and everything that they share.
 
-    The beam of a table belongs to rows without source and mask, and is None if any has one. Nothing
-    is stored once for all rows, because a row that is added later may have its own.
+    The beam of a table belongs to rows without source and mask, and is None if any has one.
     """
 
     shots: Shots
@@ -89,23 +77,13 @@ class Stack:
     reader: str = ""  # name of the reader of the files
     dtype: str = "float64"  # of fields in a store
 
-    @property
-    def chooses_sites(self) -> bool:
-        """Whether the number of sites still has to be derived from the accuracy."""
-        is_adaptive = self.beam is not None and self.task.recipe.options.is_adaptive
-        return is_adaptive and isinstance(self.task, InvertTask)
-
-    def with_sites(self, n_sites: int) -> Stack:
-        assert isinstance(self.task, InvertTask)
-        return replace(self, task=self.task.with_sites(n_sites))
-
     @cached_property
     def sizes(self) -> dict[str, int]:
         height, width = self.task.shape
         sizes = {"shot": len(self.shots), "y": height, "x": width, "component": 2}
         for dims, *_ in self.task.masks.values():
             sizes |= zip(dims[-2:], self.task.inputs.shot.shape, strict=True)
-        if isinstance(self.task, FitTask):
+        if isinstance(self.task, FitTask) or self.task.recipe.options.is_adaptive:
             return sizes
         # Sites of shots with their own beams are stored only if they do not depend on the beam.
         beam = self.beam or Beam(self.task.shape, None, self.task.moved.mask)
@@ -138,18 +116,6 @@ class Stack:
             return f"estimated from each shot: {estimate.model_dump_json()}"
         return "uniform"
 
-    def is_shared(self, name: str) -> bool:
-        """Return whether all shots share a variable, which is stored once."""
-        if self.beam is None or self.task.by_row:
-            return False
-        return name in ("sites", "site_mass") or (name == "source" and self.beam.source is not None)
-
-    @property
-    def shot_task(self) -> AnyTask:
-        """The task without the variables that are stored once."""
-        names = tuple(name for name in self.task.variables if not self.is_shared(name))
-        return replace(self.task, variables=names)
-
     def changed(self, index: int, origin: dict[str, Any]) -> str:
         """Name the part of a shot that differs from its report; empty if none does."""
         shot, label = self.shots.items[index], self.shots.label(index)
@@ -166,40 +132,6 @@ class Stack:
 def _row_of(shot: Exposure) -> RowsExposure:
     assert isinstance(shot, RowsExposure)
     return shot
-
-
-def choose_sites(stack: Stack, should_stop: ShouldStop | None = None) -> Stack:
-    """Return the stack with the number of sites that its first shots need.
-
-    All shots that share a beam then share the sites. Shots that cannot be inverted are skipped; if
-    all of them are, the number is the default without an accuracy.
-    """
-    if not stack.chooses_sites:
-        return stack
-    return with_enough_sites(stack, needed_shares(stack, should_stop))
-
-
-def needed_shares(stack: Stack, should_stop: ShouldStop | None = None) -> list[float]:
-    """Return the share of the default number of sites that each of the first shots needs."""
-    assert stack.beam is not None
-    assert isinstance(stack.task, InvertTask)
-    most = count_sites(stack.beam.image, stack.task.recipe.options, mask=stack.beam.mask)
-    needed = []
-    for shot in stack.shots.items[:MAX_TRIED_SHOTS]:
-        result: Any = try_shot(stack.task, shot, stack.beam, 1, should_stop).result
-        if result is None:  # the error is reported when it is its turn
-            continue
-        needed.append(result.report.n_sites / most)
-        if len(needed) == _DECIDING_SHOTS:
-            break
-    return needed
-
-
-def with_enough_sites(stack: Stack, shares: list[float]) -> Stack:
-    """Return the stack with enough sites for each of these shares."""
-    # A margin has its own sites, which are not counted here.
-    most = number_of_sites(stack.task.shape, stack.task.recipe.options)
-    return stack.with_sites(max(4, round(max(shares, default=1.0) * most)))
 
 
 def describe_stack(
@@ -263,7 +195,7 @@ def _plan_inversion(
     per_shot = own_masks or any(row.source is not None for row in rows)
     beam = None if per_shot else _shared_beam(inputs, source)
     options = inputs.recipe.options
-    ragged = own_masks or (beam is None and (options.boundary == "free" or options.is_adaptive))
+    ragged = own_masks or options.is_adaptive or (beam is None and options.boundary == "free")
     chosen = _checked_variables(variables, inputs.recipe, ragged=ragged)
     if rows:  # the common masks are among those of each shot
         unmasked = index_masks(inputs.provenance.images, [(None, None)])
@@ -437,8 +369,8 @@ def _checked_variables(
         hint = " (it needs a setup)" if recipe.setup is None else ""
         if name in labels:
             hint = (
-                " (sites differ between shots with one source per shot and a free boundary or no "
-                "given number of sites, or with masks of their own)"
+                " (shots differ in their number of sites, unless options.n_sites states it, the "
+                "shots have no masks of their own and, with a free boundary, share their source)"
             )
         raise InputError(
             f"there is no variable {name!r}{hint}: expected one or more of {', '.join(available)}"
@@ -461,19 +393,6 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
 def attributes_of(stack: Stack) -> dict[str, str]:
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.task.setup).attrs
     return {"format": FORMAT, **attributes, **stack.task.attributes}
-
-
-def values_of_beam(beam: Beam, options: InversionOptions) -> dict[str, Any]:
-    """Return the variables that all shots share, by name; also a task of dask."""
-    if options.threads is None:
-        options = options.model_copy(update={"threads": threads_here()})
-    plan = shared_plan(beam, options)
-    level = plan.levels[-1]
-    return {
-        "sites": level.sites - plan.margin_width,
-        "site_mass": level.mass * plan.unit,
-        "source": None if beam.source is None else check_source(beam.source, beam.mask),
-    }
 
 
 def dtype_of(name: str) -> Any:

@@ -56,21 +56,18 @@ from napari_shadowinv.stack._plan import (
     STORED,
     Stack,
     attributes_of,
-    choose_sites,
     coordinates_of,
     describe_stack,
     dtype_of,
-    values_of_beam,
 )
 from napari_shadowinv.stack._schedulers import Scheduler, is_local, scheduler_for
 from napari_shadowinv.stack._shots import Reader, differences, read_shot
-from napari_shadowinv.stack._worker import InvertTask, ShotOutcome, TaskContext
+from napari_shadowinv.stack._worker import ShotOutcome, TaskContext
 
 if TYPE_CHECKING:
     import xarray
 
 WATCHING = "watching"  # in place of the scheduler's name
-_CHOSEN_SITES = "chosen_sites"  # attribute: number of sites from the accuracy and the first shots
 _ALTERNATIVES = "use the same, overwrite the store, or choose another name"
 
 
@@ -239,9 +236,6 @@ def run_stack(
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
         with _resumable(), scheduler_for(scheduler, run.workers) as chosen:
             if store is None:
-                if stack.chooses_sites:
-                    prepare("how many sites the first shots need")
-                stack = choose_sites(stack, should_stop)
                 store = create_store(path, contents_of(stack), overwrite=run.overwrite)
             elif arrived:
                 store = append_shots(store, stack)
@@ -320,7 +314,7 @@ class _Run:
     def run_on(self, scheduler: Scheduler, portion: int = 1000) -> None:
         """Run all pending shots, a portion at a time, and summarise their reports."""
         stack, items = self._stack, self._stack.shots.items
-        context = TaskContext(ShotWriter.of(self._store), stack.shot_task, scheduler.workers)
+        context = TaskContext(ShotWriter.of(self._store), stack.task, scheduler.workers)
         self.report(scheduler.name)
         try:
             for first in range(0, len(self._todo), portion):
@@ -338,9 +332,7 @@ class _Run:
 
 def contents_of(stack: Stack) -> Contents:
     identity = {name: value for name, value in _identity(stack).items() if value}
-    attributes: dict[str, Any] = {**attributes_of(stack), **identity}
-    if isinstance(stack.task, InvertTask) and stack.task.sites_chosen:
-        attributes[_CHOSEN_SITES] = stack.task.recipe.options.n_sites
+    attributes = {**attributes_of(stack), **identity}
     return Contents(stack.sizes, _variables(stack), _coordinates(stack), attributes)
 
 
@@ -369,11 +361,7 @@ def _variables(stack: Stack) -> dict[str, StoreArray]:
             continue
         exact = dtype_of(name).kind != "f" or "site" in dims
         stored = dtype_of(name) if exact else np.dtype(stack.dtype)
-        if stack.beam is not None and stack.is_shared(name):
-            values = np.asarray(values_of_beam(stack.beam, stack.task.recipe.options)[name])
-            variables[name] = StoreArray(dims, stored, labels, values)
-        else:
-            variables[name] = StoreArray(("shot", *dims), stored, labels, None)
+        variables[name] = StoreArray(("shot", *dims), stored, labels)
     for name, (dims, pixels, labels) in stack.task.masks.items():
         variables[name] = StoreArray(dims, np.dtype(bool), labels, pixels)
     return variables
@@ -408,7 +396,8 @@ def _mask_text(mask: BoolArray | None) -> str:
 def resume(store: StackStore, stack: Stack) -> Stack:
     """Return the stack in the order of its store, new shots last; an `InputError` if it differs."""
     shots = stack.shots.reordered(_order(store, stack.shots.names))
-    stack = match_store(store, replace(stack, shots=shots))
+    stack = replace(stack, shots=shots)
+    match_store(store, stack)
     for index in np.flatnonzero(store.statuses() == DONE):
         changed = stack.changed(int(index), store.report(int(index)))
         if changed:
@@ -436,10 +425,8 @@ def reopen_damaged(store: StackStore) -> StackStore:
     return store
 
 
-def match_store(store: StackStore, stack: Stack) -> Stack:
-    """Return the stack with the store's number of sites; an `InputError` if they do not match."""
-    if stack.chooses_sites and _CHOSEN_SITES in store.attributes:
-        stack = stack.with_sites(int(store.attributes[_CHOSEN_SITES]))
+def match_store(store: StackStore, stack: Stack) -> None:
+    """Refuse a stack with an `InputError` that is not the store's."""
     identity = _identity(stack, len(store.names))
     for name, value in {**identity, "package_version": __version__}.items():
         before = str(store.attributes.get(name, ""))
@@ -449,7 +436,6 @@ def match_store(store: StackStore, stack: Stack) -> Stack:
                 f"{store.path} was started with {article}different {name.replace('_', ' ')} "
                 f"({_difference(before, value)}): {_ALTERNATIVES}"
             )
-    return stack
 
 
 def _order(store: StackStore, names: tuple[str, ...]) -> list[int]:

@@ -195,7 +195,6 @@ class InvertTask(Task):
     kind = "inversion"
 
     estimate: Estimate | None = None  # of the source of rows without one
-    sites_chosen: bool = False  # whether the number of sites follows from the accuracy
 
     @property
     def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
@@ -214,27 +213,12 @@ class InvertTask(Task):
     @property
     def identity(self) -> dict[str, str]:
         """The choices that affect the results, as JSON."""
-        options = self.recipe.options
-        if self.sites_chosen:
-            options = options.model_copy(update={"n_sites": None})
         instrument = self.recipe.instrument.stated
         return {
             "fit": "",
-            "options": options.model_dump_json(exclude={"threads"}),
+            "options": self.recipe.options.model_dump_json(exclude={"threads"}),
             "instrument": json.dumps(instrument) if instrument else "",
         }
-
-    def with_sites(self, n_sites: int) -> InvertTask:
-        """Return the task with the number of sites derived from the accuracy."""
-        options = self.recipe.options.model_copy(update={"n_sites": n_sites})
-        provenance = self.inputs.provenance
-        recipe = provenance.recipe.model_copy(update={"options": options})
-        inputs = replace(
-            self.inputs,
-            recipe=self.recipe.model_copy(update={"options": options}),
-            provenance=provenance.model_copy(update={"recipe": recipe}),
-        )
-        return replace(self, inputs=inputs, sites_chosen=True)
 
     def run(
         self,
@@ -272,9 +256,7 @@ class InvertTask(Task):
         if options.threads is None:
             options = options.model_copy(update={"threads": threads_here(workers)})
         inputs = replace(inputs, recipe=recipe.model_copy(update={"options": options}))
-        sites = _SharedSites(beam=beam)
-        inversion = run_prepared(inputs, ready, cache=sites, should_stop=should_stop)
-        return _with_sites_reason(inversion) if self.sites_chosen else inversion
+        return run_prepared(inputs, ready, cache=_SharedSites(beam=beam), should_stop=should_stop)
 
     def _inputs_of_row(self, row: Shot, beam: Beam | None, source: AnyArray | None) -> Inputs:
         """Return the image of a row over its brightness, with its own source, mask and setup."""
@@ -428,17 +410,6 @@ class FitTask(Task):
 
 
 AnyTask = InvertTask | FitTask
-
-
-def _with_sites_reason(inversion: Inversion) -> Inversion:
-    """Add the reason for the number of sites, and a warning if it does not suffice."""
-    reason = "as many as the first shots needed for the accuracy"
-    inversion = replace(inversion, report=replace(inversion.report, sites_reason=reason))
-    if inversion.errors is None:
-        return inversion
-    why = "with the sites of the first shots"
-    caution = inversion.errors.accuracy_caution(inversion.options.accuracy, why)
-    return inversion.with_warnings(filter(None, [caution]))
 
 
 def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:

@@ -37,11 +37,8 @@ from napari_shadowinv.pipeline.run_options import WatchOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._arrivals import Arrivals, checked_folder
 from napari_shadowinv.stack._plan import (
-    MAX_TRIED_SHOTS,
     Stack,
     describe_stack,
-    needed_shares,
-    with_enough_sites,
 )
 from napari_shadowinv.stack._run import (
     WATCHING,
@@ -61,7 +58,7 @@ from napari_shadowinv.stack._shots import (
     stamp,
 )
 from napari_shadowinv.stack._status_file import status_file
-from napari_shadowinv.stack._worker import ShotOutcome, TaskContext, try_shot
+from napari_shadowinv.stack._worker import ShotOutcome, TaskContext
 
 if TYPE_CHECKING:
     import xarray
@@ -89,7 +86,6 @@ class Watch:
         self._arrivals, self._on_progress, self._should_stop = arrivals, on_progress, should_stop
         self.store: GrowingStore | None = None
         self._stack: Stack | None = None
-        self._is_ready = False  # whether the number of sites is known
         # Reports of failures before the first good shot, which creates the store or fits it.
         self._early: dict[str, dict[str, Any]] = {}
         self._doubtful: set[str] = set()
@@ -127,7 +123,7 @@ class Watch:
             return
         store = StackStore(self._path)
         if self._stack is not None:
-            self._stack, self._is_ready = match_store(store, self._stack), True
+            match_store(store, self._stack)
         remove_unfinished(self._path)
         summarise(store)  # the last watch may have been killed before it did
         again = (PENDING, SKIPPED, *([FAILED] if self._options.redo_failed else []))
@@ -209,7 +205,7 @@ class Watch:
         if self._options.latest:
             self._skip(waiting[:-1])
             del waiting[:-1]
-        if self._options.latest or not self._is_ready:
+        if self._options.latest or self.store is None:
             most = 1
         if self._options.max_shots is not None:
             most = min(most, self._options.max_shots - self._ended)
@@ -273,7 +269,7 @@ class Watch:
         # Alone, a shot has all the cores.
         workers = min(len(files), scheduler.workers or 1)
         results: dict[int, Any] = {}
-        context = TaskContext(store.writer, self._stack.shot_task, workers, results)
+        context = TaskContext(store.writer, self._stack.task, workers, results)
         outcomes = scheduler.outcomes(numbered, self._stack.beam, context, self._should_stop)
         with closing(outcomes):
             for outcome in outcomes:
@@ -317,32 +313,21 @@ class Watch:
         self._note_outcome(name, reason, is_doubtful=False)
         self.report(name=name, outcome=ShotOutcome(len(self._early) - 1, FAILED, 0.0, reason))
 
-    def _prepare(self, name: str) -> str:
+    def _prepare(self, name: str, most: int = 10) -> str:
         """Describe the stack by its first shots; return why that is impossible so far."""
-        names = [name, *self._arrivals.waiting, *self._skipped]
-        stack = self._stack
-        if self._is_ready:
+        if self._stack is not None:
             return ""
-        if stack is None:
-            known: Iterable[str] = ()
-            if self.store is not None:
-                # Earlier shots are a better reference for the size of the images.
-                known = (done for done in self.store.names_of(DONE) if self._is_there(done))
-            try:
-                stack = self._stack_of([*islice(known, MAX_TRIED_SHOTS), *names[:MAX_TRIED_SHOTS]])
-            except NoShotError as error:
-                return error.reason
-            if self.store is not None:
-                stack = match_store(StackStore(self._path), stack)
-        if stack.chooses_sites:
-            self.report(stage="how many sites the first shots need")
-            tried = replace(stack, shots=self._stack_of(names[:MAX_TRIED_SHOTS]).shots)
-            shares = needed_shares(tried, self._should_stop)
-            if not shares:
-                shot = self._shot(name)
-                return try_shot(stack.task, shot, stack.beam, 1, self._should_stop).failure
-            stack = with_enough_sites(stack, shares)
-        self._stack, self._is_ready = stack, True
+        known: Iterable[str] = ()
+        if self.store is not None:
+            # Earlier shots are a better reference for the size of the images.
+            known = (done for done in self.store.names_of(DONE) if self._is_there(done))
+        names = [name, *self._arrivals.waiting, *self._skipped]
+        try:
+            self._stack = self._stack_of([*islice(known, most), *names[:most]])
+        except NoShotError as error:
+            return error.reason
+        if self.store is not None:
+            match_store(StackStore(self._path), self._stack)
         return ""
 
     def _is_there(self, name: str) -> bool:
@@ -387,8 +372,7 @@ def watch_stack(
     out : str or Path
         The store, ``name.shadowinv.zarr``, created once a shot can be read.
     recipe, source, mask, source_mask, reader
-        As for `run_stack`; one source for all shots. Without a number of sites, the first shots
-        decide it for all: up to three that exist at the start, or the first that arrives.
+        As for `run_stack`; one source for all shots.
     watch : WatchOptions, optional
         Choices of the watch: names of the files, when to stop, and the store. A mapping
         is converted.
