@@ -44,6 +44,7 @@ from napari_shadowinv.preprocessing import (
     Bin,
     Choice,
     Crop,
+    Dark,
     IsotropicEstimate,
     LowPassFilter,
     MeasuredSource,
@@ -261,6 +262,16 @@ def test_a_step_of_a_recipe_is_changed_in_its_place() -> None:
     moved = (steps[2], steps[1])
     again = with_steps(moved, ["low-pass width=4"], {"bin": 5})
     assert [step.values() for step in again] == [{"width": 4}, {"factor": 5}]
+
+
+@pytest.mark.parametrize("file", ["'dark frame.tif'", '"dark frame.tif"', "dark' 'frame.tif"])
+def test_quotes_keep_a_space_in_a_value(file: str) -> None:
+    assert with_steps((), [f"dark {file}"], {}) == (Dark(level=Path("dark frame.tif")),)
+
+
+def test_a_quotation_mark_alone_is_refused() -> None:
+    with pytest.raises(InputError, match="second quotation mark"):
+        with_steps((), ["dark 'dark frame.tif"], {})
 
 
 OTHER = {

@@ -5,6 +5,7 @@ The models check the values; a wrong key is refused with the nearest right one.
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -193,8 +194,13 @@ def source_from(text: str, before: Estimate | None) -> Estimate:
 
 
 def _parse_choice(flag: str, text: str, choices: Mapping[str, Any]) -> tuple[Any, dict[str, str]]:
-    """Return the choice that a text names, and its parameters."""
-    name, *words = text.split() or [""]
+    """Return the choice that a text names, and its parameters; quotes keep a space in one."""
+    lexer = shlex.shlex(text, posix=True)
+    lexer.whitespace_split, lexer.commenters, lexer.escape = True, "", ""
+    try:
+        name, *words = [*lexer] or [""]
+    except ValueError:
+        raise InputError(f"{flag} is '{text}': expected a second quotation mark") from None
     kind = choices.get(name)
     if kind is None:
         raise InputError(f"{flag} is '{text}': {suggestion(name, choices)}")
