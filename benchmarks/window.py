@@ -60,7 +60,7 @@ class Window:
         self.viewer.window._qt_window.resize(1280, 800)
         self.viewer.add_image(shot, name="shot")
         _, self.tool = self.viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert shot")
-        self.tool.options.set_values({"n_sites": n_sites})
+        self.tool.options.restore({"n_sites": n_sites})
         self.drawn = 0
         self.viewer.window._qt_viewer.canvas.native.aboutToCompose.connect(self._on_draw)
         self.settle(2)

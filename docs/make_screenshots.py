@@ -205,7 +205,7 @@ def proton_windows() -> None:
         invert_shot = open_widget(viewer, "Invert shot")
         invert_shot.setup.picker.set_kind("proton")
         fields = invert_shot.setup.picker.form
-        fields.set_values(PROTON_FIELDS)
+        fields.restore(PROTON_FIELDS)
         invert_shot.setup.picker.changed.emit()
         photograph(viewer, "tutorial-proton-setup.png", close=False)
         press_run(invert_shot)

@@ -14,6 +14,7 @@ from napari_shadowinv.physics.beam import (
     geometry_text,
     number_in_unit,
     setup_warnings,
+    text_in_unit,
 )
 from napari_shadowinv.physics.setup import SETUPS, OpticalSetup, ProtonSetup, setup_from_dict
 from napari_shadowinv.pipeline import read_recipe
@@ -51,10 +52,35 @@ def test_setup_with_units_equals_the_one_in_si() -> None:
         ("1 GeV", "MeV", 1000.0),
         ("14.7 MeV", "MeV", 14.7),
         ("25 m", "m", 25.0),
+        ("0.28", "m", 0.28),
+        ("inf", "m", math.inf),
+        ("2e19 cm^-3", "m⁻³", 2e25),
+        ("97 MG µm", "MG µm", 97.0),
+        ("1.5 px", "px", 1.5),
+        ("1 ns", "s", 1e-9),
+        ("1e-3", "", 1e-3),
     ],
 )
 def test_number_with_a_unit_is_exact(text: str, unit: str, number: float) -> None:
     assert number_in_unit(text, unit) == number
+    assert number_in_unit(text_in_unit(number, unit), unit) == number
+
+
+@pytest.mark.parametrize(
+    ("text", "unit"),
+    [("1.3 kg", "m"), ("abc", "m"), ("2 m", ""), ("1 mm mm", "m"), ("", "m"), ("2 m", "m⁻³")],
+)
+def test_text_without_a_number_in_the_unit_is_refused(text: str, unit: str) -> None:
+    with pytest.raises(ValueError, match="expected a number"):
+        number_in_unit(text, unit)
+
+
+def test_lengths_and_energies_get_the_prefix_of_their_size() -> None:
+    shown = [text_in_unit(size, "m") for size in (145e-6, 0.28, 8.1e-7, 25.0, math.inf, 0.0)]
+    assert shown == ["145 µm", "280 mm", "810 nm", "25 m", "inf", "0 m"]
+    assert text_in_unit(14.7, "MeV") == "14.7 MeV"
+    assert text_in_unit(3000, "MeV") == "3 GeV"
+    assert text_in_unit(1.65e25, "m⁻³") == "1.65e+25 m⁻³"
 
 
 def test_energy_with_a_prefix_is_in_mev() -> None:

@@ -4,7 +4,7 @@
 - whether its numbers are plausible: `setup_warnings`, `deflection_warnings`; for people to
   check: `geometry_text`, `field_of_view_text`
 - the gradient of a potential in pixels: `displacement_from_potential`
-- numbers with units in text, such as ``"14.7 MeV"`` in a TOML file: `number_in_unit`
+- numbers with units in text, such as ``"14.7 MeV"``: `number_in_unit`, `text_in_unit`
 
 A setup may be possible but unlike any experiment, mostly because of a unit: mm, µm or cm typed
 where m is expected, eV where MeV is. The limits of its numbers leave room for every common
@@ -19,6 +19,7 @@ import re
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
@@ -31,11 +32,13 @@ from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 
-_QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[eE]([+-]?\d+))?\s*([^\W\d_]+)")
+_QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[eE]([+-]?\d+))?\s*(.*)")
 _UNIT_IN_TITLE = re.compile(r"\(([^()]+)\)$")
+_UNIT = re.compile(r"([fpnµμumckMGT]?)(m|eV|s)\^?(-?\d*)")
+_SUPERSCRIPTS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _POWERS = {"f": -15, "p": -12, "n": -9, "µ": -6, "μ": -6, "u": -6, "m": -3, "c": -2, "": 0}
 _POWERS |= {"k": 3, "M": 6, "G": 9, "T": 12}
-_BASES = ("eV", "m")
+_SHOWN_PREFIXES = {-15: "f", -12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 _EXAMPLES = {"m": "1.3 mm", "MeV": "14.7 MeV"}
 
 
@@ -45,38 +48,57 @@ def unit_in_title(title: str | None) -> str:
     return match[1] if match else ""
 
 
-def takes_prefixes(unit: str) -> bool:
-    """Return whether numbers in a unit may be given with another prefix: in mm instead of m."""
-    return any(unit.removesuffix(base) in _POWERS for base in _BASES if unit.endswith(base))
-
-
 def number_in_unit(text: str, unit: str) -> float:
-    """Read a number with a unit, exact to the last digit.
+    """Read a number, exact to the last digit.
 
     Parameters
     ----------
     text : str
-        Such as ``"1.3 mm"``.
+        Such as ``"1.3 mm"``, ``"1e19 cm⁻³"`` or ``"inf"``; a bare number is in `unit`.
     unit : str
-        Unit of the answer that `takes_prefixes`, such as "m" or "MeV".
+        Unit of the answer, such as "m" or "MeV"; may be empty.
 
     Raises
     ------
     ValueError
         If the text is no number, or its unit does not measure the same.
     """
-    base = next(base for base in _BASES if unit.endswith(base))
-    match = _QUANTITY.fullmatch(text.strip())
+    text = text.strip()
+    if text.lower() in ("inf", "infinite", "∞"):
+        return math.inf
     example = _EXAMPLES.get(unit, f"8 {unit}")
     expected = f"expected a number in {unit}, or one with a unit such as '{example}'"
-    if match is None:
-        raise ValueError(expected)
+    match = _QUANTITY.fullmatch(text)
+    if match is None or (match[3] and not unit):
+        raise ValueError(expected if unit else "expected a number")
     digits, exponent, name = match.groups()
-    prefix = name.removesuffix(base)
-    if not name.endswith(base) or prefix not in _POWERS:
-        raise ValueError(f"the unit '{name}' cannot be converted to {unit}; {expected}")
-    power = int(exponent or 0) + _POWERS[prefix] - _POWERS[unit.removesuffix(base)]
+    power = int(exponent or 0)
+    if name not in ("", unit):
+        ratio = _power_of_ratio(name, unit)
+        if ratio is None:
+            raise ValueError(f"the unit '{name}' cannot be converted to {unit}; {expected}")
+        power += ratio
     return float(f"{digits}e{power}")
+
+
+def text_in_unit(value: float, unit: str) -> str:
+    """Write a number with its unit, of which a length or an energy has a suitable prefix."""
+    number = f"{value:.12g}"
+    match = _UNIT.fullmatch(unit)
+    if match is None or match[3] or not math.isfinite(value) or value == 0:
+        return f"{number} {unit}" if unit and math.isfinite(value) else number
+    decimal, own_power = Decimal(number), _POWERS[match[1]]
+    power = 3 * ((decimal.adjusted() + own_power) // 3)
+    power = min(max(power, min(_SHOWN_PREFIXES)), max(_SHOWN_PREFIXES))
+    return f"{float(decimal.scaleb(own_power - power)):.12g} {_SHOWN_PREFIXES[power]}{match[2]}"
+
+
+def _power_of_ratio(unit: str, other: str) -> int | None:
+    """Return the power of ten by which a unit exceeds another; None if they measure no common."""
+    first, second = (_UNIT.fullmatch(each.translate(_SUPERSCRIPTS)) for each in (unit, other))
+    if first is None or second is None or first.groups()[1:] != second.groups()[1:]:
+        return None
+    return (_POWERS[first[1]] - _POWERS[second[1]]) * int(first[3] or 1)
 
 
 @dataclass(frozen=True)
@@ -215,12 +237,7 @@ class BeamSetup(CheckedModel):
     def _read_unit(cls, value: Any, info: ValidationInfo) -> Any:
         """Turn a text such as "14.7 MeV" into the number in the field's unit."""
         unit = unit_in_title(cls.model_fields[info.field_name or ""].title)
-        if not isinstance(value, str) or not takes_prefixes(unit):
-            return value
-        try:
-            return float(value)
-        except ValueError:
-            return number_in_unit(value, unit)
+        return number_in_unit(value, unit) if isinstance(value, str) and unit else value
 
     @model_validator(mode="after")
     def _one_pixel_size(self) -> BeamSetup:

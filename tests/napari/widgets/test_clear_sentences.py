@@ -11,8 +11,8 @@ import pytest
 from napari.components import ViewerModel
 
 from helpers.reports import texts_of
+from napari_shadowinv._napari.form import StepsSection
 from napari_shadowinv._napari.viewer_sync import error_text
-from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets._products import ProductForm
 from napari_shadowinv._napari.widgets.forward_model import input_field
 from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
@@ -42,7 +42,7 @@ def test_a_doubt_of_a_setup_stands_in_the_form_only(
     image = synthetic_image(ellipse_pair((40, 52)).displacement)
     viewer.add_image(image, name="shot")
     tool = opened(InvertShot)
-    tool.options.set_values({"n_sites": 200})
+    tool.options.restore({"n_sites": 200})
     swapped = {"source_object_distance": 1.0, "object_image_distance": 0.01, "energy": 14.7}
     tool.setup.show_setup(ProtonSetup(pixel_size=1e-6, **swapped).model_dump())
     doubt = tool.setup.warning_label.text()
@@ -110,7 +110,7 @@ def test_a_file_that_fails_is_not_shown_in_place_of_the_last_shot(
     window: Any, open_widget: Any, qtbot: Any, tmp_path: Path
 ) -> None:
     tool = open_widget("Invert stack")
-    tool.options.set_values({"n_sites": 100})
+    tool.options.restore({"n_sites": 100})
     tool.shots.set_kind("folder")
     tool.shots.folder.folder.edit.setText(str(tmp_path))
     tool.shots.folder.pattern.setText("*.npy")

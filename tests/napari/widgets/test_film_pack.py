@@ -352,7 +352,7 @@ def test_new_pack_is_described_in_the_window(
         assert "expected thickness, unit" in dialog._problem.text()
         assert not dialog._problem.isHidden()
         dialog.table.item(0, 2).setText("13 um Al; 25 um Fe")
-        dialog.form.set_values({"seen_from": "source"})
+        dialog.form.restore({"seen_from": "source"})
         dialog.accept()
         return True
 

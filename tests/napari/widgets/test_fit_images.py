@@ -79,7 +79,7 @@ def tool(window: Any, open_widget: Callable[[str], Any]) -> Any:
     for energy, setup, image in zip(ENERGIES, SETUPS, images(), strict=True):
         window.add_image(image, name=f"{energy} MeV", metadata=metadata_for("shot", "", setup))
     widget = open_widget("Fit several images")
-    widget.options.set_values(QUICK)
+    widget.options.restore(QUICK)
     return widget
 
 
@@ -184,8 +184,8 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
 
 
 def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qtbot: Any) -> None:
-    tool.options.set_values({"samples": 2, "max_iterations": 5, "spacing": 0.25})
-    tool.instrument.set_values({"beam_rms": 0.0})
+    tool.options.restore({"samples": 2, "max_iterations": 5, "spacing": 0.25})
+    tool.instrument.restore({"beam_rms": 0.0})
     result = run(tool)
     assert result.verdict is Verdict.DETERMINED
     error = result.fields[0].displacement - TRUTH
@@ -255,7 +255,7 @@ def test_two_fields_are_told_apart_and_named(
         noisy = synthetic_image(moved) + rng.normal(0, 0.01, SHAPE)
         window.add_image(noisy, name=f"{setup.energy}", metadata=metadata)
     tool = open_widget("Fit several images")
-    tool.options.set_values(QUICK)
+    tool.options.restore(QUICK)
     tool.fields.restore("B and E")
     result = run(tool)
     assert [field.name for field in result.fields] == ["B", "E"]
@@ -351,7 +351,7 @@ def test_without_a_setup_strengths_are_asked_for(window: Any, open_widget: Any, 
         noise = np.random.default_rng(1).normal(0, 0.01, SHAPE)
         window.add_image(synthetic_image(strength * TRUTH) + noise, name=name)
     tool = open_widget("Fit several images")
-    tool.options.set_values(QUICK)
+    tool.options.restore(QUICK)
     assert tool.images.table.horizontalHeaderItem(BEAM).text() == "Strength"
     with pytest.raises(InputError, match="'weak' has no strength"):
         tool.request()
@@ -468,7 +468,7 @@ def test_a_fit_is_cancelled_at_once(
     # Also after a first drawing that comes before the second step, which alone shows nothing.
     monkeypatch.setattr(_fitting, "_REDRAW_MS", REDRAW_MS)
     tool.view._redraw_timer.setInterval(REDRAW_MS)
-    tool.options.set_values({"samples": 1000})
+    tool.options.restore({"samples": 1000})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.progress.history), timeout=PATIENCE)
     # The first start has no objective yet.
@@ -536,7 +536,7 @@ def test_each_stage_ends_soon_after_cancel(
     usual = {**QUICK, "samples": 1000, "max_iterations": 100}
     before = list(window.layers)
     for stage in stages:
-        tool.options.set_values(usual | BEFORE.get(stage, {}))
+        tool.options.restore(usual | BEFORE.get(stage, {}))
         tool.panel.button.click()
         course = tool.panel.runner.tag.progress
         qtbot.waitUntil(
@@ -580,7 +580,7 @@ def test_a_window_is_closed_during_a_fit(
         viewer.add_image(image, name=f"{energy} MeV", metadata=metadata_for("shot", "", setup))
     _, tool = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Fit several images")
     tool.view._redraw_timer.setInterval(REDRAW_MS)
-    tool.options.set_values({"samples": 1000})
+    tool.options.restore({"samples": 1000})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: len(tool.panel.runner.tag.progress.history) > 100, timeout=PATIENCE)
     stop = tool.panel.runner._box.stop
@@ -610,7 +610,7 @@ def test_closing_the_dock_ends_the_fit(
     window: Any, tool: Any, qtbot: Any, messages: list[str], traced_images: list[int]
 ) -> None:
     tool.view._redraw_timer.setInterval(REDRAW_MS)
-    tool.options.set_values({"samples": 1000})
+    tool.options.restore({"samples": 1000})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.progress.history), timeout=PATIENCE)
     stop = tool.panel.runner._box.stop
@@ -670,7 +670,7 @@ def test_refine_starts_from_the_last_inversion(
     shot = images()[0][MIDDLE]
     window.add_image(shot, name="shot", metadata=metadata_for("shot", "", SETUPS[0]))
     tool = open_widget("Invert shot")
-    tool.options.set_values({"n_sites": 600})
+    tool.options.restore({"n_sites": 600})
     tool.refine_section.button.click()
     assert "there is no inversion of this image" in messages.pop().lower()
     tool.panel.button.click()
@@ -836,7 +836,7 @@ def opened(window: Any, open_widget: Any, files: list[Path]) -> Any:
     for path in files:
         window.open(str(path), plugin="napari-shadowinv")
     tool = open_widget("Fit several images")
-    tool.options.set_values(QUICK)
+    tool.options.restore(QUICK)
     tool.source.set_kind("layer")
     tool.source.layers.layer = window.layers["beam"]
     tool.setup.show_setup(SETUPS[0].model_dump())
@@ -884,7 +884,7 @@ def test_a_refined_inversion_is_made_again(
     tifffile.imwrite(tmp_path / "fast.tif", np.loadtxt(files[0])[MIDDLE])
     window.open("fast.tif", plugin="napari")
     tool = open_widget("Invert shot")
-    tool.options.set_values({"n_sites": 500})
+    tool.options.restore({"n_sites": 500})
     tool.setup.show_setup(SETUPS[0].model_dump())
     tool.steps.add("low-pass")
     tool.panel.button.click()
@@ -956,7 +956,7 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
         pradreader(tmp_path / name, image, beam, hidden)
         window.open(name, plugin="napari-shadowinv")
     tool = open_widget("Fit several images")
-    tool.options.set_values(QUICK)
+    tool.options.restore(QUICK)
     tool.setup.show_setup(SETUPS[0].model_dump())
     type_in(tool, 1, BEAM, "6")
     assert tool.masks.layer is not None
@@ -966,7 +966,7 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     save(window, result, tmp_path / "window.shadowinv")
     assert "bit for bit" in command("rerun", "window.shadowinv", "--out", "again.shadowinv")
     single = open_widget("Invert shot")
-    single.options.set_values({"n_sites": 500})
+    single.options.restore({"n_sites": 500})
     single.image.layer = window.layers["b"]
     single.masks.layer = None
     single.source.set_kind("layer")
@@ -1066,7 +1066,7 @@ def test_a_recipe_is_the_same_for_window_and_command(
     command("fit", "fast.txt", "slow.txt", *words)
     assert_same(Fit.from_dataset(read(tmp_path / "fit.shadowinv")), run(tool))
     # Back again, into controls that ask for something else.
-    tool.options.set_values({})
+    tool.options.restore({})
     tool.source.set_kind("unknown")
     for row in (0, 1):
         type_in(tool, row, PSF, "0")

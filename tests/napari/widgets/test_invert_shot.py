@@ -18,6 +18,7 @@ import pytest
 from napari.utils import progress
 from qtpy.QtWidgets import QComboBox
 
+from helpers.forms import enter
 from helpers.jobs import run_job
 from helpers.reports import texts_of
 from napari_shadowinv import Instrument, InversionOptions, ProtonSetup, invert, read
@@ -49,7 +50,7 @@ PATIENCE = 60_000  # ms; a machine may have other things to do
 def tool(window: Any, open_widget: Callable[[str], Any], shot: Array) -> Any:
     window.add_image(shot, name="shot")
     widget = open_widget("Invert shot")
-    widget.options.set_values(FEW)
+    widget.options.restore(FEW)
     return widget
 
 
@@ -104,7 +105,7 @@ def test_the_window_thread_computes_nothing_during_a_run(
 ) -> None:
     shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement)
     window.layers["shot"].data = shot
-    tool.options.set_values({"n_sites": 40_000})
+    tool.options.restore({"n_sites": 40_000})
     qtbot.wait(300)
     tool.show_result = lambda *_: None
     rooms: set[str] = set()
@@ -294,7 +295,7 @@ def test_cancel_ends_the_work_itself(
     slow.set()
     shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement)
     window.layers["shot"].data = shot
-    tool.options.set_values({"tolerance": 1e-12, "lloyd_iterations": 1000, "lloyd_tolerance": 0})
+    tool.options.restore({"tolerance": 1e-12, "lloyd_iterations": 1000, "lloyd_tolerance": 0})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: "Placing the sites" in tool.panel.status.text(), timeout=PATIENCE)
     tool.panel.runner._patience = math.inf
@@ -323,7 +324,7 @@ def test_a_run_replaces_the_last_result_of_its_shot(
     layer_of(window, "caustic").visible = True
     layer_of(window, "sites").visible = True
     tool.setup.show_setup(proton_setup.model_dump())
-    tool.options.set_values({"n_sites": 300})
+    tool.options.restore({"n_sites": 300})
     run(tool)
     roles = [role_of(layer) for layer in window.layers if result_of(layer) is not None]
     assert len(roles) == len(set(roles)) == len(first) - 1
@@ -399,7 +400,7 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     window: Any, open_widget: Any, expecting: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tool = open_widget("Invert shot")
-    tool.options.set_values(FEW)
+    tool.options.restore(FEW)
 
     expect = expecting(tool)
 
@@ -507,7 +508,7 @@ def test_the_preview_follows_in_its_own_layers(
     window.layers["shot"].data = np.maximum(shot, 0)
     # Without a graphics card, drawing a large window takes longer than the inversion.
     window.window._qt_window.resize(900, 600)
-    tool.options.set_values({})
+    tool.options.restore({})
     tool.live.setChecked(True)
     qtbot.waitUntil(lambda: len(tool.previewed.layers) == 2 and settled(tool), timeout=PATIENCE)
     before = tool.previewed.layers
@@ -523,30 +524,30 @@ def test_the_preview_follows_in_its_own_layers(
 
     tool.masks.paint()
     follows(lambda: tool.steps.add("low-pass"))
-    follows(lambda: tool.steps.forms[0].form.editors["width"].set_value(2.0))
-    follows(lambda: tool.options.editors["floor"].set_value(0.5))
+    follows(lambda: enter(tool.steps.forms[0].form.entries["width"], 2.0))
+    follows(lambda: enter(tool.options.entries["floor"], 0.5))
     follows(lambda: tool.masks.layer.paint((30, 10), 1))
     assert not result_of(field).content.mask.all()
     tool.masks.layer = None
-    tool.options.set_values({})
+    tool.options.restore({})
     tool._draw_crop()
     corners = np.array([[0, 0], [0, 150], [199, 150], [199, 0]])
     follows(lambda: tool.crop.layer.add_rectangles(corners))
     assert field.data.shape == (200, 151)
     follows(lambda: setattr(tool.crop, "layer", None))
     follows(lambda: tool.source.set_kind("low-pass"))
-    width = tool.source.form.editors["width"]
+    width = tool.source.form.entries["width"]
     outcomes: list[Any] = []
     tool.panel.runner.ended.connect(outcomes.append)
     for value in np.linspace(40, 60, 21):
-        width.set_value(value)
+        enter(width, value)
         qtbot.wait(2)
     qtbot.waitUntil(lambda: settled(tool), timeout=PATIENCE)
     assert outcomes[-1].tag.recipe.source.width == pytest.approx(60)
     assert outcomes[-1].value is not None
     outcomes.clear()
     for value in np.linspace(59, 50, 10):  # as fast as one event of the window
-        width.set_value(value)
+        enter(width, value)
     qtbot.waitUntil(lambda: settled(tool), timeout=PATIENCE)
     assert [outcome.tag.recipe.source.width for outcome in outcomes] == [pytest.approx(50)]
     assert [a is b for a, b in zip(before, tool.previewed.layers, strict=True)] == [True] * 2
@@ -554,7 +555,7 @@ def test_the_preview_follows_in_its_own_layers(
 
 
 def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fits: Any) -> None:
-    tool.options.set_values({"seed": 5})
+    tool.options.restore({"seed": 5})
     tool.source.set_kind("interpolated")
     tool.setup.show_setup(paper_setup().model_dump())
     for name in STEPS:
@@ -575,7 +576,7 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
 def test_doubts_stand_under_run_with_a_notification(
     window: Any, tool: Any, run: Any, messages: list[str]
 ) -> None:
-    tool.options.set_values({**FEW, "max_iterations": 1})
+    tool.options.restore({**FEW, "max_iterations": 1})
     run(tool)
     assert "Failed" in tool.verdict.text()
     (text,) = messages
@@ -586,7 +587,7 @@ def test_doubts_stand_under_run_with_a_notification(
     x = np.mgrid[:48, :60][1]
     edge = synthetic_image(np.stack([0 * x, 0.03 * (x - 20.0)]))
     window.layers["shot"].data = edge
-    tool.options.set_values(FEW)
+    tool.options.restore(FEW)
     run(tool)
     report = result_of(layer_of(window, "field")).content.report
     assert report.converged
@@ -658,22 +659,22 @@ def test_camera_fits_after_units_change(
 def test_detector_and_beam_source_are_chosen_in_the_window(tool: Any) -> None:
     form = tool.instrument
     for kind, choices in (("detector", DETECTORS), ("beam_source", BEAM_SOURCES)):
-        box = form.editors[kind].inner
+        box = form.entries[kind].line.native
         assert isinstance(box, QComboBox)
         assert [box.itemText(k) for k in range(box.count())] == ["", *choices]
         assert box.currentText() == ""
     assert tool.recipe().instrument == Instrument()
-    form.editors["detector"].inner.setCurrentText("film")
-    form.editors["beam_source"].inner.setCurrentText("laser")
+    enter(form.entries["detector"], "film")
+    enter(form.entries["beam_source"], "laser")
     assert tool.recipe().instrument == Instrument.of("film", source="laser")
 
 
 def test_a_recipe_keeps_detector_and_beam_source(tool: Any, tmp_path: Path) -> None:
     stated = Instrument.of("film", source="TNSA", gamma=0.2, noise_correlation=1)
-    tool.instrument.set_values(stated.stated)
+    tool.instrument.restore(stated.stated)
     tool.recipes.save(tmp_path / "recipe.toml")
     assert read_recipe(tmp_path / "recipe.toml").instrument == stated
-    tool.instrument.set_values({})
+    tool.instrument.restore({})
     assert tool.instrument.model() == Instrument()
     tool.recipes.load(tmp_path / "recipe.toml")
     assert tool.instrument.model() == stated
@@ -692,10 +693,10 @@ def test_a_layer_of_an_estimated_source_was_not_measured(
     tool.source.set_kind("layer")
     tool.source.layers.layer = source
     assert tool.recipe().instrument == Instrument(beam_rms=0.05)
-    tool.instrument.editors["beam_source"].set_value("laser")
-    tool.instrument.editors["beam_rms"].set_value(0.01)
+    enter(tool.instrument.entries["beam_source"], "laser")
+    enter(tool.instrument.entries["beam_rms"], 0.01)
     assert tool.recipe().instrument == Instrument.of(source="laser", beam_rms=0.01)
-    tool.instrument.set_values({})
+    tool.instrument.restore({})
     tool.source.layers.layer = window.add_image(source.data, name="recorded")
     assert tool.recipe().instrument == Instrument()
 
@@ -706,7 +707,7 @@ def test_the_beam_under_a_painted_mask_is_predicted_with_its_error(
     blob = gaussian_blob((64, 64), -6.0, 4.0)
     window.add_image(np.random.default_rng(0).poisson(500 * synthetic_image(blob.displacement)))
     tool = open_widget("Invert shot")
-    tool.options.set_values(FEW)
+    tool.options.restore(FEW)
     tool.source.set_kind("kriged")
     assert tool.source.choice.currentText() == "estimate: predicted under the mask"
     tool.source_masks.paint()

@@ -12,6 +12,7 @@ import dask.array as da
 import numpy as np
 import pytest
 
+from helpers.forms import enter
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert
 from napari_shadowinv._napari.layer_metadata import role_of
@@ -47,7 +48,7 @@ def tool(window: Any, open_widget: Callable[[str], Any], stack: Array, out: Path
 
 
 def prepared(widget: Any, out: Path) -> Any:
-    widget.options.set_values(FEW)
+    widget.options.restore(FEW)
     widget.store.edit.setText(str(out))
     widget.engine.workers.setValue(1)
     return widget
@@ -283,9 +284,9 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
 
     run(tool)
     before = written(out)
-    tool.options.set_values({**FEW, "seed": 7})
+    tool.options.restore({**FEW, "seed": 7})
     expect("started with different options (seed: 0 there, 7 now)")
-    tool.options.set_values(FEW)
+    tool.options.restore(FEW)
     tool.source.set_kind("low-pass")
     expect("started with a different source")
     tool.source.set_kind("uniform")
@@ -319,7 +320,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
 def test_overwriting_takes_a_box_that_counts_once(tool: Any, run: Any, out: Path) -> None:
     run(tool)
     before = written(out)
-    tool.options.set_values({**FEW, "seed": 7})
+    tool.options.restore({**FEW, "seed": 7})
     tool.overwrite.setChecked(True)
     run(tool)
     assert not before.items() & written(out).items()
@@ -334,7 +335,7 @@ def test_shots_are_filtered_and_their_sources_guessed(
     tool.masks.paint()
     tool.masks.layer.data[:3, :4] = 1
     tool.source.set_kind("low-pass")
-    tool.source.form.editors["width"].set_value(6.0)
+    enter(tool.source.form.entries["width"], 6.0)
     tool.steps.add("low-pass")
     run(tool)
     clean = LowPassFilter(width=1.0).filter_image(stack[1], mask)

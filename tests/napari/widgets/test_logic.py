@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,6 @@ from napari.layers import Image, Labels, Shapes
 
 from helpers.jobs import run_job
 from napari_shadowinv import InputError, InversionOptions
-from napari_shadowinv._napari.widgets._editors import format_number, parse_number
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._objects import GridFile
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
@@ -62,33 +60,6 @@ from napari_shadowinv.shot import Shot
 
 FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]
-
-
-@pytest.mark.parametrize(
-    ("text", "unit", "value"),
-    [
-        ("1.3 mm", "m", 1.3e-3),
-        ("810nm", "m", 8.1e-7),
-        ("145 µm", "m", 145e-6),
-        ("0.28", "m", 0.28),
-        ("inf", "m", math.inf),
-        ("3 keV", "MeV", 3e-3),
-        ("1e-3", "", 1e-3),
-    ],
-)
-def test_a_quantity_is_read_exactly_and_shown_so_that_it_reads_back(
-    text: str, unit: str, value: float
-) -> None:
-    assert parse_number(text, unit) == value
-    assert parse_number(format_number(value, unit), unit) == value
-
-
-@pytest.mark.parametrize(
-    ("text", "unit"), [("1.3 kg", "m"), ("abc", "m"), ("2 m", ""), ("1 mm mm", "m"), ("", "m")]
-)
-def test_what_is_no_quantity_is_refused(text: str, unit: str) -> None:
-    with pytest.raises(InputError):
-        parse_number(text, unit)
 
 
 def test_a_crop_gives_the_field_of_the_cropped_image(shot: Array) -> None:

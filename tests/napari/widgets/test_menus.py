@@ -122,7 +122,7 @@ def test_a_setup_is_stored_with_its_image(
     widget.apply_button.click()
     assert "'Kinetic energy (MeV)' is missing" in messages[-1]
     assert widget.status.text() == messages[-1]
-    widget.setup.picker.form.set_values(proton_setup.model_dump())
+    widget.setup.picker.form.restore(proton_setup.model_dump())
     assert widget.area.horizontalScrollBar().maximum() == 0
     assert setup_of(stack) is None  # not before Apply
     widget.apply_button.click()

@@ -25,10 +25,10 @@ def tool(window: Any, open_widget: Any) -> Any:
     """The widget with a small toroid and three draws."""
     tool = open_widget("Plan an experiment")
     tool.object.set_kind("toroid")
-    tool.object.form.set_values({"peak": 20.0, "radius": 9e-6})
+    tool.object.form.restore({"peak": 20.0, "radius": 9e-6})
     tool.side.setText("64 x 64")
-    tool.instrument.set_values({"beam_rms": 0.0})
-    tool.options.set_values({"draws": 3, "counts": 3000.0})
+    tool.instrument.restore({"beam_rms": 0.0})
+    tool.options.restore({"draws": 3, "counts": 3000.0})
     return tool
 
 
@@ -93,7 +93,7 @@ def traced(tool: Any, cube: Path) -> Any:
     tool.object.set_kind("grid")
     tool.file.edit.setText(str(cube))
     tool.file.changed.emit()
-    tool.object.form.set_values({"beam": "x", "right": "y", "centre": True})
+    tool.object.form.restore({"beam": "x", "right": "y", "centre": True})
     tool.side.setText("")
     return tool
 
@@ -125,7 +125,7 @@ def test_forward_model_offers_the_same_view_of_a_file(traced: Any, open_widget: 
     forward.object.set_kind("grid")
     names = [tool.object.choice.currentText() for tool in (traced, forward)]
     assert names == ["a 3-D field from a file"] * 2
-    assert forward.object.form.editors.keys() == traced.object.form.editors.keys()
+    assert forward.object.form.entries.keys() == traced.object.form.entries.keys()
     assert forward.file.toolTip() == traced.file.toolTip()
 
 
@@ -156,11 +156,11 @@ def test_wrong_file_is_a_sentence(
         assert message in messages[-1]
     assert len(messages) == 4
     traced.file.edit.setText(str(tmp_path / "cube.nc"))
-    traced.object.form.set_values({"beam": "x", "right": "x"})
+    traced.object.form.restore({"beam": "x", "right": "x"})
     finished(traced, qtbot)
     assert len(messages) == 5
     assert "right" in messages[-1]
-    traced.object.form.set_values({"beam": "x", "right": "y"})
+    traced.object.form.restore({"beam": "x", "right": "y"})
     traced.setup.picker.set_kind("none")
     finished(traced, qtbot)
     assert "There is no setup: expected one of charged particles" in messages[-1]

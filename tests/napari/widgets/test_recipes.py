@@ -12,8 +12,10 @@ from napari.components import ViewerModel
 from qtpy.QtWidgets import QFileDialog
 
 from helpers.command_line import undrawn
+from helpers.forms import enter
 from helpers.jobs import run_job
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
+from napari_shadowinv._napari.form import StepsSection
 from napari_shadowinv._napari.layer_metadata import (
     Frame,
     frame_of,
@@ -23,7 +25,6 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets import _files
-from napari_shadowinv._napari.widgets._forms import StepsSection
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.inversion import Inversion
@@ -57,7 +58,7 @@ def opened(opened: Callable[[Any], Any]) -> Callable[..., Any]:
 
     def make(kind: Any = InvertShot) -> Any:
         widget = opened(kind)
-        widget.options.set_values({"n_sites": 300})
+        widget.options.restore({"n_sites": 300})
         return widget
 
     return make
@@ -108,8 +109,8 @@ def test_steps_are_added_moved_and_removed(qtbot: Any) -> None:
         section.choice.activated.emit(section.choice.findData(name))
     first, second = section.forms
     assert section.folded.text() == "Steps: low-pass (smooth), bin"
-    assert set(second.form.editors) == {"factor"}
-    second.form.editors["factor"].set_value(3)
+    assert set(second.form.entries) == {"factor"}
+    enter(second.form.entries["factor"], 3)
     assert not first.up.isEnabled()
     second.up.click()
     assert section.steps() == (Bin(factor=3), LowPassFilter(width=1.0))
@@ -143,13 +144,11 @@ def test_every_step_comes_back_from_its_state(qtbot: Any) -> None:
 def test_a_range_that_is_none_is_refused_where_it_is_typed(qtbot: Any) -> None:
     section = StepsSection()
     qtbot.addWidget(section)
-    rows = section.add("crop").form.editors["y"].inner
+    rows = section.add("crop").form.entries["y"]
     for text, rows_kept in (("10:40", (10, 40)), ("10:", (10, None)), ("", (0, None))):
-        rows.setText(text)
-        rows.editingFinished.emit()
+        enter(rows, text)
         assert section.steps() == (Crop(y=rows_kept),)
-    rows.setText("ten")
-    rows.editingFinished.emit()
+    enter(rows, "ten")
     with pytest.raises(InputError, match="such as 10:200"):
         section.steps()
 
@@ -316,7 +315,7 @@ def test_the_selected_result_is_repeated_from_its_files(
     said: list[str] = []
     monkeypatch.setattr(_files, "show_info", said.append)
     tool = opened(InvertShot)
-    tool.options.set_values({"n_sites": 200})
+    tool.options.restore({"n_sites": 200})
     tool.recipes.repeat()
     assert not tool.panel.runner.running  # the image is no result
     run(tool)

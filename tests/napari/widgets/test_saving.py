@@ -37,7 +37,7 @@ def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 def tool(window: Any, open_widget: Callable[[str], Any], shot: Any) -> Any:
     window.add_image(shot, name="shot", metadata=metadata_for("shot", "", paper_setup()))
     widget = open_widget("Invert shot")
-    widget.options.set_values({"n_sites": 300})
+    widget.options.restore({"n_sites": 300})
     return widget
 
 
@@ -154,7 +154,7 @@ def test_shot_of_a_store_is_saved_alone(
     stack = np.stack([shot, shot[:, ::-1]])
     window.add_image(stack, name="run", metadata=metadata_for("shot", "", proton_setup))
     tool = open_widget("Invert stack")
-    tool.options.set_values({"n_sites": 300})
+    tool.options.restore({"n_sites": 300})
     tool.store.edit.setText(str(tmp_path / "run.shadowinv.zarr"))
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)

@@ -52,7 +52,7 @@ def pack(tmp_path: Path) -> Path:
 @pytest.fixture
 def tool(window: Any, open_widget: Callable[[str], Any], pack: Path) -> Any:
     tool = open_widget("Invert stack")
-    tool.options.set_values({"tolerance": 1e-3})
+    tool.options.restore({"tolerance": 1e-3})
     tool.engine.workers.setValue(1)
     tool.store.edit.setText(str(pack.with_name("run.shadowinv.zarr")))
     tool.shots.set_kind("table")

@@ -10,6 +10,7 @@ import pytest
 import tomli_w
 from napari.components import ViewerModel
 
+from helpers.forms import enter
 from helpers.jobs import run_job
 from helpers.reports import texts_of
 from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
@@ -67,7 +68,7 @@ def typed(tool: Any, energy: float) -> None:
         "pixel_size": 2e-6,
     }
     for name, value in values.items():
-        tool.setup.picker.form.editors[name].set_value(value)
+        enter(tool.setup.picker.form.entries[name], value)
 
 
 @pytest.mark.parametrize("kind", [InvertShot, InvertStack])
@@ -94,9 +95,7 @@ def test_the_setup_of_a_file_is_not_there_in_the_next_session(
 ) -> None:
     tool = opened(kind)
     assert tool.setup.setup() is not None
-    energy = tool.setup.picker.form.editors["energy"]
-    energy.inner.setText("3 MeV")
-    energy.inner.editingFinished.emit()
+    enter(tool.setup.picker.form.entries["energy"], "3 MeV")
     assert setup_origin_of(of_a_file) == "came with experiment.h5, changed by hand"
     tool._keeper.write()
     viewer.layers.clear()
@@ -197,7 +196,7 @@ def test_a_loaded_setup_goes_with_the_image_until_run(
     tool = opened(InvertShot)
     tool.image.layer = plain
     tool.setup.load(proton_setup.model_dump(exclude_none=True), "tcc.toml")
-    tool.setup.picker.form.editors["energy"].set_value(5.0)
+    enter(tool.setup.picker.form.entries["energy"], 5.0)
     other = viewer.add_image(np.ones((20, 30)), name="other")
     tool.image.layer = other
     assert tool.setup.setup().energy == 5.0
@@ -454,7 +453,7 @@ def test_a_result_says_where_everything_came_from(
     viewer: ViewerModel, opened: Any, of_a_file: Any, run: Any
 ) -> None:
     tool = opened(InvertShot)
-    tool.options.set_values({"n_sites": 300})
+    tool.options.restore({"n_sites": 300})
     tool.source.set_kind("polynomial")
     tool.source_masks.paint()
     tool.source_masks.layer.data[10:30, 20:45] = 1
@@ -480,7 +479,7 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
     opened: Any, plain: Any, of_a_file: Any, run: Any, qtbot: Any, messages: list[str]
 ) -> None:
     tool = opened(InvertShot)
-    tool.options.set_values({"n_sites": 300})
+    tool.options.restore({"n_sites": 300})
 
     def rerun() -> None:
         run(tool)
@@ -570,7 +569,7 @@ def test_a_part_of_another_form_leaves_the_other_parts_restored(
     viewer: ViewerModel, opened: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = opened(InvertShot)
-    first.options.set_values({"n_sites": 777})
+    first.options.restore({"n_sites": 777})
     saved = {**first.state(), "source": {"values": 5}, "steps": 3}
     monkeypatch.setattr(StateKeeper, "load", lambda self: saved)
     assert opened(InvertShot).options.model().n_sites == 777

@@ -12,10 +12,11 @@ from matplotlib import rc_context
 from matplotlib.text import Text
 from qtpy.QtWidgets import QFileDialog, QLabel
 
+from helpers.forms import enter
 from napari_shadowinv import ProtonSetup
+from napari_shadowinv._napari.form import PROBLEM_STYLE, ModelPicker
 from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_to_viewer
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE, ModelPicker
 from napari_shadowinv._napari.widgets._qt import Plot
 from napari_shadowinv.analysis.paths import measure_peak
 from napari_shadowinv.inversion import Inversion
@@ -96,7 +97,7 @@ def test_nothing_is_orange_before_something_is_typed(
         setup.choice.setCurrentIndex(index)
         assert orange_texts(tools["Invert shot"]) == [], setup.choice.currentText()
     setup.set_kind("proton")
-    setup.form.editors["energy"].set_value(14.7)
+    enter(setup.form.entries["energy"], 14.7)
     assert any("Source" in text for text in orange_texts(tools["Invert shot"]))
 
 
@@ -110,12 +111,12 @@ def test_an_estimate_becomes_a_layer_after_its_preview(
     qtbot.waitUntil(lambda: bool(tool.previewed.layers), timeout=PATIENCE)
     (preview,) = tool.previewed.layers
     old = preview.data
-    tool.method.form.editors["degree"].set_value(0)
+    enter(tool.method.form.entries["degree"], 0)
     qtbot.waitUntil(lambda: preview.data is not old, timeout=PATIENCE)
     assert np.ptp(preview.data) == pytest.approx(0, abs=1e-9)
     tool.masks.paint()
     tool.masks.layer.data[10:20, 20:30] = 1
-    tool.method.form.editors["degree"].set_value(2)
+    enter(tool.method.form.entries["degree"], 2)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: "shot source: fitted polynomial" in window.layers, timeout=PATIENCE)
     source = window.layers["shot source: fitted polynomial"]
@@ -151,14 +152,14 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     tool.object.set_kind("four_toroids")
     tool.height_px.setValue(60)
     tool.width_px.setValue(80)
-    strength = tool.object.form.editors["strength"]
-    strength.set_value(0.2)
+    strength = tool.object.form.entries["strength"]
+    enter(strength, 0.2)
     expected = four_toroids((60, 80), paper_setup(), 0.2)
     layer = made()
     np.testing.assert_allclose(layer.data, synthetic_image(expected.displacement))
     assert tuple(layer.scale) == pytest.approx((1.5, 1.5))
     assert not tool.warning.isVisible()
-    strength.set_value(2.0)
+    enter(strength, 2.0)
     made()
     assert tool.warning.isVisible()
     assert "Caustics" in tool.warning.text()
@@ -306,9 +307,7 @@ def test_an_object_brings_the_beam_that_it_needs(
     qtbot.waitUntil(lambda: len(window.layers) == 1, timeout=PATIENCE)
     wave = wakefield((200, 200), wakefield_setup())
     np.testing.assert_allclose(window.layers[0].data, synthetic_image(wave.displacement))
-    density = tool.object.form.editors["density"]
-    density.inner.setText("2e19 cm⁻³")
-    density.inner.editingFinished.emit()
+    enter(tool.object.form.entries["density"], "2e19 cm⁻³")
     assert tool.object.model().density == pytest.approx(2e25)
 
     # What somebody has typed is not replaced.

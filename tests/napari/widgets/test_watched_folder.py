@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from helpers.reports import texts_of
+from napari_shadowinv._napari.form import PROBLEM_STYLE
 from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
-from napari_shadowinv._napari.widgets._forms import PROBLEM_STYLE
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -38,7 +38,7 @@ def out(tmp_path: Path) -> Path:
 @pytest.fixture
 def tool(open_widget: Any, folder: Path, out: Path) -> Any:
     tool = open_widget("Invert stack")
-    tool.options.set_values({"n_sites": 100})
+    tool.options.restore({"n_sites": 100})
     tool.shots.set_kind("folder")
     tool.shots.folder.folder.edit.setText(str(folder))
     tool.shots.folder.pattern.setText("*.npy")

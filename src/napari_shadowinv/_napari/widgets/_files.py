@@ -15,13 +15,13 @@ from napari.utils.notifications import show_info
 from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.form import TOML
 from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import dataset_to_save, layers_of_result, missing_layers
 from napari_shadowinv._napari.shots import radiograph_layers
 from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
-from napari_shadowinv._napari.widgets._forms import TOML
 from napari_shadowinv._napari.widgets._layers import new_crop, new_mask
 from napari_shadowinv._napari.widgets._panels import Outcome, ToolPanel
 from napari_shadowinv._napari.widgets._qt import may_replace, notify_errors
@@ -163,8 +163,8 @@ class RecipeButton(QPushButton):
         source = _usable_source(recipe, image, path)
         tool.steps.show_steps(steps)
         tool.source.show(source)
-        tool.instrument.set_values(recipe.instrument.model_dump())
-        tool.options.set_values(recipe.options.model_dump())
+        tool.instrument.restore(recipe.instrument.model_dump())
+        tool.options.restore(recipe.options.model_dump())
         if recipe.setup is not None:
             tool.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
         for picker, usable in masks.items():
@@ -234,7 +234,7 @@ class FitRecipeButton(RecipeButton):
         tool.steps.show_steps(recipe.steps)
         if recipe.setup is not None:
             tool.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
-        tool.instrument.set_values(recipe.instrument.model_dump())
+        tool.instrument.restore(recipe.instrument.model_dump())
         tool.show_choices(choices)
         if beam is not None:
             (tool.source.layers.layer,) = add_layers(tool.viewer, radiograph_layers(beam)[-1:])

@@ -10,12 +10,11 @@ from napari.utils.notifications import show_warning
 from qtpy.QtCore import QSignalBlocker, Qt
 from qtpy.QtWidgets import QDoubleSpinBox, QWidget
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.fit_layers import alternative_layers, start_name
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.facts import Fact, percent
@@ -61,7 +60,7 @@ class FitView(QWidget):
         self.results = ResultLayers(viewer, self)
         self.curve = ObjectiveCurve()
         self.verdict = panels.VerdictLine()
-        self.solutions = SteadyComboBox(
+        self.solutions = forms.SteadyComboBox(
             tip="Alternative solutions from other starting points. Select one to show it next to "
             "the best."
         )

@@ -13,13 +13,12 @@ from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv import preprocessing
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox, format_number
 from napari_shadowinv._napari.widgets._files import RecipeButton
 from napari_shadowinv._napari.widgets._results import describe_inputs
 from napari_shadowinv._system.validation import validate
@@ -34,10 +33,9 @@ from napari_shadowinv.options import (
     Instrument,
     InversionOptions,
 )
-from napari_shadowinv.physics.beam import geometry_text, setup_warnings, unit_in_title
+from napari_shadowinv.physics.beam import geometry_text, setup_warnings, text_in_unit, unit_in_title
 from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
 from napari_shadowinv.pipeline.files import complete_setup
-from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 from napari_shadowinv.shot import Shot
 
 _NONE = "none"
@@ -206,7 +204,7 @@ class SetupPicker(QWidget):
         kind, before, form = self.picker.kind, self._state, self.picker.form
         if kind != before["kind"] and form is not None and form.is_empty and self._fill_in(form):
             name = self._layer.name
-            self._shown[kind] = _Entry(form.values(), f"begun with the file of '{name}'")
+            self._shown[kind] = _Entry(form.state(), f"begun with the file of '{name}'")
         values = self.picker.state()["values"].get(kind, {})
         # Selecting another form, or leaving a field as it was, changes no values.
         if kind == before["kind"] and values != before["values"].get(kind):
@@ -273,9 +271,9 @@ class SetupPicker(QWidget):
     def _fill_in(self, form: forms.ModelForm) -> bool:
         """Begin an empty form with what the image's file says; return whether that is anything."""
         geometry = self._file_geometry()
-        values = {name: geometry[name] for name in form.editors if name in geometry}
+        values = {name: geometry[name] for name in form.entries if name in geometry}
         with QSignalBlocker(self.picker):
-            form.set_values(form.values() | values)
+            form.restore(form.state() | values)
         return bool(values)
 
     def _to_save(self) -> dict[str, object]:
@@ -489,51 +487,47 @@ class SourcePicker(forms.ModelPicker):
 class OptionsForm(forms.ModelForm):
     """A form of options, with buttons to load and save them."""
 
-    def __init__(self, model_class: type[BaseModel], initial: Mapping[str, Any]) -> None:
-        super().__init__(model_class, initial)
+    def __init__(self, model_class: type[BaseModel]) -> None:
+        super().__init__(model_class)
         self.files = forms.TomlButtons("options", self._to_save, self._load)
         self.layout().addWidget(self.files)
 
     def _to_save(self) -> dict[str, object]:
-        self.model()
-        return self.values()
+        return self.model().model_dump(exclude_none=True)
 
     def _load(self, values: dict[str, object], path: str) -> None:
         validate(self._model_class, values, path)
-        self.set_values(values)
+        self.restore(values)
 
 
 class InstrumentForm(forms.ModelForm):
     """A form of an instrument; its empty numbers show their defaults in grey."""
 
-    leaves_empty = True
+    defaults_vary = True
 
     def __init__(self) -> None:
         super().__init__(Instrument)
-        for kind in _INSTRUMENT_KINDS:
-            self.editors[kind].changed.connect(self._show_defaults)
+        self.changed.connect(self._show_defaults)
         self._show_defaults()
 
-    def set_values(self, values: Mapping[str, Any]) -> None:
+    def restore(self, values: Mapping[str, Any]) -> None:
         """Show the values that differ from their defaults."""
         with suppress(InputError):  # invalid entries are shown one by one
             values = validate(Instrument, values, "instrument").stated
-        super().set_values(values)
-
-    restore = set_values
+        super().restore(values)
 
     def _show_defaults(self) -> None:
         """Show the defaults of the chosen detector and beam source, with their names."""
-        kinds = {kind: self.editors[kind].value() for kind in _INSTRUMENT_KINDS}
+        kinds = {kind: self.entries[kind].value for kind in _INSTRUMENT_KINDS}
         usual = Instrument(**kinds)
-        for name, editor in self.editors.items():
+        for name, entry in self.entries.items():
             if name in kinds:
                 continue
             value = getattr(usual, name)
             unit = unit_in_title(Instrument.model_fields[name].title)
-            text = _UNSTATED[name] if value is None else format_number(value, unit)
+            text = _UNSTATED[name] if value is None else text_in_unit(value, unit)
             origin = next((kind for kind in kinds.values() if name in _KINDS.get(kind, ())), None)
-            editor.inner.setPlaceholderText(f"{text} ({origin})" if origin else text)
+            entry.show_default(f"{text} ({origin})" if origin else text)
 
 
 class InversionInputs:
@@ -559,7 +553,7 @@ class InversionInputs:
         self.setup = SetupPicker(until_run=True)
         self.steps = forms.StepsSection()
         self.instrument = InstrumentForm()
-        self.options = OptionsForm(InversionOptions, {"n_sites": PREVIEW_SITES})
+        self.options = OptionsForm(InversionOptions)
         self.recipes = RecipeButton(self)
         self.chosen_image = image
         self.beam = (self.source, self.source_masks, self.masks)
@@ -631,7 +625,7 @@ NOISES = {
 }
 
 
-class ChoiceBox(SteadyComboBox):
+class ChoiceBox(forms.SteadyComboBox):
     """A choice that is saved between sessions."""
 
     def __init__(self, choices: dict[str, str], tip: str) -> None:

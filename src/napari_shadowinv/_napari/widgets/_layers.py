@@ -13,10 +13,9 @@ from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.form import SteadyComboBox, labelled
 from napari_shadowinv._napari.placement import labels_on, mapped, matrix_between
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox
-from napari_shadowinv._napari.widgets._forms import labelled
 from napari_shadowinv._system.arrays import complete_block_means, join_masks
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from napari_shadowinv._napari.widgets import _forms as forms
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
 from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
 from napari_shadowinv.errors import InputError

@@ -17,12 +17,12 @@ from napari.utils.notifications import notification_manager
 from qtpy import QtWidgets
 from qtpy.QtCore import QObject, Qt, Signal
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop

@@ -11,13 +11,12 @@ import numpy as np
 from napari.utils.notifications import show_info
 from qtpy import QtWidgets
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.placement import mapped, matrix_between
 from napari_shadowinv._napari.preferences import colour_map
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes
 from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel
 from napari_shadowinv._system.arrays import PLANE
@@ -42,6 +41,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, RESULT, SITES
 from napari_shadowinv.io.store_shots import open_shots
+from napari_shadowinv.physics.beam import number_in_unit
 from napari_shadowinv.physics.units import prefix_for
 from napari_shadowinv.plotting import make_logarithmic, products_figure, save_figure
 
@@ -123,27 +123,27 @@ class ProductForm(QtWidgets.QWidget):
         self.result = LayerPicker(
             viewer, tip, suits=lambda layer: bool(about.result_of(layer) or _store_of(layer))
         )
-        self.product = SteadyComboBox(
+        self.product = forms.SteadyComboBox(
             {name: f"{kind.title[:1].upper()}{kind.title[1:]}" for name, kind in PRODUCTS.items()}
         )
         tip = "<qt>Shapes layer with the line or outline. Of several, the selected is used.</qt>"
         self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",))
-        self.unit = SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
+        self.unit = forms.SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
         tip = "<qt>Width of the strip across a profile's line, in px.</qt>"
         self.width_edit = QtWidgets.QDoubleSpinBox(maximum=1e4, toolTip=tip)
         component = AxisymmetricProfile.model_fields["component"]
         titles = {name: name for name in get_args(component.annotation)}
-        self.component = SteadyComboBox(titles, str(component.description))
+        self.component = forms.SteadyComboBox(titles, str(component.description))
         self._component_row = forms.labelled(str(component.title), self.component)
         tip = "<qt>Number of samples of the field for the bands.</qt>"
         self.samples = QtWidgets.QSpinBox(minimum=20, maximum=2000, value=100, toolTip=tip)
-        self.times = forms.LineEdit(
+        self.times = forms.SavedLine(
             "shots are numbered",
             "Time between two shots of the store, such as 1 ns, or the times of all shots "
             "used, such as 0, 1 ns, 3 ns; a number without a unit is in s. Empty: shots are "
             "numbered, and rates are per shot.",
         )
-        self.shots = forms.LineEdit(
+        self.shots = forms.SavedLine(
             "all finished ones",
             "Shots of the store, such as 3:20 or 0,2,5. Empty: all finished ones.",
         )
@@ -377,8 +377,8 @@ def _seconds(times: str, shots: list[int]) -> list[float] | None:
         return None
     received = f"{_TIMES} is '{times}'"
     try:
-        numbers = [parse_number(part, "s") for part in times.split(",")]
-    except InputError:
+        numbers = [number_in_unit(part, "s") for part in times.split(",")]
+    except ValueError:
         raise InputError(
             f"{received}, expected times separated by commas, such as 1 ns or 0, 1 ns, 3 ns"
         ) from None

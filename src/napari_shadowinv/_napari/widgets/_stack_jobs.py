@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike
 from qtpy import QtWidgets
 from qtpy.QtCore import Signal
 
+from napari_shadowinv._napari.form import PathEdit, labelled
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import KEY, role_of
 from napari_shadowinv._napari.layers import FullLayerData, LayerData, widen_limits
 from napari_shadowinv._napari.stores import first_shot, store_layers
-from napari_shadowinv._napari.widgets._forms import PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import column
 from napari_shadowinv._napari.widgets._results import result_frame

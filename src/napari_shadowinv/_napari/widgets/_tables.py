@@ -20,14 +20,13 @@ from qtpy.QtWidgets import (
 )
 
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.form import PROBLEM_COLOUR, PathEdit, labelled
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._editors import format_number, parse_number
-from napari_shadowinv._napari.widgets._forms import PROBLEM_COLOUR, PathEdit, labelled
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import SITES
-from napari_shadowinv.physics.beam import BeamQuantity
+from napari_shadowinv.physics.beam import BeamQuantity, number_in_unit, text_in_unit
 from napari_shadowinv.physics.setup import SETUPS, Setup, beam_quantities
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 
@@ -101,9 +100,10 @@ class NumberTable(QTableWidget):
         if exact is not None or not text:
             return None if exact is None else float(exact)
         try:
-            return parse_number(text, self._columns[column - 1].unit or "")
-        except InputError as error:
-            raise error.about(f"'{self.item(row, 0).text()}'") from error
+            return number_in_unit(text, self._columns[column - 1].unit or "")
+        except ValueError as error:
+            name = self.item(row, 0).text()
+            raise InputError(f"'{name}': received {text!r}, {error}") from error
 
     def write(self, row: int, column: int, value: Any) -> None:
         """Show a number, a file's name, or text that the user has to correct."""
@@ -115,7 +115,7 @@ class NumberTable(QTableWidget):
             if not is_number:
                 item.setText(value or "")
             elif spec.unit == _PREFIXED_UNIT:
-                item.setText(format_number(value, spec.unit))
+                item.setText(text_in_unit(value, spec.unit))
             else:
                 item.setText(f"{value:.6g}")
             self._mark(item, spec)
@@ -125,8 +125,8 @@ class NumberTable(QTableWidget):
         value: Any = item.text().strip() or None
         unit = self._columns[item.column() - 1].unit
         if value is not None and unit is not None:
-            with suppress(InputError):  # the text stays for correction
-                value = parse_number(value, unit)
+            with suppress(ValueError):  # the text stays for correction
+                value = number_in_unit(value, unit)
         self.write(item.row(), item.column(), value)
         return value
 
@@ -137,8 +137,8 @@ class NumberTable(QTableWidget):
         if spec.unit is None:
             return
         try:
-            parse_number(item.text() or "0", spec.unit)
-        except InputError as error:
+            number_in_unit(item.text() or "0", spec.unit)
+        except ValueError as error:
             item.setForeground(PROBLEM_COLOUR)
             item.setToolTip(f"<qt>{error}</qt>")
 

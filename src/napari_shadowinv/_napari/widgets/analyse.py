@@ -9,12 +9,11 @@ import numpy as np
 from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
 from napari_shadowinv._napari.placement import pixel_mapper
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _products as products
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.paths import (
@@ -79,7 +78,7 @@ class Analyse(qt.Docked):
         self.width_edit = QtWidgets.QDoubleSpinBox(maximum=_MAX_WIDTH, toolTip=f"<qt>{tip}</qt>")
         self.width_edit.setSpecialValueText("0: line only")
         self.width_edit.setKeyboardTracking(False)
-        self.width_unit = SteadyComboBox(tip=tip)
+        self.width_unit = forms.SteadyComboBox(tip=tip)
         self.width_unit.addItem(_PIXELS)
         self.plot = ProfilePlot()
         self.measures = forms.WrappingLabel()

@@ -13,13 +13,13 @@ from napari.utils.notifications import show_info
 from qtpy import QtWidgets
 from qtpy.QtCore import QObject, Qt
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.jobs import Finished
 from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.result_files import dataset_of_layers
 from napari_shadowinv._napari.viewer_sync import plane_in_view
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, mask_of, new_shapes
@@ -64,7 +64,7 @@ class NewPackDialog(QtWidgets.QDialog):
         for widget in (self.form, self.table, self._problem, self.buttons):
             column.addWidget(widget)
         self._show_layers(film_files.draft_pack(folder)["layers"])
-        self.form.editors["film"].changed.connect(self._on_film)
+        self.form.entries["film"].line.changed.connect(self._on_film)
 
     def entries(self) -> dict[str, Any]:
         facts: Any = self.form.model()
@@ -108,7 +108,7 @@ class NewPackDialog(QtWidgets.QDialog):
 
     def _on_film(self) -> None:
         """Show the selected type for all films whose file names contain no type."""
-        facts = film_files.NewPack(film=self.form.editors["film"].value())
+        facts = film_files.NewPack(film=self.form.entries["film"].line.value)
         for row, layer in enumerate(film_files.draft_pack(self._folder, facts)["layers"]):
             self.table.cellWidget(row, 1).setCurrentText(layer["film"])
 

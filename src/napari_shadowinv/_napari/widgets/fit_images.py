@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, FitJob, TimeEstimate
 from napari_shadowinv._napari.shots import radiograph_of
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _inputs as inputs
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._files import FitRecipeButton, result_buttons
@@ -92,8 +92,7 @@ class FitImages(ToolPanel):
         self.setup_section = forms.titled_section(self.setup)
         self.steps = forms.StepsSection(FIT_STEPS)
         self.instrument = inputs.InstrumentForm()
-        initial = {"smoothness": 1.0, "margin": 16, "threads": 1}
-        self.options = inputs.OptionsForm(FitOptions, initial)
+        self.options = inputs.OptionsForm(FitOptions)
         self.recipes = FitRecipeButton(self)
         self.cost = forms.WrappingLabel()
         self.view = FitView(self.viewer, self.panel)
@@ -195,7 +194,7 @@ class FitImages(ToolPanel):
             inputs.NOISES | {noise: inputs.NOISES.get(noise, f"σ = {noise} in each pixel")}
         )
         self.noise.restore(noise)
-        self.options.set_values(choices.options.model_dump())
+        self.options.restore(choices.options.model_dump())
         for row in self.images.used:
             width = self._spread(choices, row)
             if width is not None:
@@ -344,7 +343,7 @@ class FitImages(ToolPanel):
         """Set the energy or wavelength of the shown setup from the reference's row."""
         form = self.setup.picker.form
         if form is not None:
-            self.setup.show_setup({**form.values(), self.images.beam.name: value})
+            self.setup.show_setup({**form.state(), self.images.beam.name: value})
 
     def _on_setup(self) -> None:
         self.fields.offer(inputs.fields_of(self.setup.picker.kind))
@@ -356,5 +355,5 @@ class FitImages(ToolPanel):
 
     def _show_beams(self) -> None:
         form = self.setup.picker.form
-        beam = None if form is None else form.values().get(self.images.beam.name)
+        beam = None if form is None else form.state().get(self.images.beam.name)
         self.images.show_beams(self.setup.picker.kind, beam, self.brightness.state() == "known")

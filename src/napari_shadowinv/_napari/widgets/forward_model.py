@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from qtpy.QtWidgets import QLabel, QSpinBox
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.viewer_sync import error_text
-from napari_shadowinv._napari.widgets import _forms as forms
-from napari_shadowinv._napari.widgets._editors import SteadyComboBox, parse_number
 from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, SaveButton
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
 from napari_shadowinv._napari.widgets._objects import GRID, LAYER, GridFile, ObjectPanel
@@ -28,7 +27,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level, percent
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.beam import displacement_from_potential
+from napari_shadowinv.physics.beam import displacement_from_potential, number_in_unit
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
@@ -216,7 +215,7 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
             f"'{layer.name}' is in {unit}: select the setup of its experiment, which is needed "
             "to convert it to pixels"
         )
-    to_px2 = float(field_setup.normalized_potential(parse_number(f"1 {unit}", "m")))
+    to_px2 = float(field_setup.normalized_potential(number_in_unit(f"1 {unit}", "m")))
     return InputField(potential, to_px2, field_setup, f"A potential in {unit}.")
 
 
@@ -246,7 +245,7 @@ class ForwardModel(ObjectPanel):
             suits=may_be_field,
         )
         self.interpretation = forms.WrappingLabel()
-        self.deflector = SteadyComboBox(
+        self.deflector = forms.SteadyComboBox(
             {None: "default for the beam", **{name: name for name in deflector_titles().values()}},
             "Field that deflects the beam. Used only to predict the object's image in another "
             "experiment, when the setup differs from the result's setup.",

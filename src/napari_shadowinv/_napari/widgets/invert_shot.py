@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
 from napari_shadowinv._napari.viewer_sync import show_caution
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt

@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdit, QSpinBox
 
+from napari_shadowinv._napari.form import ModelPicker, PathEdit, labelled
 from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.stores import follow_shots, shot_rows
 from napari_shadowinv._napari.widgets import _stack_jobs as stack_jobs
 from napari_shadowinv._napari.widgets._files import result_buttons, shot_to_save
-from napari_shadowinv._napari.widgets._forms import ModelPicker, PathEdit, labelled
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
 from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel, ToolPanel

@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.shots import shot_layer
-from napari_shadowinv._napari.widgets import _forms as forms
 from napari_shadowinv._napari.widgets import _panels as panels
-from napari_shadowinv._napari.widgets._editors import parse_number
 from napari_shadowinv._napari.widgets._inputs import ChoiceBox, InstrumentForm
 from napari_shadowinv._napari.widgets._layers import LayerPicker
 from napari_shadowinv._napari.widgets._objects import GRID, LAYER, GridFile, ObjectPanel
@@ -24,6 +23,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
+from napari_shadowinv.physics.beam import number_in_unit
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import intensity_limits
@@ -140,12 +140,12 @@ class PlanExperiment(ObjectPanel):
             suits=lambda layer: about.displacement_of(layer) is not None,
         )
         self._field_row = forms.labelled("Result", self.field)
-        self.energies = forms.LineEdit(
+        self.energies = forms.SavedLine(
             "14.7, 30",
             "Energies of several images of a shot in MeV (of light: wavelengths in m), separated "
             "by commas. Empty: one image with the setup's.",
         )
-        self.side = forms.LineEdit(
+        self.side = forms.SavedLine(
             "200 x 200", "Height and width of an image in px, such as 200 x 200."
         )
         self.instrument = InstrumentForm()
@@ -154,7 +154,7 @@ class PlanExperiment(ObjectPanel):
             {_NOTHING: "nothing", **{key: swept.title for key, swept in SWEPT.items()}},
             "Quantity of the experiment that is varied.",
         )
-        self.values = forms.LineEdit(
+        self.values = forms.SavedLine(
             "100, 300, 1000", "Values of the quantity, separated by commas, in its unit."
         )
         self._values_row = forms.labelled("Values", self.values)
@@ -201,7 +201,7 @@ class PlanExperiment(ObjectPanel):
             object=self._object(),
             setups=self._setups(setup),
             shape=shape_of_text(size, "the size") if size else None,
-            instrument=validate(Instrument, self.instrument.values(), "instrument"),
+            instrument=validate(Instrument, self.instrument.state(), "instrument"),
             options=options,
             quantity=quantity,
             values=tuple(_numbers("the values", self.values.text())) if quantity else (),
@@ -259,8 +259,8 @@ class PlanExperiment(ObjectPanel):
 def _numbers(name: str, text: str, unit: str = "") -> Sequence[float]:
     parts = [part for part in text.split(",") if part.strip()]
     try:
-        return [parse_number(part, unit) for part in parts]
-    except InputError:
+        return [number_in_unit(part, unit) for part in parts]
+    except ValueError:
         raise InputError(
             f"{name}: received '{text}', expected numbers separated by commas"
         ) from None

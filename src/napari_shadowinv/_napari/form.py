@@ -1,26 +1,37 @@
-"""Forms generated from pydantic models, the only list of fields and defaults."""
+"""Forms of pydantic models, the only list of fields, units, limits and defaults.
+
+A form holds what the user stated, and the model reads it; grey text shows the defaults.
+
+- the entry of a field: `Entry`; the entries of a model: `ModelForm`
+- one of several models: `ModelPicker`; a list of them: `StepsSection`
+- files: `PathEdit`, `TomlButtons`, `save_text`
+"""
 
 from __future__ import annotations
 
 import html
+import types
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 import tomli_w
+from magicgui import widgets as magic
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 from qtpy import QtWidgets
-from qtpy.QtCore import QSignalBlocker, Qt, Signal
+from qtpy.QtCore import QEvent, QObject, QSignalBlocker, Qt, Signal
 from qtpy.QtGui import QColor
 from qtpy.QtWidgets import QSizePolicy, QWidget
 from superqt import QCollapsible
 
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._editors import Editor, SteadyComboBox, editor_for
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import read_toml, replacing
-from napari_shadowinv.physics.beam import unit_in_title
+from napari_shadowinv.physics.beam import number_in_unit, text_in_unit, unit_in_title
 from napari_shadowinv.preprocessing import STEPS, Step
 
 # For each key a title, and the class of its form's model, a widget, or None.
@@ -28,11 +39,43 @@ Kinds = dict[str, tuple[str, type[BaseModel] | QWidget | None]]
 
 PROBLEM_COLOUR = QColor("#d9822b")
 PROBLEM_STYLE = f"color: {PROBLEM_COLOUR.name()};"
-_LABEL_WIDTH_PX = 80
+_LABEL_WIDTH_PX, _ENTRY_WIDTH_PX = 80, 80
 INDENT = 12
 TOML = "TOML (*.toml)"
-# Optional fields that exclude each other: checking one unchecks the other.
+# Fields that exclude each other: stating one empties the other.
 _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
+
+
+class _WheelGuard(QObject):
+    """Keeps the mouse wheel from changing values while it scrolls the form."""
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
+        if event.type() == QEvent.Type.Wheel and not watched.hasFocus():
+            event.ignore()
+            return True
+        return False
+
+
+def steady(widget: QWidget) -> None:
+    """Make a widget ignore the mouse wheel, and combo boxes as narrow as the window."""
+    if isinstance(widget, QtWidgets.QComboBox):
+        widget.setMinimumContentsLength(6)
+        policy = QtWidgets.QComboBox.SizeAdjustPolicy.AdjustToMinimumContentsLengthWithIcon
+        widget.setSizeAdjustPolicy(policy)
+        widget.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+    for each in (widget, *widget.findChildren(QWidget)):
+        each.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        each.installEventFilter(_WheelGuard(each))
+
+
+class SteadyComboBox(QtWidgets.QComboBox):
+    """A narrow combo box that ignores the mouse wheel; `choices` are titles by key."""
+
+    def __init__(self, choices: Mapping[Any, str] | None = None, tip: str = "") -> None:
+        super().__init__(toolTip=f"<qt>{tip}</qt>" if tip else "")
+        for key, title in (choices or {}).items():
+            self.addItem(title, key)
+        steady(self)
 
 
 def labelled(text: str, widget: QtWidgets.QWidget) -> QtWidgets.QWidget:
@@ -83,7 +126,7 @@ class WrappingLabel(QtWidgets.QLabel):
         self.show_text(f"<b>{html.escape(title)}</b><br>{sentence}", style)
 
 
-class LineEdit(QtWidgets.QLineEdit):
+class SavedLine(QtWidgets.QLineEdit):
     """An entry that can be saved between sessions."""
 
     def __init__(self, example: str, tip: str) -> None:
@@ -104,7 +147,7 @@ class PathEdit(QtWidgets.QWidget):
     ) -> None:
         super().__init__()
         self._title, self._files = title, files
-        self.edit = LineEdit(example, tip)
+        self.edit = SavedLine(example, tip)
         self.edit.setMinimumWidth(60)
         qt.side_by_side((qt.with_button(self.edit, "…", title, self.choose), 0), holder=self)
         self.edit.editingFinished.connect(self.changed)
@@ -131,82 +174,224 @@ class PathEdit(QtWidgets.QWidget):
             self.changed.emit()
 
 
-class ModelForm(QtWidgets.QWidget):
-    """Editors for a model's fields; `initial` holds the first values of optional fields."""
+class Entry:
+    """The widget of a field; `value` is what was stated, None while the `default` applies.
+
+    `on_change` is called when the user has changed the value.
+    """
+
+    def __init__(self, field: FieldInfo, default: Any, on_change: Callable[[], Any]) -> None:
+        self._field, self._on_change = field, on_change
+        self._unit = unit_in_title(field.title)
+        self._default = self._plain(default)
+        self._kinds = _kinds_in(field.annotation)
+        self.widget = self._make(str(field.title))
+        self._stated: Any = None
+        self._shown = self.line.value
+        if self._is_text:
+            self.line.native.editingFinished.connect(self._read)
+        else:
+            self.line.changed.connect(self._read)
+
+    @property
+    def line(self) -> Any:
+        """The widget with the value, which may have a button beside it."""
+        return self.widget[0] if isinstance(self.widget, magic.Container) else self.widget
+
+    @property
+    def value(self) -> Any:
+        """The stated value exactly, or text that only the model can read."""
+        shown = self.line.value
+        if shown == self._shown:
+            return self._stated
+        if not self._is_text:
+            return None if shown == self._default else shown
+        return self._number_in(shown.strip()) if shown.strip() else None
+
+    @value.setter
+    def value(self, value: Any) -> None:
+        value = self._plain(value)
+        self._stated = value = None if value == self._default else value
+        shown = self._default if value is None else value
+        if self._is_text:
+            self.line.value = "" if value is None else _text_of(value, self._unit)
+        elif isinstance(self.line, magic.Slider | magic.FloatSlider):
+            self._show_on_slider(shown)
+        elif not isinstance(self.line, magic.ComboBox) or shown in self.line.choices:
+            self.line.value = shown
+        else:
+            self._stated = None
+        self._shown = self.line.value
+
+    def _plain(self, value: Any) -> Any:
+        """Return paths and ranges as text, which files and settings can hold."""
+        return _text_of(value, self._unit) if isinstance(value, list | tuple | Path) else value
+
+    def show_default(self, text: str) -> None:
+        """Show in grey what applies while the entry is empty."""
+        self.line.native.setPlaceholderText(text)
+
+    @property
+    def _is_text(self) -> bool:
+        return isinstance(self.line, magic.LineEdit)
+
+    def _make(self, title: str) -> Any:
+        extra = self._field.json_schema_extra
+        ends = extra.get("slider") if isinstance(extra, dict) else None
+        # Qt wraps rich text only.
+        tip = f"<qt>{self._field.description}</qt>" if self._field.description else ""
+        named = {"label": title, "tooltip": tip}
+        if self._kinds == {bool}:
+            box = magic.CheckBox(value=bool(self._default), **named)
+            box.text = ""  # its label stands before it
+            return box
+        if choices := _choices_in(self._field.annotation):
+            widget: Any = magic.ComboBox(choices=[(str(c or ""), c) for c in choices], **named)
+            widget.value = self._default
+        elif isinstance(ends, list | tuple):
+            kind = magic.FloatSlider if float in self._kinds else magic.Slider
+            widget = kind(min=ends[0], max=ends[1], value=self._default, **named)
+        else:
+            named["label"] = title.removesuffix(f" ({self._unit})")
+            return self._make_line(named)
+        steady(widget.native)
+        return widget
+
+    def _make_line(self, named: dict[str, str]) -> Any:
+        in_unit = f"in {self._unit}" if self._unit else "a number"
+        hint = in_unit if self._field.is_required() else f"not set ({in_unit})"
+        if tuple in self._kinds:
+            hint = "all, or a range such as 10:200"
+        elif self._default is not None:
+            hint = _text_of(self._default, self._unit)
+        is_file = Path in self._kinds
+        line = magic.LineEdit(**named)
+        line.native.setPlaceholderText("a number, or a file" if is_file else hint)
+        line.native.setMinimumWidth(_ENTRY_WIDTH_PX)
+        if not is_file:
+            return line
+        button = magic.PushButton(text="…", tooltip="Choose a file.")
+        button.native.setMaximumWidth(30)
+        button.changed.connect(self._choose_file)
+        row = magic.Container(widgets=[line, button], layout="horizontal", labels=False, **named)
+        row.margins = (0, 0, 0, 0)
+        return row
+
+    def _choose_file(self) -> None:
+        path, _ = QtWidgets.QFileDialog.getOpenFileName(
+            self.line.native, self._field.title or "Choose a file"
+        )
+        if path:
+            self.line.value = path
+            self._read()
+
+    def _show_on_slider(self, value: Any) -> None:
+        if isinstance(value, int | float):
+            self.line.min, self.line.max = min(self.line.min, value), max(self.line.max, value)
+            self.line.value = value
+
+    def _number_in(self, text: str) -> Any:
+        """Return the number in a text, or the text, which the model reads or refuses."""
+        if not self._kinds & {int, float}:
+            return text
+        for read in (int, partial(number_in_unit, unit=self._unit)):
+            if read is not int or int in self._kinds:
+                with suppress(ValueError):
+                    return read(text)
+        return text
+
+    def _read(self) -> None:
+        """Read what the user has entered, and show a number with its unit."""
+        if self.line.value != self._shown:
+            self.value = self.value
+            self._on_change()
+
+
+def _kinds_in(annotation: Any) -> set[Any]:
+    """Return the types of a field without None."""
+    if get_origin(annotation) in (Union, types.UnionType):
+        return set().union(*(_kinds_in(each) for each in get_args(annotation)))
+    return set() if annotation is type(None) else {get_origin(annotation) or annotation}
+
+
+def _choices_in(annotation: Any) -> tuple[Any, ...]:
+    """Return the choices of a field, None for an empty one; no choices for other fields."""
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)
+    if _kinds_in(annotation) == {Literal}:
+        (choices,) = (each for each in get_args(annotation) if each is not type(None))
+        return (None, *get_args(choices))
+    return ()
+
+
+def _text_of(value: Any, unit: str) -> str:
+    if isinstance(value, tuple | list):  # pixels, first and end
+        start, stop = value
+        return f"{start}:{'' if stop is None else stop}"
+    is_number = isinstance(value, int | float)
+    return text_in_unit(value, unit) if is_number else str(value)
+
+
+class ModelForm(QWidget):
+    """Entries for a model's fields; its state has those that are stated, as in a TOML file."""
 
     changed = Signal()
-    leaves_empty = False  # whether fields are empty until they are set, instead of their defaults
+    defaults_vary = False  # with the stated values, so that a default may be stated, too
 
-    def __init__(
-        self, model_class: type[BaseModel], initial: Mapping[str, Any] | None = None
-    ) -> None:
+    def __init__(self, model_class: type[BaseModel]) -> None:
         super().__init__()
         self._model_class = model_class
         self._fixed: dict[str, Any] = {}
-        self.editors: dict[str, Editor] = {}
+        self.entries: dict[str, Entry] = {}
         rows = QtWidgets.QFormLayout()
         rows.setContentsMargins(0, 0, 0, 0)
-        rows.setRowWrapPolicy(QtWidgets.QFormLayout.RowWrapPolicy.DontWrapRows)
         rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
-        layout = qt.column(self)
-        layout.addLayout(rows)
         for name, field in model_class.model_fields.items():
-            if get_origin(field.annotation) is Literal and len(get_args(field.annotation)) == 1:
-                self._fixed[name] = get_args(field.annotation)[0]
+            choices = _choices_in(field.annotation)
+            if len(choices) == 1:
+                self._fixed[name] = choices[0]
                 continue
-            editor = editor_for(field, (initial or {}).get(name), leave_empty=self.leaves_empty)
-            title = field.title or name
-            unit = unit_in_title(title) if editor.shows_unit else ""
-            label = QtWidgets.QLabel(title.removesuffix(f" ({unit})"))
-            for widget in (label, editor):
-                # Qt wraps rich text only.
-                widget.setToolTip(f"<qt>{field.description}</qt>" if field.description else "")
-            rows.addRow(label, editor)
-            editor.changed.connect(self._on_change)
-            self.editors[name] = editor
+            is_open = self.defaults_vary or field.is_required()
+            default = None if is_open else field.get_default()
+            self.entries[name] = Entry(field, default, partial(self._on_edit, name))
+            widget = self.entries[name].widget
+            label = QtWidgets.QLabel(widget.label, toolTip=widget.tooltip)
+            rows.addRow(label, widget.native)
         self._problem = WrappingLabel(style=PROBLEM_STYLE)
-        layout.addWidget(self._problem)
+        qt.column(self).addLayout(rows)
+        self.layout().addWidget(self._problem)
 
     @property
     def is_empty(self) -> bool:
         """Whether there are required fields, all of them empty."""
         fields = self._model_class.model_fields
-        required = [editor for name, editor in self.editors.items() if fields[name].is_required()]
-        return bool(required) and all(editor.value() in (None, "") for editor in required)
+        required = [entry for name, entry in self.entries.items() if fields[name].is_required()]
+        return bool(required) and all(entry.value is None for entry in required)
 
-    def values(self) -> dict[str, Any]:
-        """Return the values as in a TOML file, without unset fields."""
-        values = {name: editor.value() for name, editor in self.editors.items()}
+    def state(self) -> dict[str, Any]:
+        """Return the stated values by key, which are JSON values."""
+        values = {name: entry.value for name, entry in self.entries.items()}
         return self._fixed | {name: value for name, value in values.items() if value is not None}
 
-    def set_values(self, values: Mapping[str, Any]) -> None:
+    def restore(self, values: Mapping[str, Any]) -> None:
         """Show values; missing fields get their defaults."""
-        with QSignalBlocker(self):
-            for name, editor in self.editors.items():
-                field = self._model_class.model_fields[name]
-                has_default = not (self.leaves_empty or field.is_required())
-                default = field.get_default() if has_default else None
-                value = values.get(name, default)
-                if value is None and default is not None:
-                    continue
-                try:
-                    editor.set_value(value)
-                except (TypeError, ValueError, OverflowError):
-                    # A saved entry may be text that is no number.
-                    editor.set_value(default)
+        for name, entry in self.entries.items():
+            entry.value = values.get(name)
         self._on_change()
-
-    # State that is saved between sessions
-    state, restore = values, set_values
 
     def model(self) -> BaseModel:
         """Return the validated model, or raise an `InputError`."""
         name = getattr(self._model_class, "title", "options")
-        return validate(self._model_class, self.values(), name, labels_of(self._model_class))
+        return validate(self._model_class, self.state(), name, labels_of(self._model_class))
+
+    def _on_edit(self, name: str) -> None:
+        if name in _ALTERNATIVES and self.entries[name].value is not None:
+            for other in set(_ALTERNATIVES) - {name}:
+                self.entries[other].value = None
+        self._on_change()
 
     def _on_change(self) -> None:
-        self._keep_one_alternative()
         problem = ""
         try:
             self.model()
@@ -215,14 +400,6 @@ class ModelForm(QtWidgets.QWidget):
             problem = "" if self.is_empty else str(error)
         self._problem.show_text(problem)
         self.changed.emit()
-
-    def _keep_one_alternative(self) -> None:
-        editors = [self.editors[name] for name in _ALTERNATIVES if name in self.editors]
-        checked = [editor for editor in editors if editor.checked]
-        if len(checked) == 2:
-            unchecked = checked[0] if self.sender() is checked[1] else checked[1]
-            with QSignalBlocker(unchecked):
-                unchecked.set_value(None)
 
 
 def kinds_of(models: Mapping[str, Any]) -> Kinds:
@@ -264,14 +441,14 @@ class ModelPicker(QtWidgets.QWidget):
         return None if self.form is None else self.form.model()
 
     def state(self) -> dict[str, Any]:
-        values = {kind: form.values() for kind, form in self._forms.items()}
+        values = {kind: form.state() for kind, form in self._forms.items()}
         return {"kind": self.kind, "values": values}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         for kind, values in state.get("values", {}).items():
             form = self._form_of(kind) if kind in self._kinds else None
             if form is not None:
-                form.set_values(values)
+                form.restore(values)
         self.set_kind(str(state.get("kind", self.kind)))
 
     def _on_choice(self) -> None:
@@ -409,7 +586,7 @@ class StepsSection(QWidget):
         """Append a step by name, with its defaults or other values."""
         step_form = StepForm(STEPS[name], self._move)
         if values is not None:
-            step_form.form.set_values(values)
+            step_form.form.restore(values)
         step_form.changed.connect(self._on_change)
         self.forms.append(step_form)
         self._list.layout().addWidget(step_form)
@@ -421,7 +598,7 @@ class StepsSection(QWidget):
         self._show([step.model_dump() for step in steps])
 
     def state(self) -> list[dict[str, Any]]:
-        return [form.form.values() for form in self.forms]
+        return [form.form.state() for form in self.forms]
 
     def restore(self, state: Any) -> None:
         """Show the steps of a saved state, and say that they are of an earlier image."""
