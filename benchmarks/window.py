@@ -72,8 +72,8 @@ class Window:
         """Press Run and wait for the answer, without its layers."""
         self.tool._cache = Cache()
         self.tool.show_result = lambda *_: None
-        runner, ended = self.tool.panel.runner, []
-        runner.ended.connect(ended.append)
+        panel, ended = self.tool.panel, []
+        panel.ended.connect(ended.append)
         self.drawn = 0
         used, start = time.process_time(), time.perf_counter()
         self.tool.panel.button.click()
@@ -81,7 +81,7 @@ class Window:
             QApplication.processEvents()
             time.sleep(0.005)
         cost = Cost(time.process_time() - used, time.perf_counter() - start, self.drawn)
-        runner.ended.disconnect(ended.append)
+        panel.ended.disconnect(ended.append)
         self.settle(0.5)
         return cost
 

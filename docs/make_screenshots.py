@@ -125,7 +125,7 @@ def press_run(widget: Any) -> None:
     """Press Run and wait until all layers are there."""
     widget.panel.button.click()
     settle(0.2)
-    while widget.panel.runner.running or (hasattr(widget, "results") and widget.results.busy):
+    while widget.panel.running or (hasattr(widget, "results") and widget.results.busy):
         settle(0.2)
     settle()
     bar = widget.area.verticalScrollBar()
@@ -264,7 +264,7 @@ def series_window() -> None:
         form.shapes.layer.mode = "pan_zoom"
         form.times.setText("1 ns")
         form.panel.button.click()
-        while form.panel.runner.running:
+        while form.panel.running:
             settle(0.2)
         viewer.dims.set_current_step(0, 3)
         field = form.result.layer

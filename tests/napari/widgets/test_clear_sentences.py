@@ -128,4 +128,4 @@ def test_a_file_that_fails_is_not_shown_in_place_of_the_last_shot(
     np.save(tmp_path / "a4.npy", image)
     qtbot.waitUntil(lambda: window.dims.current_step[0] == 4, timeout=PATIENCE)
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)

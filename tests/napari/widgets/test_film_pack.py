@@ -45,7 +45,7 @@ def tool(viewer: ViewerModel, qtbot: Any) -> Any:
 def wait(qtbot: Any) -> Callable[[Any], None]:
     def until_at_rest(tool: Any) -> None:
         qtbot.waitUntil(
-            lambda: not (tool.panel.runner.running or tool.results.busy or tool.fit_images.busy),
+            lambda: not (tool.panel.running or tool.results.busy or tool.fit_images.busy),
             timeout=PATIENCE,
         )
         qtbot.wait(20)
@@ -176,7 +176,7 @@ def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluate
     tool.run_again.click()
     assert "with 3 corners: expected one polygon with the four" in tool.panel.status.text()
     assert len(viewer.layers) == before
-    assert not tool.panel.runner.running
+    assert not tool.panel.running
 
 
 def test_painted_pixels_are_not_used(

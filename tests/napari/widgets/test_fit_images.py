@@ -110,7 +110,7 @@ def run(qtbot: Any) -> Callable[[Any], Any]:
 
     def pressed(widget: Any) -> Any:
         answers: list[Any] = []
-        widget.panel.runner.ended.connect(answers.append)
+        widget.panel.ended.connect(answers.append)
         widget.panel.button.click()
         qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
         assert answers[0].error is None
@@ -404,7 +404,7 @@ def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
         messages.clear()
         spoil()
         tool.panel.button.click()
-        assert not tool.panel.runner.running
+        assert not tool.panel.running
         (text,) = messages
         assert text[1:].startswith(sentence[1:])  # apart from its capital
         assert tool.panel.status.text() == text
@@ -456,7 +456,7 @@ def test_images_that_do_not_fit_are_refused(
     tool.images.table.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
     window.layers["6.0 MeV"].data = np.full(SHAPE, np.nan)
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     assert messages[-1].startswith("'6.0 MeV' has 3072 pixels that are NaN")
     assert len(messages) == 2
     assert tool.panel.status.text() == messages[-1]
@@ -470,7 +470,7 @@ def test_a_fit_is_cancelled_at_once(
     tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.restore({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.progress.history), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.panel.tag.progress.history), timeout=PATIENCE)
     # The first start has no objective yet.
     qtbot.waitUntil(lambda: "objective" in tool.panel.status.text(), timeout=PATIENCE)
     assert tool.panel.status.text().startswith("Fitting: ")
@@ -500,7 +500,7 @@ def threads() -> list[str]:
 
 def cancel(tool: Any, qtbot: Any) -> None:
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
 
 
 @pytest.fixture
@@ -530,7 +530,7 @@ def test_each_stage_ends_soon_after_cancel(
     stages: list[str],
     traced_images: list[int],
 ) -> None:
-    tool.panel.runner._patience = math.inf  # the fit has to end by itself
+    tool.panel._patience = math.inf  # the fit has to end by itself
     enlarged(window, times)
     tool.view._redraw_timer.setInterval(REDRAW_MS)
     usual = {**QUICK, "samples": 1000, "max_iterations": 100}
@@ -538,7 +538,7 @@ def test_each_stage_ends_soon_after_cancel(
     for stage in stages:
         tool.options.restore(usual | BEFORE.get(stage, {}))
         tool.panel.button.click()
-        course = tool.panel.runner.tag.progress
+        course = tool.panel.tag.progress
         qtbot.waitUntil(
             lambda: any(reached == stage for reached, _ in course.history),  # noqa: B023
             timeout=PATIENCE,
@@ -582,8 +582,8 @@ def test_a_window_is_closed_during_a_fit(
     tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.restore({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: len(tool.panel.runner.tag.progress.history) > 100, timeout=PATIENCE)
-    stop = tool.panel.runner._box.stop
+    qtbot.waitUntil(lambda: len(tool.panel.tag.progress.history) > 100, timeout=PATIENCE)
+    stop = tool.panel._box.stop
     viewer.close()
     qtbot.waitUntil(stop.is_set, timeout=PATIENCE)
     traced_images.clear()
@@ -612,8 +612,8 @@ def test_closing_the_dock_ends_the_fit(
     tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.restore({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.panel.runner.tag.progress.history), timeout=PATIENCE)
-    stop = tool.panel.runner._box.stop
+    qtbot.waitUntil(lambda: bool(tool.panel.tag.progress.history), timeout=PATIENCE)
+    stop = tool.panel._box.stop
     window.window.remove_dock_widget(tool)
     tool.deleteLater()
     qtbot.waitUntil(stop.is_set, timeout=PATIENCE)
@@ -679,7 +679,7 @@ def test_refine_starts_from_the_last_inversion(
     inversion = result_of(layer_of(window, "field")).content
     tool.refine_section.psf.setValue(0.5)
     answers: list[Any] = []
-    tool.panel.runner.ended.connect(answers.append)
+    tool.panel.ended.connect(answers.append)
     tool.refine_section.button.click()
     assert tool.panel.button.text() == "Cancel"
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
@@ -710,7 +710,7 @@ def test_refine_starts_from_the_last_inversion(
     assert refined.visible
     # A new inversion is not hidden by what was made of the one before.
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     assert not refined.visible
     assert not tool.fit_view.verdict.isVisible()
 
@@ -725,7 +725,7 @@ def test_the_button_refines_an_inversion_of_a_file(
     window.open(str(path), plugin="napari-shadowinv")
     in_loop(tool.refine_section.button.click)
     assert not any("no inversion" in text for text in messages)
-    assert tool.panel.runner.running
+    assert tool.panel.running
 
 
 def test_the_menu_refines_an_inversion_of_a_file(
@@ -745,7 +745,7 @@ def test_the_menu_refines_an_inversion_of_a_file(
     (dock,) = window.window.dock_widgets.values()
     tool = dock if hasattr(dock, "refine_section") else dock._magic_widget
     assert tool.refine_section.folded.isExpanded()
-    assert tool.panel.runner.running
+    assert tool.panel.running
     in_loop(refine)
     assert messages[-1].startswith("Invert shot is running")
     qtbot.waitUntil(lambda: bool(tool.fit_view.verdict.text()), timeout=PATIENCE)
@@ -892,7 +892,7 @@ def test_a_refined_inversion_is_made_again(
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     tool.refine_section.psf.setValue(0.5)
     answers: list[Any] = []
-    tool.panel.runner.ended.connect(answers.append)
+    tool.panel.ended.connect(answers.append)
     tool.refine_section.button.click()
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.fit_view.results.busy, timeout=PATIENCE)
@@ -1009,7 +1009,7 @@ def test_the_same_image_twice_is_told_by_the_names_of_its_layers(
 ) -> None:
     window.layers[1].data = window.layers[0].data.copy()
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     assert messages == ["'14.7 MeV' and '6.0 MeV' are the same: give each image once"]
 
 

@@ -91,7 +91,7 @@ def computed(tool: Any) -> Any:
 
 
 def settled(tool: Any) -> bool:
-    return not tool.panel.runner.running and not tool._preview_timer.isActive()
+    return not tool.panel.running and not tool._preview_timer.isActive()
 
 
 def layer_of(viewer: Any, role: str, word: str = "") -> Any:
@@ -117,7 +117,7 @@ def test_the_window_thread_computes_nothing_during_a_run(
     tool.panel.button.click()
     sys.setprofile(note_room)  # of this thread alone
     try:
-        qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     finally:
         sys.setprofile(None)
     computing = {"geometry", "transport", "inversion", "physics", "preprocessing", "pipeline"}
@@ -298,10 +298,10 @@ def test_cancel_ends_the_work_itself(
     tool.options.restore({"tolerance": 1e-12, "lloyd_iterations": 1000, "lloyd_tolerance": 0})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: "Placing the sites" in tool.panel.status.text(), timeout=PATIENCE)
-    tool.panel.runner._patience = math.inf
+    tool.panel._patience = math.inf
     tool.panel.button.click()
     cancelled.set()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     # Of a thousand iterations at most the one at hand is finished.
     assert stages_after_cancel in ([], ["sites"])
     assert [layer.name for layer in window.layers] == ["shot"]
@@ -378,9 +378,7 @@ def expecting(messages: list[str], qtbot: Any) -> Any:
         def expect(words: str) -> None:
             messages.clear()
             tool.panel.button.click()
-            qtbot.waitUntil(
-                lambda: bool(messages) and not tool.panel.runner.running, timeout=PATIENCE
-            )
+            qtbot.waitUntil(lambda: bool(messages) and not tool.panel.running, timeout=PATIENCE)
             qtbot.wait(30)
             assert len(messages) == 1, messages
             assert words in messages[0]
@@ -538,7 +536,7 @@ def test_the_preview_follows_in_its_own_layers(
     follows(lambda: tool.source.set_kind("low-pass"))
     width = tool.source.form.entries["width"]
     outcomes: list[Any] = []
-    tool.panel.runner.ended.connect(outcomes.append)
+    tool.panel.ended.connect(outcomes.append)
     for value in np.linspace(40, 60, 21):
         enter(width, value)
         qtbot.wait(2)

@@ -66,7 +66,7 @@ def run(qtbot: Any) -> Callable[[Any], None]:
 
 
 def at_rest(tool: Any) -> bool:
-    return not (tool.panel.runner.running or tool.results.busy or tool._refresh_timer.isActive())
+    return not (tool.panel.running or tool.results.busy or tool._refresh_timer.isActive())
 
 
 @pytest.fixture

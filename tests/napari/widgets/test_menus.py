@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from qtpy.QtCore import QObject
 from qtpy.QtWidgets import QComboBox
 
 from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, setup_origin_of
 from napari_shadowinv._napari.layers import add_layers, inversion_layers
 from napari_shadowinv._napari.preferences import preference
-from napari_shadowinv._napari.widgets._panels import Runner
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets.analyse import Analyse
 from napari_shadowinv._napari.widgets.forward_model import ForwardModel
 from napari_shadowinv._napari.widgets.image_setup import ImageSetup
@@ -178,11 +177,11 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
 def test_runs_have_the_preferred_number_of_threads(preferences: Any, qtbot: Any) -> None:
     preferences.widgets.threads = 7
     threads: list[int] = []
-    owner = QObject()
-    runner = Runner(owner)
+    panel = Run("Some work", "Run", "")
+    qtbot.addWidget(panel)
     try:
-        runner.start(lambda on_progress, should_stop: threads.append(available_threads(None)))
-        qtbot.waitUntil(lambda: not runner.running, timeout=PATIENCE)
+        panel.start(lambda on_progress, should_stop: threads.append(available_threads(None)))
+        qtbot.waitUntil(lambda: not panel.running, timeout=PATIENCE)
     finally:
         set_default_threads(None)
     assert threads == [7]

@@ -11,7 +11,7 @@ from napari.utils import progress
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QDockWidget
 
-from napari_shadowinv._napari.widgets._panels import RunPanel
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import InputError
 
@@ -33,28 +33,28 @@ class Work:
 
 
 @pytest.fixture
-def panel(window: Any, qtbot: Any) -> RunPanel:
-    run_panel = RunPanel("Some work", "Run", "Do it.")
+def panel(window: Any, qtbot: Any) -> Run:
+    run_panel = Run("Some work", "Run", "Do it.")
     window.window.add_dock_widget(run_panel, name="work", area="right")
     qtbot.wait(500)
     return run_panel
 
 
-def finish(panel: RunPanel, qtbot: Any) -> None:
-    qtbot.waitUntil(lambda: not panel.runner.running, timeout=PATIENCE)
+def finish(panel: Run, qtbot: Any) -> None:
+    qtbot.waitUntil(lambda: not panel.running, timeout=PATIENCE)
 
 
 @pytest.mark.parametrize("total", [None, 200])
 def test_a_run_seldom_makes_the_window_be_drawn(
-    panel: RunPanel, window: Any, qtbot: Any, total: int | None
+    panel: Run, window: Any, qtbot: Any, total: int | None
 ) -> None:
     """Each composition of the canvas takes 20 ms of a core without a graphics card."""
     composed: list[str] = []  # the line of text at each composition
     canvas = window.window._qt_viewer.canvas.native
     canvas.aboutToCompose.connect(lambda: composed.append(panel.status.text()))
     texts: list[str] = []
-    panel.runner.progressed.connect(lambda _: texts.append(panel.status.text()))
-    panel.run(Work(total))
+    panel.progressed.connect(lambda _: texts.append(panel.status.text()))
+    panel.start(Work(total))
     finish(panel, qtbot)
     assert len(texts) > 15
     # Bar and text change together, and are then laid out anew; a busy bar never rests.
@@ -65,9 +65,9 @@ def test_a_run_seldom_makes_the_window_be_drawn(
 
 
 def test_a_panel_that_cannot_be_seen_uses_the_activity_dock(
-    panel: RunPanel, window: Any, qtbot: Any
+    panel: Run, window: Any, qtbot: Any
 ) -> None:
-    panel.run(Work(200))
+    panel.start(Work(200))
     qtbot.waitUntil(lambda: "Solving" in panel.status.text(), timeout=PATIENCE)
     assert panel.bar.isVisible()
     assert not progress._all_instances
@@ -79,12 +79,12 @@ def test_a_panel_that_cannot_be_seen_uses_the_activity_dock(
 
 
 def test_what_went_wrong_stays_until_the_next_run(
-    panel: RunPanel, qtbot: Any, messages: list[str]
+    panel: Run, qtbot: Any, messages: list[str]
 ) -> None:
     def mistaken(*_: Any) -> None:
         raise InputError("the film has no grain: expected some; take another one")
 
-    panel.run(mistaken)
+    panel.start(mistaken)
     finish(panel, qtbot)
     qtbot.wait(700)
     status = panel.status
@@ -93,7 +93,7 @@ def test_what_went_wrong_stays_until_the_next_run(
     assert status.wordWrap()
     assert status.textInteractionFlags() & Qt.TextInteractionFlag.TextSelectableByMouse
     assert "color" in status.styleSheet()
-    panel.run(lambda *_: None)
+    panel.start(lambda *_: None)
     assert status.text() == "Starting…"
     assert status.styleSheet() == ""
     finish(panel, qtbot)

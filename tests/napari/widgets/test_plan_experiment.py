@@ -34,7 +34,7 @@ def tool(window: Any, open_widget: Any) -> Any:
 
 def finished(tool: Any, qtbot: Any) -> None:
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
 
 
 def test_a_plan_shows_its_verdict_and_the_first_image(tool: Any, window: Any, qtbot: Any) -> None:

@@ -317,7 +317,7 @@ def test_the_selected_result_is_repeated_from_its_files(
     tool = opened(InvertShot)
     tool.options.restore({"n_sites": 200})
     tool.recipes.repeat()
-    assert not tool.panel.runner.running  # the image is no result
+    assert not tool.panel.running  # the image is no result
     run(tool)
     (field,) = [layer for layer in viewer.layers if role_of(layer) == "field"]
     viewer.layers.selection.active = field
@@ -443,9 +443,7 @@ def test_a_stack_is_inverted_by_a_saved_recipe(
     qtbot.waitUntil(
         lambda: any(role_of(layer) == "field" for layer in viewer.layers), timeout=PATIENCE
     )
-    qtbot.waitUntil(
-        lambda: not tool.panel.runner.running and not tool.results.busy, timeout=PATIENCE
-    )
+    qtbot.waitUntil(lambda: not tool.panel.running and not tool.results.busy, timeout=PATIENCE)
     alone = run_recipe(recipe, shot[::-1])
     dataset = read_stack(tmp_path / "a.shadowinv.zarr")
     displacement = dataset["displacement"].values[1]

@@ -6,26 +6,17 @@ import math
 import threading
 from typing import Any
 
-import pytest
-from qtpy.QtWidgets import QWidget
-
-from napari_shadowinv._napari.widgets._panels import Outcome, Runner
+from napari_shadowinv._napari.run import Outcome, Run
 
 
-class Heard(Runner):
-    """A runner that remembers how its work ended."""
+class Heard(Run):
+    """A button that remembers how its work ended."""
 
-    def __init__(self, window: QWidget, **keywords: float) -> None:
-        super().__init__(window, **keywords)
+    def __init__(self, qtbot: Any, patience: float = 0.5) -> None:
+        super().__init__("Some work", "Run", "", patience)
+        qtbot.addWidget(self)
         self.outcomes: list[Outcome] = []
         self.ended.connect(self.outcomes.append)
-
-
-@pytest.fixture
-def window(qtbot: Any) -> QWidget:
-    widget = QWidget()
-    qtbot.addWidget(widget)
-    return widget
 
 
 class Stubborn:
@@ -42,29 +33,29 @@ class Stubborn:
         return "late"
 
 
-def test_work_that_does_not_stop_is_left_alone(window: QWidget, qtbot: Any) -> None:
-    runner = Heard(window)
+def test_work_that_does_not_stop_is_left_alone(qtbot: Any) -> None:
+    panel = Heard(qtbot)
     work = Stubborn()
-    runner.start(work, tag="first")
-    runner.cancel()
-    qtbot.waitUntil(lambda: not runner.running, timeout=20_000)
+    panel.start(work, tag="first")
+    panel.cancel()
+    qtbot.waitUntil(lambda: not panel.running, timeout=20_000)
     assert not work.may_look.is_set()
-    assert runner.outcomes == [Outcome(cancelled=True, tag="first")]
+    assert panel.outcomes == [Outcome(cancelled=True, tag="first")]
 
-    runner.start(lambda *_: "next", tag="second")
+    panel.start(lambda *_: "next", tag="second")
     work.may_look.set()
     assert work.stopped.wait(5)
-    qtbot.waitUntil(lambda: not runner.running, timeout=5000)
-    assert runner.outcomes[1:] == [Outcome("next", tag="second")]
+    qtbot.waitUntil(lambda: not panel.running, timeout=5000)
+    assert panel.outcomes[1:] == [Outcome("next", tag="second")]
 
 
-def test_work_that_must_be_finished_is_waited_for(window: QWidget, qtbot: Any) -> None:
-    runner = Heard(window, patience=math.inf)
+def test_work_that_must_be_finished_is_waited_for(qtbot: Any) -> None:
+    panel = Heard(qtbot, patience=math.inf)
     work = Stubborn()
-    runner.start(work)
-    runner.cancel()
+    panel.start(work)
+    panel.cancel()
     qtbot.wait(800)
-    assert runner.cancelling
+    assert panel.cancelling
     work.may_look.set()
-    qtbot.waitUntil(lambda: not runner.running, timeout=5000)
-    assert runner.outcomes == [Outcome("late")]
+    qtbot.waitUntil(lambda: not panel.running, timeout=5000)
+    assert panel.outcomes == [Outcome("late")]

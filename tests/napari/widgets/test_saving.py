@@ -158,9 +158,7 @@ def test_shot_of_a_store_is_saved_alone(
     tool.store.edit.setText(str(tmp_path / "run.shadowinv.zarr"))
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
-    qtbot.waitUntil(
-        lambda: not tool.panel.runner.running and not tool.results.busy, timeout=PATIENCE
-    )
+    qtbot.waitUntil(lambda: not tool.panel.running and not tool.results.busy, timeout=PATIENCE)
     window.dims.set_current_step(0, 1)
     choose(tmp_path / "second")
     tool.save_result.click()

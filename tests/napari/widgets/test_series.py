@@ -57,7 +57,7 @@ def form(window: Any, open_widget: Any, store: Path) -> Any:
 def press(form: Any, qtbot: Any) -> str:
     """Press the button, wait for the end, and return the line below the button."""
     form.panel.button.click()
-    qtbot.waitUntil(lambda: not form.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not form.panel.running, timeout=PATIENCE)
     return str(form.panel.status.text())
 
 
@@ -156,7 +156,7 @@ def test_cancelled_series_leaves_no_result(
     form.panel.button.click()
     qtbot.waitUntil(entered.is_set, timeout=PATIENCE)
     form.panel.button.click()
-    qtbot.waitUntil(lambda: not form.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not form.panel.running, timeout=PATIENCE)
     assert form.panel.status.text() == "Cancelled."
     assert form.results == []
     monkeypatch.undo()

@@ -74,9 +74,7 @@ def use(tool: Any, row: int, *, used: bool) -> None:
 def run(tool: Any, qtbot: Any) -> StackStore:
     tool.panel.button.click()
     qtbot.waitUntil(
-        lambda: (
-            not (tool.panel.runner.running or tool.results.busy or tool._refresh_timer.isActive())
-        ),
+        lambda: not (tool.panel.running or tool.results.busy or tool._refresh_timer.isActive()),
         timeout=60_000,
     )
     return StackStore(tool.store.store)
@@ -138,7 +136,7 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:
     def expect(words: str) -> None:
         before = len(messages)
         tool.panel.button.click()
-        qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=60_000)
+        qtbot.waitUntil(lambda: not tool.panel.running, timeout=60_000)
         assert words in messages[before]
 
     write(tool, 1, ENERGY, "much")

@@ -393,7 +393,7 @@ def test_a_mask_over_the_object_is_refused(
     tool.source.set_kind("polynomial")
     tool.masks.layer = tool.source_masks.layer = labels
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(messages) and not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(messages) and not tool.panel.running, timeout=PATIENCE)
     words = "the object would be excluded from the inversion"
     assert words in tool.panel.status.text()
 
@@ -517,7 +517,7 @@ def test_what_the_core_refuses_stays_in_the_widget(
     monkeypatch.setattr(jobs, "run", refuse)
     tool = opened(InvertShot)
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     assert messages == ["Both masks hide the object"]
     assert tool.panel.status.text() == messages[0]
 

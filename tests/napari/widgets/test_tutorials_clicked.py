@@ -312,7 +312,7 @@ def test_no_reference_is_clicked_to_its_end(
     assert estimate.image.layer is window.layers["four toroids"]
     assert estimate.method.choice.currentText() == "fitted polynomial"
     press(estimate, "Estimate")
-    qtbot.waitUntil(lambda: not estimate.panel.runner.running, timeout=PATIENCE_MS)
+    qtbot.waitUntil(lambda: not estimate.panel.running, timeout=PATIENCE_MS)
     qtbot.waitUntil(lambda: len(window.layers) == 3, timeout=PATIENCE_MS)
     guess = window.layers.selection.active
     assert role_of(guess) == "source"
@@ -399,7 +399,7 @@ def test_film_pack_is_clicked_to_its_end(
     """With three simulated films instead of the real ones."""
 
     def wait() -> None:
-        qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE_MS)
+        qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE_MS)
         busy = (tool.results, tool.fit_images)
         qtbot.waitUntil(lambda: not any(layers.busy for layers in busy), timeout=PATIENCE_MS)
         qtbot.wait(50)

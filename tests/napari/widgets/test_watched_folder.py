@@ -94,7 +94,7 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     status = tool.panel.status
     qtbot.waitUntil(lambda: "3 done, 1 failed" in status.text(), timeout=PATIENCE)
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     expected = "3 done, 1 failed, in live.shadowinv.zarr"
     assert tool.panel.status.text() == expected
     assert messages == []
@@ -106,7 +106,7 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     assert window.dims.current_step[0] == 4
     assert (StackStore(out).statuses() == DONE).sum() == 4
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
 
 
 def test_it_fits_and_a_refused_watch_has_its_reason_under_the_button(
@@ -124,7 +124,7 @@ def test_it_fits_and_a_refused_watch_has_its_reason_under_the_button(
         tool.shots.folder.folder.edit.setText(folder)
         tool.panel.button.click()
         qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
-        qtbot.waitUntil(lambda: not tool.panel.runner.running, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
         qtbot.wait(50)
         status, button = tool.panel.status, tool.panel.button
         assert reason in messages[0]

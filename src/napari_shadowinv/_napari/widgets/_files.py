@@ -19,11 +19,12 @@ from napari_shadowinv._napari.form import TOML
 from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import dataset_to_save, layers_of_result, missing_layers
+from napari_shadowinv._napari.run import Outcome
 from napari_shadowinv._napari.shots import radiograph_layers
 from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._layers import new_crop, new_mask
-from napari_shadowinv._napari.widgets._panels import Outcome, ToolPanel
+from napari_shadowinv._napari.widgets._panels import ToolPanel
 from napari_shadowinv._napari.widgets._qt import may_replace, notify_errors
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
@@ -120,7 +121,7 @@ class RecipeButton(QPushButton):
         menu.addAction("Save…").triggered.connect(lambda: self._ask_and_save())
         menu.addAction("Repeat").triggered.connect(lambda: self.repeat())
         self.setMenu(menu)
-        tool.panel.runner.ended.connect(self._on_end)
+        tool.panel.ended.connect(self._on_end)
 
     def _ask_and_load(self) -> None:
         path, _ = QFileDialog.getOpenFileName(self, "Load recipe", "", TOML)
@@ -136,10 +137,10 @@ class RecipeButton(QPushButton):
     def repeat(self) -> None:
         """Repeat the result of the selected layer from its files, as further layers."""
         tool = self._tool
-        if tool.panel.runner.running:
+        if tool.panel.running:
             raise InputError("a run is under way: wait until it finishes, or press Cancel")
         job = _Repetition.of(tool.viewer.layers.selection.active, tool.viewer)
-        tool.panel.run(job.run, job)
+        tool.panel.start(job.run, job)
 
     @notify_errors
     def _on_end(self, outcome: Outcome) -> None:

@@ -14,6 +14,7 @@ from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.fit_layers import alternative_layers, start_name
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
@@ -51,7 +52,7 @@ class RefineSection(QWidget):
 class FitView(QWidget):
     """The objective of a running fit; then its verdict, report and alternative solutions."""
 
-    def __init__(self, viewer: Any, panel: panels.RunPanel) -> None:
+    def __init__(self, viewer: Any, panel: Run) -> None:
         super().__init__()
         self._viewer, self._panel = viewer, panel
         self._job: FitJob | None = None
@@ -69,8 +70,8 @@ class FitView(QWidget):
         column(self, self.verdict, self._solutions_row, self.curve, self.report)
         self._redraw_timer = timer(self, _REDRAW_MS, self._draw)
         self.solutions.currentIndexChanged.connect(self._show_alternative)
-        panel.runner.started.connect(self._on_start)
-        panel.runner.ended.connect(self._on_end)
+        panel.started.connect(self._on_start)
+        panel.ended.connect(self._on_end)
         self.empty()
 
     def empty(self) -> None:
@@ -98,7 +99,7 @@ class FitView(QWidget):
         """Show the verdict on the fit whose layer is selected; return False without a fit."""
         layer = self._viewer.layers.selection.active
         result = None if layer is None else result_of(layer)
-        if result is None or self._panel.runner.running or not isinstance(result.content, Fit):
+        if result is None or self._panel.running or not isinstance(result.content, Fit):
             return False
         if result is not self._result:
             self.empty()
@@ -137,11 +138,11 @@ class FitView(QWidget):
 
     def _on_start(self) -> None:
         self.empty()
-        if isinstance(self._panel.runner.tag, FitJob):
+        if isinstance(self._panel.tag, FitJob):
             self._redraw_timer.start()
 
     def _draw(self) -> None:
-        job = self._panel.runner.tag
+        job = self._panel.tag
         if isinstance(job, FitJob):
             start = time.perf_counter()
             self.curve.show_steps(list(job.progress.history))

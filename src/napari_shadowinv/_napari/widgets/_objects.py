@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from napari_shadowinv._napari import form as forms
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
-from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._panels import ToolPanel
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.trace_options import GridView
@@ -33,7 +34,7 @@ class GridFile:
 class ObjectPanel(ToolPanel):
     """A panel for an object that deflects the beam: a phantom, a 3-D field, or a layer's field."""
 
-    def __init__(self, viewer: Any, name: str, panel: RunPanel, layer_title: str) -> None:
+    def __init__(self, viewer: Any, name: str, panel: Run, layer_title: str) -> None:
         super().__init__(viewer, name, panel)
         kinds: forms.Kinds = {
             **forms.kinds_of(PHANTOMS),

@@ -16,9 +16,10 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.placement import mapped, matrix_between
 from napari_shadowinv._napari.preferences import colour_map
+from napari_shadowinv._napari.run import Outcome, Run
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes
-from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel
+from napari_shadowinv._napari.widgets._panels import ReportTable
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -148,9 +149,9 @@ class ProductForm(QtWidgets.QWidget):
             "Shots of the store, such as 3:20 or 0,2,5. Empty: all finished ones.",
         )
         self._store_rows = (forms.labelled(_SHOTS, self.shots), forms.labelled(_TIMES, self.times))
-        self.panel = RunPanel("analysis", "Measure", "Measure the product with its bands.")
+        self.panel = Run("analysis", "Measure", "Measure the product with its bands.")
         self.panel.button.clicked.connect(lambda: self._run_or_cancel())
-        self.panel.runner.ended.connect(self._on_end)
+        self.panel.ended.connect(self._on_end)
         self.plot, self.report = ProductPlot(), ReportTable()
         self.export = qt.push_button("Export CSV…", "Save all measured products.", self._export)
         self.save = qt.push_button(
@@ -282,11 +283,11 @@ class ProductForm(QtWidgets.QWidget):
 
     @qt.notify_errors
     def _run_or_cancel(self) -> None:
-        if self.panel.runner.running:
+        if self.panel.running:
             self.panel.cancel()
             return
         request = self.request()
-        self.panel.run(request.work, request)
+        self.panel.start(request.work, request)
 
     def _on_end(self, outcome: Outcome) -> None:
         if outcome.value is None:

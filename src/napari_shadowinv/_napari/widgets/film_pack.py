@@ -19,6 +19,7 @@ from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.jobs import Finished
 from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.result_files import dataset_of_layers
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
@@ -284,7 +285,7 @@ class FilmPack(panels.ToolPanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Compute dose and fluence of each film of the pack."
-        super().__init__(napari_viewer, "film-pack", panels.RunPanel("Film pack", "Run", tip))
+        super().__init__(napari_viewer, "film-pack", Run("Film pack", "Run", tip))
         scratch = TemporaryDirectory(prefix="film-pack-")
         qt.when_destroyed(self, scratch.cleanup)
         self._scratch = Path(scratch.name)
@@ -410,7 +411,7 @@ class FilmPack(panels.ToolPanel):
 
     @qt.notify_errors
     def _run_again(self) -> None:
-        if self.panel.runner.running:
+        if self.panel.running:
             return
         job = self._corrected_job()
         self.forget()

@@ -11,12 +11,13 @@ import numpy as np
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, FitJob, TimeEstimate
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import radiograph_of
 from napari_shadowinv._napari.widgets import _inputs as inputs
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._files import FitRecipeButton, result_buttons
 from napari_shadowinv._napari.widgets._fitting import FitView
-from napari_shadowinv._napari.widgets._panels import RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._panels import ToolPanel
 from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
 from napari_shadowinv._napari.widgets._results import describe_inputs, result_frame
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
@@ -50,7 +51,7 @@ class FitImages(ToolPanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Fit the fields, and an unknown beam, to all images together."
-        panel = RunPanel("Fit several images", "Run", tip, patience=0.4)
+        panel = Run("Fit several images", "Run", tip, patience=0.4)
         super().__init__(napari_viewer, "fit-images", panel)
         self._build()
         self._connect()

@@ -15,12 +15,12 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.placement import source_on
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, SaveButton
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
 from napari_shadowinv._napari.widgets._objects import GRID, LAYER, GridFile, ObjectPanel
-from napari_shadowinv._napari.widgets._panels import RunPanel
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -234,7 +234,7 @@ class ForwardModel(ObjectPanel):
     """Choose an object or a potential, and predict its image."""
 
     def __init__(self, napari_viewer: Any) -> None:
-        panel = RunPanel(
+        panel = Run(
             "Forward model", "Simulate", "Trace the beam through the object and show the image."
         )
         super().__init__(napari_viewer, "forward-model", panel, "a result or potential")

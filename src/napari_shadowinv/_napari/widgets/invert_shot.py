@@ -12,6 +12,7 @@ from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layers import LayerData
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._napari.widgets import _layers as layers
@@ -90,7 +91,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Invert the image and show the result as layers."
-        super().__init__(napari_viewer, "invert-shot", panels.RunPanel("Invert shot", "Run", tip))
+        super().__init__(napari_viewer, "invert-shot", Run("Invert shot", "Run", tip))
         self._cache = Cache()
         self._build()
         self._connect()
@@ -136,7 +137,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
         self.image.edited.connect(self._forget_report)
         # Also for runs that are cancelled, or refused before they start.
         self.panel.button.clicked.connect(self._empty_report)
-        self.panel.runner.started.connect(self._on_start)
+        self.panel.started.connect(self._on_start)
         qt.while_alive(self, self.viewer.layers.selection, "active", self._follow_result)
         changes = [control.changed for control in self.parts().values()]
         masks = self.masks.layers, self.source_masks.layers
@@ -172,7 +173,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
     @qt.notify_errors
     def refine(self, psf: float) -> None:
         """Refine the last inversion of the image, or else that of the selected layer."""
-        if self.panel.runner.running and not self._running_preview:
+        if self.panel.running and not self._running_preview:
             return
         image: Any = self.image.layer
         fields = field_of(self._last.layers_of(image))
@@ -194,7 +195,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
         name = jobs.name_of_result(layer) if image is None else str(image.name)
         psf = self.refine_section.psf.value()
         job = jobs.refinement(layer, layer if image is None else image, name, psf)
-        if self.panel.runner.running and not self._running_preview:
+        if self.panel.running and not self._running_preview:
             raise InputError(
                 "Invert shot is running: wait until it finishes, or press Cancel, then refine"
             )
@@ -225,7 +226,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
             return
         layer = self.viewer.layers.selection.active
         result = None if layer is None else about.result_of(layer)
-        if result is None or result is self._reported or self.panel.runner.running:
+        if result is None or result is self._reported or self.panel.running:
             return
         if isinstance(result.content, Inversion):
             self.fit_view.empty()
@@ -296,7 +297,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
         """Clear the report, which does not apply to another image."""
         self._empty_report()
         self.fit_view.empty()
-        if not self.panel.runner.running:
+        if not self.panel.running:
             self.panel.say("")
 
     @qt.notify_errors
@@ -348,7 +349,7 @@ class EstimateSource(panels.LivePanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Estimate the beam and add it as an image layer."
-        panel = panels.RunPanel("Estimate source", "Estimate", tip)
+        panel = Run("Estimate source", "Estimate", tip)
         super().__init__(napari_viewer, "estimate-source", panel)
         self.image = layers.ShotPicker(self.viewer)
         tip = "Labels or shapes on pixels that the estimate ignores."

@@ -16,12 +16,13 @@ from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdi
 from napari_shadowinv._napari.form import ModelPicker, PathEdit, labelled
 from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
 from napari_shadowinv._napari.placement import source_on
+from napari_shadowinv._napari.run import Outcome, Run
 from napari_shadowinv._napari.stores import follow_shots, shot_rows
 from napari_shadowinv._napari.widgets import _stack_jobs as stack_jobs
 from napari_shadowinv._napari.widgets._files import result_buttons, shot_to_save
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
-from napari_shadowinv._napari.widgets._panels import Outcome, ReportTable, RunPanel, ToolPanel
+from napari_shadowinv._napari.widgets._panels import ReportTable, ToolPanel
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer, while_alive
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._tables import ShotTable
@@ -203,7 +204,7 @@ class InvertStack(InversionInputs, ToolPanel):
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Invert all shots that are not in the store yet."
         # A cancelled run may take as long as it needs to finish writing to the store.
-        panel = RunPanel("Invert stack", "Run", tip, patience=math.inf)
+        panel = Run("Invert stack", "Run", tip, patience=math.inf)
         super().__init__(napari_viewer, "invert-stack", panel)
         self._shown: stack_jobs.StackJob | None = None
         self._ended, self._resets_view, self._newest = 0, False, 0
@@ -216,7 +217,7 @@ class InvertStack(InversionInputs, ToolPanel):
         self.setup.changed.connect(lambda: self.shots.table.show_kind(self.setup.picker.kind))
         for part in self.parts().values():
             part.changed.connect(self.keep)
-        self.panel.runner.progressed.connect(self._on_progress)
+        self.panel.progressed.connect(self._on_progress)
         while_alive(self, self.viewer.dims, "current_step", self._on_step)
         self.restore_last()
         self._on_layer()
@@ -299,7 +300,7 @@ class InvertStack(InversionInputs, ToolPanel):
 
     def _on_progress(self, progress: Progress) -> None:
         if progress.stage == "shots" or (progress.stage == "wait" and progress.step):
-            self._show(self.panel.runner.tag)
+            self._show(self.panel.tag)
 
     def _show(self, job: stack_jobs.StackJob) -> None:
         # Once only: pressing Run again must not discard these shots.
@@ -380,7 +381,7 @@ class InvertStack(InversionInputs, ToolPanel):
     def _show_report(self) -> None:
         """Show the origins of the results, and the quantities of the shot in view."""
         job = self._shown
-        if job is None or self.panel.runner.running:
+        if job is None or self.panel.running:
             return
         rows = list(job.inputs)
         shot = stack_jobs.shot_in_view(self.viewer, self.results.layers)
@@ -417,6 +418,6 @@ class InvertStack(InversionInputs, ToolPanel):
         self.engine.setVisible(self.shots.kind != _FOLDER)
         self.source.follow(layer)
         self.setup.follow(layer, "" if layer is not None else self.shots.name)
-        if not self.panel.runner.running:
+        if not self.panel.running:
             self.forget()
         self.keep()

@@ -13,6 +13,7 @@ from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job
 from napari_shadowinv._napari.layers import LayerData
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._inputs import ChoiceBox, InstrumentForm
@@ -127,7 +128,7 @@ class PlanExperiment(ObjectPanel):
     """Choose an object and an experiment, and see whether its field would be determined."""
 
     def __init__(self, napari_viewer: Any) -> None:
-        panel = panels.RunPanel(
+        panel = Run(
             "Plan an experiment",
             "Plan",
             "Simulate shots with random imperfections, retrieve their fields, and compare these "
