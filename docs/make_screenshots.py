@@ -224,9 +224,8 @@ def source_windows() -> None:
     invert_shot.image.layer = viewer.layers["four toroids"]
     invert_shot.source.set_kind("polynomial")
     press_run(invert_shot)
-    table = invert_shot.report.table
-    for row in range(table.rowCount()):
-        print(*(table.item(row, column).text() for column in (0, 1)), sep=": ")
+    for title, text in invert_shot.report.rows:
+        print(f"{title}: {text}")
     photograph(viewer, "tutorial-source-field.png")
 
 

@@ -122,7 +122,7 @@ def test_a_file_that_fails_is_not_shown_in_place_of_the_last_shot(
     tool.panel.button.click()
     qtbot.waitUntil(lambda: "2 done" in tool.panel.status.text(), timeout=PATIENCE)
     (tmp_path / "a3.npy").write_bytes(b"")
-    qtbot.waitUntil(lambda: tool.failures.count == 2, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: len(tool.failures.rows) == 2, timeout=PATIENCE)
     qtbot.wait(1000)
     assert window.dims.current_step[0] == 2
     np.save(tmp_path / "a4.npy", image)

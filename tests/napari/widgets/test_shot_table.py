@@ -129,7 +129,7 @@ def test_the_mask_of_one_row_is_wrong(tool: Any, qtbot: Any, pack: Path) -> None
     write(tool, 1, MASK, "small.npy")
     store = run(tool, qtbot)
     assert store.statuses().tolist() == [DONE, FAILED, DONE]
-    assert "mask has shape (4, 4), image (48, 48)" in tool.failures.item(0, 1).text()
+    assert "mask has shape (4, 4), image (48, 48)" in tool.failures.rows[0][1]
 
 
 def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:

@@ -18,6 +18,7 @@ from napari_shadowinv import Instrument
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, unit_of
 from napari_shadowinv._napari.viewer_sync import _text_overlay
 from napari_shadowinv._napari.widgets import _fitting
+from napari_shadowinv._napari.widgets._panels import Report
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE
 from simulated_pack import Truth
@@ -164,13 +165,8 @@ def overlay_text(window: Any) -> str:
 
 
 def report_of(tool: Any) -> str:
-    return "\n".join(
-        " ".join(
-            item.text() for column in range(2) if (item := table.item(row, column)) is not None
-        )
-        for table in tool.findChildren(QtWidgets.QTableWidget)
-        for row in range(table.rowCount())
-    )
+    reports = tool.findChildren(Report)
+    return "\n".join(f"{title} {text}" for report in reports for title, text in report.rows)
 
 
 def save_reload(

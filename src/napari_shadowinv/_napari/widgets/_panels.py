@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import html
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
 from qtpy import QtWidgets
-from qtpy.QtCore import Qt
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.jobs import Job
@@ -28,7 +29,7 @@ _LEVEL_STYLES = {
     Level.DOUBTFUL: forms.PROBLEM_STYLE,
     Level.FAILED: "color: #e05252;",
 }
-_ROW_SPACING_PX = 4
+_TITLE_WIDTH = "30%"
 _SETTLE_MS = 10  # merges simultaneous changes
 
 
@@ -50,72 +51,53 @@ def warning_rows(facts: Iterable[Fact]) -> list[tuple[str, str]]:
     return [(fact.title, fact.text) for fact in facts if fact.key in codes]
 
 
-class ReportTable(QtWidgets.QTableWidget):
-    """A table of names and values, as high as its rows."""
+class Report(QtWidgets.QWidget):
+    """Titles and texts in a column, to be read and copied; details are folded below."""
 
     def __init__(self) -> None:
-        super().__init__(0, 2, showGrid=False, wordWrap=True)
-        self.horizontalHeader().setVisible(False)
-        self.verticalHeader().setVisible(False)
-        self.verticalHeader().setMinimumSectionSize(1)
-        self.setEditTriggers(QtWidgets.QAbstractItemView.EditTrigger.NoEditTriggers)
-        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.setSizePolicy(QtWidgets.QSizePolicy.Policy.Ignored, QtWidgets.QSizePolicy.Policy.Fixed)
-        header = self.horizontalHeader()
-        header.setSectionResizeMode(0, QtWidgets.QHeaderView.ResizeMode.ResizeToContents)
-        header.setSectionResizeMode(1, QtWidgets.QHeaderView.ResizeMode.Stretch)
-        self.setVisible(False)
+        super().__init__()
+        self.rows: Rows = []  # with the details
+        self._main, self._details = _Table(), _Table()
+        self.details = forms.section("More", self._details)
+        self._details.setVisible(True)
+        qt.column(self, self._main, self.details)
+        self.empty()
 
-    def show_rows(self, rows: Rows) -> None:
-        self.setRowCount(len(rows))
-        for row, texts in enumerate(rows):
-            for column, text in enumerate(texts):
-                item = QtWidgets.QTableWidgetItem(text)
-                item.setTextAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignTop)
-                item.setToolTip(text)
-                if texts[0] == "Warning":
-                    item.setForeground(forms.PROBLEM_COLOUR)
-                self.setItem(row, column, item)
-        self.setVisible(True)
-        self._fit()
+    def show_rows(self, rows: Rows, details: Rows = ()) -> None:
+        self.rows = [*rows, *details]
+        self._main.show_text(_table_html(rows))
+        self._details.setText(_table_html(details))
+        self.details.setVisible(bool(details))
+        self.setVisible(bool(self.rows))
 
     def empty(self) -> None:
-        self.setRowCount(0)
-        self.setVisible(False)
+        self.show_rows([])
 
-    def resizeEvent(self, event: object) -> None:
+
+class _Table(forms.WrappingLabel):
+    """Rows of rich text, as high as their width requires."""
+
+    def setText(self, text: str) -> None:
+        super().setText(text)
+        self._fit()
+
+    def resizeEvent(self, event: Any) -> None:
         super().resizeEvent(event)
         self._fit()
 
     def _fit(self) -> None:
-        self.resizeRowsToContents()
-        for row in range(self.rowCount()):
-            self.setRowHeight(row, self.rowHeight(row) + _ROW_SPACING_PX)
-        self.setFixedHeight(self.verticalHeader().length() + 2 * self.frameWidth())
+        self.setMinimumHeight(max(self.heightForWidth(self.width()), 0))
 
 
-class FoldedReport(QtWidgets.QWidget):
-    """A report with a folded section on the solver and its timing."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.table, self._details = ReportTable(), ReportTable()
-        self.details = forms.section("More", self._details)
-        self.details.toggled.connect(lambda _: self._details.setVisible(True))
-        qt.column(self, self.table, self.details)
-        self.empty()
-
-    def show_rows(self, rows: Rows, details: Rows) -> None:
-        self.table.show_rows(rows)
-        self._details.show_rows(details)
-        self.details.setVisible(bool(details))
-        self.setVisible(True)
-
-    def empty(self) -> None:
-        self.table.empty()
-        self._details.empty()
-        self.setVisible(False)
+def _table_html(rows: Rows) -> str:
+    """Return a table of titles and texts, in which long names of files may wrap."""
+    lines = []
+    for row in rows:
+        title, text = (re.sub(r"(?<=[/_.-])(?=\S{8})", "\u200b", html.escape(each)) for each in row)
+        style = forms.PROBLEM_STYLE if title == "Warning" else ""
+        cells = f'<td width="{_TITLE_WIDTH}">{title}&nbsp;</td><td>{text}</td>'
+        lines.append(f'<tr style="{style}">{cells}</tr>')
+    return f'<table cellspacing="2">{"".join(lines)}</table>' if lines else ""
 
 
 class VerdictLine(forms.WrappingLabel):

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from numpy.typing import ArrayLike
-from qtpy.QtCore import Qt
-from qtpy.QtWidgets import QCheckBox, QFileDialog, QHeaderView, QLabel, QLineEdit, QSpinBox
+from qtpy.QtWidgets import QCheckBox, QFileDialog, QLabel, QLineEdit, QSpinBox
 
 from napari_shadowinv._napari.form import ModelPicker, PathEdit, labelled
 from napari_shadowinv._napari.layer_metadata import main_layers, may_be_shot, role_of
@@ -22,7 +21,7 @@ from napari_shadowinv._napari.widgets import _stack_jobs as stack_jobs
 from napari_shadowinv._napari.widgets._files import result_buttons, shot_to_save
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
-from napari_shadowinv._napari.widgets._panels import ReportTable, ToolPanel
+from napari_shadowinv._napari.widgets._panels import Report, ToolPanel
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer, while_alive
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._tables import ShotTable
@@ -33,7 +32,6 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 _REFRESH_INTERVAL_MS = 200  # many small shots may finish within a second
 _MAX_FAILURES = 100
-_NAME_WIDTH_PX = 110
 _LAYER, _FILES, _TABLE, _FOLDER = "layer", "files", "table", "folder"
 _LOCAL, _SCHEDULER = "threads", "scheduler"
 _SEPARATOR = "; "
@@ -178,26 +176,6 @@ class EnginePicker(ModelPicker):
         self.address.setText(str(state.get("address", "")))
 
 
-class FailureTable(ReportTable):
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-        # File names have no spaces to wrap at, and differ at their ends.
-        self.setTextElideMode(Qt.TextElideMode.ElideMiddle)
-        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Fixed)
-        self.horizontalHeader().resizeSection(0, _NAME_WIDTH_PX)
-
-    def show_failures(self, failures: list[tuple[str, str]]) -> None:
-        """Show the first failures, and the number of further ones."""
-        self.count = len(failures)
-        n_hidden = self.count - _MAX_FAILURES
-        rows = failures[:_MAX_FAILURES]
-        if n_hidden > 0:
-            rows = [*rows, ("…", f"and {n_hidden} more")]
-        self.show_rows(rows)
-        self.setVisible(bool(rows))
-
-
 class InvertStack(InversionInputs, ToolPanel):
     """Choose shots and a store, then press Run; press it again to resume after an interruption."""
 
@@ -207,7 +185,7 @@ class InvertStack(InversionInputs, ToolPanel):
         panel = Run("Invert stack", "Run", tip, patience=math.inf)
         super().__init__(napari_viewer, "invert-stack", panel)
         self._shown: stack_jobs.StackJob | None = None
-        self._ended, self._resets_view, self._newest = 0, False, 0
+        self._ended, self._failed, self._resets_view, self._newest = 0, 0, False, 0
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
         self._refresh_timer = timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
@@ -239,7 +217,7 @@ class InvertStack(InversionInputs, ToolPanel):
         tip = "<qt>Retry the shots that failed in an earlier run.</qt>"
         self.redo_failed = QCheckBox("retry failed shots", toolTip=tip)
         self.engine = EnginePicker()
-        self.report = ReportTable()
+        self.report = Report()
         self.save_result, self.more_layers = result_buttons(
             self,
             lambda: self.results,
@@ -248,7 +226,7 @@ class InvertStack(InversionInputs, ToolPanel):
         )
         self.failures_title = QLabel("Failed shots")
         self.failures_title.setVisible(False)
-        self.failures = FailureTable()
+        self.failures = Report()
         self.add(self.shots, *self.beam, *self.settings, labelled("Store", self.store))
         self.add(labelled("", self.overwrite), labelled("", self.redo_failed), self.engine)
         self.add(self.panel, side_by_side((self.save_result, 1), (self.more_layers, 1)))
@@ -307,7 +285,7 @@ class InvertStack(InversionInputs, ToolPanel):
         self.overwrite.setChecked(False)
         self.redo_failed.setChecked(False)
         status = job.status
-        if len(status.failures) != self.failures.count:
+        if len(status.failures) != self._failed:
             self._show_failures(list(status.failures))
         if job.layer_data and job is not self._shown:
             self._show_layers(job)
@@ -390,7 +368,11 @@ class InvertStack(InversionInputs, ToolPanel):
         self.report.show_rows(rows)
 
     def _show_failures(self, failures: list[tuple[str, str]]) -> None:
-        self.failures.show_failures(failures)
+        """Show the first failures, and the number of further ones."""
+        self._failed = len(failures)
+        hidden = failures[_MAX_FAILURES:]
+        more = [("…", f"and {len(hidden)} more")] if hidden else []
+        self.failures.show_rows(failures[:_MAX_FAILURES] + more)
         self.failures_title.setVisible(bool(failures))
 
     @notify_errors

@@ -159,7 +159,7 @@ class PlanExperiment(ObjectPanel):
             "100, 300, 1000", "Values of the quantity, separated by commas, in its unit."
         )
         self._values_row = forms.labelled("Values", self.values)
-        self.verdict, self.report = panels.VerdictLine(), panels.FoldedReport()
+        self.verdict, self.report = panels.VerdictLine(), panels.Report()
         self.plot = PlanPlot()
         instrument = forms.section("Instrument", self.instrument)
         options = forms.section("Simulated shots", self.options)
