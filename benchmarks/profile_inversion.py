@@ -94,7 +94,8 @@ def counted(image: np.ndarray, options: InversionOptions) -> tuple[Inversion, Si
 def pixels_crossed(inversion: Inversion) -> tuple[int, int]:
     """Borders between cells, and pieces that pixels cut them into."""
     density = Density.from_image(inversion.image)
-    triangulation = RegularTriangulation(inversion.sites, inversion.weights, region=density.region)
+    sites, weights = inversion.cells.sites, inversion.cells.weights
+    triangulation = RegularTriangulation(sites, weights, region=density.region)
     ends = PowerDiagram(triangulation, density)
     corners = np.clip(ends.vertices + 0.5, 0, density.shape).astype(int)
     neighbors = triangulation.neighbors

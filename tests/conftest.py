@@ -21,7 +21,7 @@ from helpers.public_data import public_file, public_names
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Basin, Fit, FitReport, FittedField
-from napari_shadowinv.inversion import Inversion, Report
+from napari_shadowinv.inversion import Cells, Inversion, Report
 from napari_shadowinv.inversion.error_budget import ErrorEstimate, Errors
 from napari_shadowinv.inversion.solution_checks import image_residual
 from napari_shadowinv.options import FitOptions, InversionOptions
@@ -144,11 +144,13 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         source=source,
         potential=blob.potential,
         displacement=blob.displacement,
-        sites=sites,
-        weights=np.linspace(-1, 1, 17),
-        site_mass=np.full(17, source.sum() / 17),
-        site_flux=source.sum() / 17 * (1 + np.linspace(-1, 1, 17) / 3000),
-        site_displacement=sites / 7,
+        cells=Cells(
+            sites=sites,
+            weights=np.linspace(-1, 1, 17),
+            mass=np.full(17, source.sum() / 17),
+            flux=source.sum() / 17 * (1 + np.linspace(-1, 1, 17) / 3000),
+            displacement=sites / 7,
+        ),
         reprojection=reprojection,
         residual=image - reprojection,
         caustic=caustic,

@@ -148,7 +148,7 @@ def test_what_is_no_image_is_refused(call: Callable[[Any], Any], image: Any) -> 
 
 
 def test_options_may_be_a_mapping() -> None:
-    assert len(invert(SHOT, options={"n_sites": 60}).weights) == 60
+    assert len(invert(SHOT, options={"n_sites": 60}).cells.weights) == 60
     assert invert(SHOT, options={}).options == InversionOptions()
 
 

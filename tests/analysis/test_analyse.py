@@ -66,7 +66,7 @@ def test_bands_are_those_of_uncertainty(inversion: Inversion):
 
     reference = uncertainty(
         np.rint(counts), 200, source=inversion.source, quantities={"mean": mean},
-        options={"n_sites": len(inversion.sites)},
+        options={"n_sites": len(inversion.cells.sites)},
     )  # fmt: skip
     region = Region(rectangle=((19.5, 19.5), (43.5, 43.5)))
     (result,) = analyse(inversion, region, samples=200, unit="px")

@@ -131,7 +131,7 @@ def test_more_noise_asks_for_a_wider_smoothing():
 
 def test_smoothing_of_an_inversion_follows_its_noise(inversion: Inversion):
     (density,) = analyse(inversion, CurrentDensity(), setup=SETUP, samples=20)
-    spacing = (64 * 64 / len(inversion.sites)) ** 0.5
+    spacing = (64 * 64 / len(inversion.cells.sites)) ** 0.5
     assert density.product.smoothing >= 1.5 * spacing - 1e-3
     text = next(fact.text for fact in density.facts if fact.key == "smoothing")
     assert f"width {density.product.smoothing:.3g} px" in text

@@ -456,7 +456,7 @@ def test_the_number_of_a_plan_is_used_and_else_that_of_the_options(image):
     coarse = invert(image, plan=default_plan, options=few)
     assert coarse.report.n_sites == 700
     alone = invert(image, source=beam, options=few)
-    np.testing.assert_array_equal(coarse.sites, alone.sites)
+    np.testing.assert_array_equal(coarse.cells.sites, alone.cells.sites)
     np.testing.assert_allclose(coarse.displacement, alone.displacement, atol=1e-3)
     with pytest.raises(InputError, match="700 sites that differ"):
         invert(image, plan=numbered_plan, start=coarse)

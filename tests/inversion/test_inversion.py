@@ -144,20 +144,20 @@ def test_reprojection_is_the_image_and_the_residual_their_difference(image):
 
 def test_sites_carry_the_source_and_point_along_the_field(phantom, image):
     inversion = invert(image, options=InversionOptions(n_sites=3000))
-    assert inversion.sites.shape == (3000, 2)
-    assert inversion.site_mass.sum() == pytest.approx(inversion.source.sum(), rel=1e-12)
-    y, x = np.rint(inversion.sites.T).astype(int)
+    assert inversion.cells.sites.shape == (3000, 2)
+    assert inversion.cells.mass.sum() == pytest.approx(inversion.source.sum(), rel=1e-12)
+    y, x = np.rint(inversion.cells.sites.T).astype(int)
     true = phantom.displacement[:, y, x].T
-    assert relative_error(inversion.site_displacement, true) < 0.12
+    assert relative_error(inversion.cells.displacement, true) < 0.12
 
 
 @pytest.mark.parametrize("boundary", ["closed", "free"])
 def test_cells_hold_the_flux_of_the_source_to_the_residual(image, boundary):
     inversion = invert(image, options=InversionOptions(n_sites=3000, boundary=boundary))
-    error = np.abs(inversion.site_flux - inversion.site_mass) / inversion.site_mass
+    error = np.abs(inversion.cells.flux - inversion.cells.mass) / inversion.cells.mass
     assert error.max() == pytest.approx(inversion.report.residual, rel=1e-6)
     if boundary == "closed":
-        assert inversion.site_flux.sum() == pytest.approx(inversion.image.sum(), rel=1e-3)
+        assert inversion.cells.flux.sum() == pytest.approx(inversion.image.sum(), rel=1e-3)
 
 
 def test_both_read_outs_agree_on_a_smooth_object(phantom, image):

@@ -53,7 +53,7 @@ def case(request, image):
     options = InversionOptions(n_sites=1000, negative="clip", **KINDS[request.param])
     plan = plan_sites(np.ones(SHAPE), options, mask=mask)
     draw, _ = noise_of(image, NOISE, None, mask)
-    weights = invert(image, plan=plan, options=options).weights
+    weights = invert(image, plan=plan, options=options).cells.weights
     samples = FullResampling(plan, weights, lambda rng: draw(rng, 0.0), options)
     clean = prepare(image, plan.source, options, mask).floored_image
     return samples, clean

@@ -37,11 +37,11 @@ def test_sites_as_a_table(tmp_path: Path, inversion: Inversion) -> None:
     assert path.read_text().startswith("y_px,x_px,weight_px2,mass,")
     table = np.loadtxt(path, delimiter=",", skiprows=1)
     expected = [
-        inversion.sites,
-        inversion.weights[:, None],
-        inversion.site_mass[:, None],
-        inversion.site_flux[:, None],
-        inversion.site_displacement,
+        inversion.cells.sites,
+        inversion.cells.weights[:, None],
+        inversion.cells.mass[:, None],
+        inversion.cells.flux[:, None],
+        inversion.cells.displacement,
     ]
     np.testing.assert_array_equal(table, np.hstack(expected))
 

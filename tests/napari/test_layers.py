@@ -21,7 +21,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import inversion_layers, sample_arrows
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion import Cells, Inversion
 from napari_shadowinv.physics.significance import PixelErrors
 
 
@@ -70,7 +70,7 @@ def test_values_are_those_of_the_result_in_the_unit_that_the_layer_names(
     np.testing.assert_allclose(layers["residual"].data, percent)
     np.testing.assert_array_equal(layers["reprojection"].data, solved.reprojection)
     np.testing.assert_array_equal(layers["caustic"].data > 0, solved.caustic)
-    np.testing.assert_array_equal(layers["sites"].data, solved.sites)
+    np.testing.assert_array_equal(layers["sites"].data, solved.cells.sites)
 
 
 def test_light_shows_the_deflection_angle(
@@ -170,7 +170,7 @@ def test_no_field_makes_no_arrow(viewer: ViewerModel, solved: Inversion) -> None
         displacement=np.zeros_like(solved.displacement),
         potential=np.zeros_like(solved.potential),
         residual=np.zeros_like(solved.residual),
-        site_displacement=np.zeros_like(solved.site_displacement),
+        cells=replace(solved.cells, displacement=np.zeros_like(solved.cells.displacement)),
     )
     layers = by_role(add_to_viewer(viewer, still))
     assert len(layers["arrows"].data) == 0
@@ -183,9 +183,9 @@ def test_features_of_the_sites_agree_with_the_report(
     sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
     features = sites.features
     assert list(features) == ["weight", "mass", "displacement", "flux residual"]
-    np.testing.assert_array_equal(features["weight"], solved.weights)
+    np.testing.assert_array_equal(features["weight"], solved.cells.weights)
     np.testing.assert_allclose(features["mass"].sum(), solved.source.sum())
-    np.testing.assert_allclose(features["displacement"], np.hypot(*solved.site_displacement.T))
+    np.testing.assert_allclose(features["displacement"], np.hypot(*solved.cells.displacement.T))
     worst = np.abs(features["flux residual"]).max()
     np.testing.assert_allclose(worst, solved.report.residual, rtol=1e-6)
 
@@ -202,9 +202,9 @@ def test_many_sites_are_thinned_and_the_name_says_so(
 ) -> None:
     monkeypatch.setattr("napari_shadowinv._napari.layers._MAX_SHOWN_SITES", 200)
     sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
-    np.testing.assert_array_equal(sites.data, solved.sites[::3])
+    np.testing.assert_array_equal(sites.data, solved.cells.sites[::3])
     assert sites.name == "✓ sites (1 in 3)"
-    np.testing.assert_array_equal(sites.features["weight"], solved.weights[::3])
+    np.testing.assert_array_equal(sites.features["weight"], solved.cells.weights[::3])
 
 
 def test_each_layer_knows_the_whole_result(
@@ -232,11 +232,13 @@ def large(make_inversion: Callable[..., Inversion]) -> Inversion:
     rng = np.random.default_rng(0)
     return replace(
         inversion,
-        sites=rng.uniform(-0.5, 1023.5, (count, 2)),
-        weights=np.zeros(count),
-        site_mass=np.full(count, inversion.source.sum() / count),
-        site_flux=np.full(count, inversion.source.sum() / count),
-        site_displacement=rng.normal(0, 1, (count, 2)),
+        cells=Cells(
+            sites=rng.uniform(-0.5, 1023.5, (count, 2)),
+            weights=np.zeros(count),
+            mass=np.full(count, inversion.source.sum() / count),
+            flux=np.full(count, inversion.source.sum() / count),
+            displacement=rng.normal(0, 1, (count, 2)),
+        ),
     )
 
 
@@ -244,7 +246,7 @@ def test_layers_share_the_arrays_of_a_large_result(large: Inversion) -> None:
     added = add_to_viewer(ViewerModel(), large, all_layers=True)
     layers = {role_of(layer): layer for layer in added}
     assert np.shares_memory(layers["reprojection"].data, large.reprojection)
-    assert np.shares_memory(layers["sites"].data, large.sites)
+    assert np.shares_memory(layers["sites"].data, large.cells.sites)
 
 
 def show_layers(viewer: Any, qtbot: Any, layer_data: list[Any]) -> tuple[list[str], Any]:

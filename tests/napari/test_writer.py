@@ -172,8 +172,8 @@ def test_sites_are_written_with_all_that_is_known(
     viewer.layers.selection = {sites}
     viewer.layers.save(str(tmp_path / "a.csv"), selected=True, plugin=PLUGIN)
     rows = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
-    np.testing.assert_array_equal(rows[:, :2], solved.sites)
-    np.testing.assert_array_equal(rows[:, 2], solved.weights)
+    np.testing.assert_array_equal(rows[:, :2], solved.cells.sites)
+    np.testing.assert_array_equal(rows[:, 2], solved.cells.weights)
 
 
 def test_a_field_of_other_origin_can_be_kept_as_a_result(

@@ -29,7 +29,7 @@ def site_column(monkeypatch) -> ShotColumn:
         title="places",
         kind=int,
         stores=(INVERSIONS,),
-        value=lambda inversion: len(inversion.sites),
+        value=lambda inversion: len(inversion.cells.sites),
         format="04d",
     )
     monkeypatch.setattr(store_columns, "COLUMNS", (*COLUMNS, column))

@@ -184,7 +184,7 @@ def test_a_source_for_each_shot(night, plans_made):
     for index in (1, 4):
         alone = invert(night.images[index], source=sources[index], options=OPTIONS)
         np.testing.assert_array_equal(shots.potential[index], alone.potential)
-        np.testing.assert_array_equal(shots.sites[index], alone.sites)
+        np.testing.assert_array_equal(shots.sites[index], alone.cells.sites)
     free = OPTIONS.model_copy(update={"boundary": "free"})
     ragged = invert_stack(night.images, Recipe(options=free), source=sources)
     assert "site" not in ragged.dims

@@ -168,7 +168,7 @@ def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> La
 
     content = result.content
     dataset = xr.Dataset(
-        {name: (dims, getattr(content, name)) for name, (dims, _, _) in VARIABLES.items()}
+        {name: (dims, content.variable(name)) for name, (dims, _, _) in VARIABLES.items()}
     ).assign(significance_variables(content.displacement, content.pixel_errors, content.structures))
     view = View(dataset, result.setup)
     facts, level = shared_metadata(result, name), content.headline.level

@@ -148,7 +148,7 @@ class ResampledInversion(SampledField):
         repeated = scatter.quantities["all"]
         systematic, causes = {}, ["noise", *scatter.imperfections]
         if coarse is not None:
-            share = discretisation_share(len(inversion.sites) / len(coarse.sites))
+            share = discretisation_share(len(inversion.cells.sites) / len(coarse.cells.sites))
             change = value - measure(coarse.potential, coarse.displacement)
             systematic["discretisation"] = share * change
         shifted = repeated.samples
@@ -191,7 +191,7 @@ class ResampledInversion(SampledField):
             instrument=inversion.instrument,
             **callbacks,
         )
-        return coarse if len(coarse.sites) < len(inversion.sites) else None
+        return coarse if len(coarse.cells.sites) < len(inversion.cells.sites) else None
 
 
 def recorded_shot(inversion: Inversion, mask: BoolArray | None) -> tuple[InversionOptions, Any]:
@@ -219,7 +219,7 @@ def recorded_shot(inversion: Inversion, mask: BoolArray | None) -> tuple[Inversi
 
 def number_of_inner_sites(inversion: Inversion) -> int:
     """Return the number of sites to ask for: without those in a margin."""
-    return max(int(is_inside(inversion.sites, inversion.image.shape).sum()), 4)
+    return max(int(is_inside(inversion.cells.sites, inversion.image.shape).sum()), 4)
 
 
 def has_measured_source(inversion: Inversion) -> bool:

@@ -2,7 +2,7 @@
 
 - invert an image: `invert`
 - prepare the sites once for many images with one source: `plan_sites`; how many: `count_sites`
-- results: `Inversion`, with a `Report`
+- results: `Inversion`, with a `Report`, and the `Cells` that the solver found
 """
 
 import lazy_loader

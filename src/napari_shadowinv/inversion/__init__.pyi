@@ -1,8 +1,9 @@
 from ._invert import count_sites, invert, plan_sites
 from .error_bars import Maximum, Uncertainty, uncertainty
-from .result import Inversion, Report
+from .result import Cells, Inversion, Report
 
 __all__ = [
+    "Cells",
     "Inversion",
     "Maximum",
     "Report",

@@ -34,7 +34,7 @@ from napari_shadowinv.inversion.machine_code import loading_kernels
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, mask_unlit, prepare
 from napari_shadowinv.inversion.readout import read_out
-from napari_shadowinv.inversion.result import Inversion, Report
+from napari_shadowinv.inversion.result import Cells, Inversion, Report
 from napari_shadowinv.inversion.solution_checks import (
     find_cautions,
     image_residual,
@@ -438,7 +438,7 @@ def _solve(
                 levels,
                 budget.target,
                 report,
-                start=None if start is None else start.weights,
+                start=None if start is None else start.cells.weights,
                 needed=partial(problem.needed, levels) if adaptive else None,
                 solved=solutions,
             )
@@ -492,11 +492,13 @@ def _inversion(
         source=prepared.source,
         potential=fields.potential,
         displacement=fields.displacement,
-        sites=answer.level.sites - plan.margin_width,
-        weights=answer.weights,
-        site_mass=answer.level.mass * plan.unit,
-        site_flux=answer.flux * plan.unit,
-        site_displacement=answer.displacement,
+        cells=Cells(
+            sites=answer.level.sites - plan.margin_width,
+            weights=answer.weights,
+            mass=answer.level.mass * plan.unit,
+            flux=answer.flux * plan.unit,
+            displacement=answer.displacement,
+        ),
         reprojection=reprojection,
         residual=np.where(prepared.mask, prepared.image - reprojection, 0.0),
         caustic=mark_caustics(
@@ -682,7 +684,7 @@ def _levels_from_start(
 
     With `may_differ`, the inversion may have a level between two of the plan.
     """
-    start_sites = start.sites + margin_width
+    start_sites = start.cells.sites + margin_width
     if len(start_sites) in levels.counts or (may_differ and len(start_sites) <= levels.counts[-1]):
         up_to = levels.up_to(len(start_sites))
         level = up_to[-1]

@@ -446,7 +446,7 @@ def uncertainty(
         resampling,
         np.stack([inversion.potential, *inversion.displacement]),
         _changes_by_edge(inversion),
-        _workers(options, len(inversion.sites), inversion.image.size),
+        _workers(options, len(inversion.cells.sites), inversion.image.size),
         options,
         choose if quantities else None,
     )
@@ -476,12 +476,12 @@ def _resampling(
     seeds: list[Seed],
 ) -> FullResampling:
     """Return the solver of samples with their draws of noise and instrument."""
-    workers = _workers(options, len(inversion.sites), inversion.image.size)
+    workers = _workers(options, len(inversion.cells.sites), inversion.image.size)
     # The threads are shared out among the samples; what noise drives below zero is clipped.
     threads = max(1, available_threads(options.threads) // workers)
     clipping = options.model_copy(update={"threads": threads, "negative": "clip"})
-    plan = replace(plan, levels=plan.levels.up_to(len(inversion.weights)))
-    resampling = FullResampling(plan, inversion.weights, draw_noise, clipping)
+    plan = replace(plan, levels=plan.levels.up_to(len(inversion.cells.weights)))
+    resampling = FullResampling(plan, inversion.cells.weights, draw_noise, clipping)
     resampling = resampling.to_tolerance_of_noise(seeds[0])
     if draws is None:
         return resampling

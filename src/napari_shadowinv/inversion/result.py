@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from napari_shadowinv._system.safety import as_input_errors
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import (
@@ -40,6 +40,7 @@ from napari_shadowinv.inversion.error_budget import Errors
 from napari_shadowinv.inversion.normalise import lit_pixels
 from napari_shadowinv.inversion.solution_checks import DECISIVE
 from napari_shadowinv.inversion.variables import (
+    CELL_VARIABLES,
     DISPLACEMENT_STD,
     VARIABLES,
     dataset_from_field,
@@ -129,6 +130,32 @@ class Report:
     errors: Errors | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """The power diagram of an inversion: n sites with their cells in source and image.
+
+    Attributes
+    ----------
+    sites : ndarray, shape (n, 2)
+        Positions of the sites, px.
+    weights : ndarray, shape (n,)
+        Weights of the power diagram, px².
+    mass : ndarray, shape (n,)
+        Flux of the source in each site's cell.
+    flux : ndarray, shape (n,)
+        Flux of the image in each site's power cell. It differs from `mass` by the residual,
+        ``max(abs(flux / mass - 1))``.
+    displacement : ndarray, shape (n, 2)
+        Centroid of each site's cell in the image minus its centroid in the source, px.
+    """
+
+    sites: FloatArray
+    weights: FloatArray
+    mass: FloatArray
+    flux: FloatArray
+    displacement: FloatArray
+
+
 @dataclass(frozen=True, repr=False)
 class Inversion(Summarised):
     """Deflection potential of one shot, with its errors and warnings.
@@ -147,17 +174,8 @@ class Inversion(Summarised):
     displacement : ndarray, shape (2, H, W)
         Displacement of the ray through each pixel, minus the gradient of the potential,
         in px.
-    sites : ndarray, shape (n, 2)
-        Positions of the sites.
-    weights : ndarray, shape (n,)
-        Weights of the power diagram, px².
-    site_mass : ndarray, shape (n,)
-        Flux of the source in each site's cell.
-    site_flux : ndarray, shape (n,)
-        Flux of the image in each site's power cell. It differs from `site_mass` by the residual,
-        ``max(abs(site_flux / site_mass - 1))``.
-    site_displacement : ndarray, shape (n, 2)
-        Centroid of each site's cell in the image minus its centroid in the source, px.
+    cells : Cells
+        Sites, weights and cells that the solver found.
     reprojection : ndarray, shape (H, W)
         The source as displaced by the retrieved field.
     residual : ndarray, shape (H, W)
@@ -184,11 +202,7 @@ class Inversion(Summarised):
     source: FloatArray
     potential: FloatArray
     displacement: FloatArray
-    sites: FloatArray
-    weights: FloatArray
-    site_mass: FloatArray
-    site_flux: FloatArray
-    site_displacement: FloatArray
+    cells: Cells
     reprojection: FloatArray
     residual: FloatArray
     caustic: BoolArray
@@ -231,7 +245,7 @@ class Inversion(Summarised):
     @property
     def structures(self) -> Structures | None:
         """Regions where the displacement stands above its error; None without pixel errors."""
-        element = self.displacement[0].size / len(self.sites)
+        element = self.displacement[0].size / len(self.cells.sites)
         errors = self.pixel_errors
         if errors is None:
             return None
@@ -256,6 +270,11 @@ class Inversion(Summarised):
     def facts(self) -> tuple[Fact, ...]:
         """The result in words, as every face shows it below the headline."""
         return self.in_units(self.setup).facts
+
+    def variable(self, name: str) -> AnyArray:
+        """Return the array of a variable of the dataset, one of `VARIABLES`."""
+        part = CELL_VARIABLES.get(name)
+        return np.asarray(getattr(self, name) if part is None else getattr(self.cells, part))
 
     def in_units(self, setup: Setup | None) -> InversionInUnits:
         """Return errors, assessment, headline and facts in the units of a setup.
@@ -332,7 +351,7 @@ class Inversion(Summarised):
             dataset["displacement_std"] = dims, self.pixel_errors.std, label(*words)
         dataset = dataset.assign(
             {
-                name: (dims, getattr(self, name), label(units, long_name))
+                name: (dims, self.variable(name), label(units, long_name))
                 for name, (dims, units, long_name) in VARIABLES.items()
                 if name not in dataset
             }
@@ -359,10 +378,12 @@ class Inversion(Summarised):
                 "inversion"
             )
         arrays: dict[str, Any] = {name: numbers_of(dataset, name) for name in VARIABLES}
+        cells = Cells(**{part: arrays.pop(name) for name, part in CELL_VARIABLES.items()})
         content = json.loads(dataset.attrs["report"])
         content["warnings"] = [Caution.from_json(caution) for caution in content["warnings"]]
         return cls(
             **arrays,
+            cells=cells,
             report=_report_schema().validate_python(content),
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             instrument=Instrument.model_validate_json(dataset.attrs["instrument"]),

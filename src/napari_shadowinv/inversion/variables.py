@@ -30,7 +30,7 @@ _FLUX = "1"
 _VECTORS = ("component", "y", "x")
 _SITE_VECTORS = ("site", "component")
 
-# Attribute of Inversion: dimensions, units, long name.
+# Of an inversion: dimensions, units, long name.
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "potential": (PLANE, PIXEL_AREA, "Normalised deflection potential"),
     "displacement": (_VECTORS, PIXEL, "Displacement of the ray through each pixel"),
@@ -46,6 +46,15 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "caustic": (PLANE, "1", "The map folds or its Jacobian is below the threshold"),
     "mask": (PLANE, "1", "Pixels that were used"),
 }
+
+CELL_VARIABLES = {
+    "sites": "sites",
+    "weights": "weights",
+    "site_mass": "mass",
+    "site_flux": "flux",
+    "site_displacement": "displacement",
+}
+"""Variables of the cells, and the attributes of `Cells` that they hold."""
 
 DISPLACEMENT_STD = (
     _VECTORS,

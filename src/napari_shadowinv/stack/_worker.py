@@ -284,7 +284,7 @@ class InvertTask(Task):
 
     def _planes(self, result: Inversion) -> tuple[dict[str, AnyArray], Any]:
         names = variable_labels().keys() & set(self.variables)
-        return {name: getattr(result, name) for name in names}, result
+        return {name: result.variable(name) for name in names}, result
 
     def report(self, result: Inversion) -> dict[str, Any]:
         """Return the report of a shot, with its own provenance if it is a row of a table."""

@@ -334,7 +334,7 @@ def test_a_run_replaces_the_last_result_of_its_shot(
         result = result_of(layer)
         if result is not None:
             assert result.content.options == few
-    np.testing.assert_allclose(layer_of(window, "sites").data, expected.sites)
+    np.testing.assert_allclose(layer_of(window, "sites").data, expected.cells.sites)
     assert layer_of(window, "sites").visible
     assert layer_of(window, "caustic").visible
     strength = np.hypot(*proton_setup.path_integrated_b(expected.displacement))
