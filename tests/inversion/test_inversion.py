@@ -309,7 +309,7 @@ def test_threads_do_not_change_a_bit(image):
         for threads in (1, 4)
     )
     for name in ("potential", "displacement", "weights", "site_displacement", "reprojection"):
-        np.testing.assert_array_equal(getattr(serial, name), getattr(parallel, name))
+        np.testing.assert_array_equal(serial.variable(name), parallel.variable(name))
 
 
 def processor_ticks() -> dict[str, int]:
@@ -506,7 +506,7 @@ def test_units_of_image_and_source_change_nothing(boundary, of_image, of_source)
     np.testing.assert_allclose(inversion.displacement, expected.displacement, atol=1e-9)
     for name in ("image", "source", "reprojection", "site_mass", "site_flux"):
         np.testing.assert_allclose(
-            getattr(inversion, name) / of_source, getattr(expected, name), rtol=1e-6, atol=1e-9
+            inversion.variable(name) / of_source, expected.variable(name), rtol=1e-6, atol=1e-9
         )
 
 

@@ -81,9 +81,9 @@ def image() -> FloatArray:
 
 def assert_same(one: Any, other: Any, rtol: float = 0.0) -> None:
     for name in ("displacement", "potential", "weights", "image", "source", "residual"):
-        expected = getattr(other, name)
+        expected = other.variable(name)
         scale = rtol * np.abs(expected).max()
-        np.testing.assert_allclose(getattr(one, name), expected, rtol=0, atol=scale)
+        np.testing.assert_allclose(one.variable(name), expected, rtol=0, atol=scale)
 
 
 def test_without_steps_it_is_invert(image: FloatArray) -> None:

@@ -84,7 +84,7 @@ def test_sources_are_guessed_from_filtered_shots(night, out, bare, usable):
     for index in (0, 3):
         expected = alone(shots[index], usable, bare)
         for name in ("potential", "source", "weights"):
-            values = getattr(expected, name)
+            values = expected.variable(name)
             np.testing.assert_array_equal(written[name][index], values)
             np.testing.assert_array_equal(lazy[name][index].compute(), values)
     estimate = '{"method":"polynomial","degree":1}'
