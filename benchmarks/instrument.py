@@ -32,7 +32,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,7 +43,8 @@ from fit import Beam, Field, blobs, counted
 from napari_shadowinv import FitOptions, Instrument, InversionOptions, fit, invert, synthetic_image
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.inversion import Maximum, plan_sites, uncertainty
+from napari_shadowinv.inversion import ErrorSamples, Maximum, plan_sites
+from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.shot import shots_of
 from reference import toroid_case
 
@@ -281,16 +282,25 @@ def table_of_bands(side: int, shots: int, first_seed: int) -> None:
                 name = names[number % len(names)]
                 shot = Shot(side, objects(side)[name], first_seed + number, times)
                 change(shot)
-                result = uncertainty(
-                    shot.image(), BANDS, source=COUNTS * shot.source, instrument=shot.instrument
+                inversion = invert(
+                    shot.image(), source=COUNTS * shot.source, instrument=shot.instrument
                 )
                 exact = truth(side, name)
-                ends = [result.band(share) for share in (0.68, 0.95)]
+                drawn = samples_of(inversion, BANDS)
+                ends = [drawn.band(share) for share in (0.68, 0.95)]
                 within.append([((low < exact) & (exact < high)).mean() for low, high in ends])
             narrow, wide = np.mean(within, axis=0)
             row.append(f"{narrow:.0%}, {wide:.0%}")
         print(f"| {title} | " + " | ".join(row) + " |", flush=True)
     print()
+
+
+def samples_of(inversion: Inversion, n: int, **choices: Any) -> ErrorSamples:
+    """Return samples of counting noise and instrument."""
+    errors = inversion.uncertainty(n, noise="poisson", **choices).errors
+    assert errors is not None
+    assert errors.samples is not None
+    return errors.samples
 
 
 def quantities(side: int) -> dict[str, Callable[[FloatArray, FloatArray], FloatArray]]:
@@ -325,15 +335,13 @@ def table_of_ranks(side: int, shots: int, first_seed: int, method: str) -> None:
         scaled = scale_field(shape, strength)
         shot = Shot(side, scaled, first_seed + number)
         everything(shot)
-        result = uncertainty(
+        inversion = invert(
             shot.image(),
-            RANKS,
             source=COUNTS * shot.source,
             instrument=shot.instrument,
-            quantities=measures,
-            method=method,
             options=InversionOptions(seed=number),
         )
+        result = samples_of(inversion, RANKS, quantities=measures, method=method)
         samples.append(np.array([q.mirrored() for q in result.quantities.values()]).T)
         exact = strength * truth(side, names[number % len(names)])
         truths.append([float(measure(exact[0], exact)) for measure in measures.values()])
@@ -385,13 +393,14 @@ def table_of_cost() -> None:
     options = InversionOptions(n_sites=10_000)
     image = np.random.default_rng(0).poisson(COUNTS * toroid_case(97).image).astype(float)
     plan = plan_sites(COUNTS * np.ones(image.shape), options)
+    inversion = invert(image, plan=plan, options=options, instrument=INSTRUMENT)
     print("| samples, 200², 10,000 sites | a minute | a minute by processor time |")
     print("|---|---|---|")
     for method, (few, many) in {"linear": (8, 1608), "resolve": (8, 108)}.items():
 
         def seconds(n: int, method: str = method) -> FloatArray:
             start = np.array([time.perf_counter(), time.process_time()])
-            uncertainty(image, n, plan=plan, options=options, instrument=INSTRUMENT, method=method)
+            samples_of(inversion, n, method=method)
             return np.array([time.perf_counter(), time.process_time()]) - start
 
         seconds(few)

@@ -58,7 +58,6 @@ from exact_shots import (
 )
 from napari_shadowinv import Fit, Instrument, Inversion, ProtonSetup, analyse, fit, invert, read
 from napari_shadowinv.analysis import EnclosedCurrent, LineProfile
-from napari_shadowinv.inversion import uncertainty
 from napari_shadowinv.shot import shots_of
 
 SIDE, COUNTS = 96, 1000.0
@@ -806,8 +805,8 @@ def coverage(seed: int, count: int) -> Iterator[Answer]:
             else:
                 image, given = drawn.counts(displacement, rng, cells), {"instrument": drawn.stated}
                 result = invert(image, source=drawn.source, **given)
-                spread = uncertainty(image, 60, source=drawn.source, **given)
-                ends = [spread.band(share) for share in (0.68, 0.95)]
+                errors = result.uncertainty(60, noise="poisson").errors
+                ends = [errors.samples.band(share) for share in (0.68, 0.95)]
                 pixels = [float(((low < truth) & (truth < high)).mean()) for low, high in ends]
             numbers = dict(zip(("pixels 68", "pixels 95"), pixels, strict=True))
             numbers |= product_coverage(result, displacement, truth, setups[0])

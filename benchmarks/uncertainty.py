@@ -14,13 +14,14 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from napari_shadowinv import InversionOptions, invert, synthetic_image
-from napari_shadowinv.inversion import plan_sites, uncertainty
+from napari_shadowinv.inversion import ErrorSamples, plan_sites
+from napari_shadowinv.inversion.result import Inversion
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from reference import toroid_case
 
@@ -36,15 +37,25 @@ def seconds(work: Callable[[], object]) -> NDArray[np.float64]:
     return np.array([time.perf_counter() - wall, time.process_time() - processor])
 
 
+def samples_of(
+    inversion: Inversion, n: int, noise: Any, method: Literal["linear", "resolve"] = "linear"
+) -> ErrorSamples:
+    """Return samples of the noise alone."""
+    errors = inversion.uncertainty(n, noise=noise, noise_only=True, method=method).errors
+    assert errors is not None
+    assert errors.samples is not None
+    return errors.samples
+
+
 def cost_rows(n_sites: int, n: int, n_solved: int, repeat: int = 5) -> list[str]:
     """Time two numbers of samples of each method: their difference tells what samples take."""
     options = InversionOptions(n_sites=n_sites, negative="clip", threads=1)
     image = toroid_case(97, noise=True).image
     plan = plan_sites(SOURCE, options)
+    start = invert(image, plan=plan, options=options)
 
     def call(method: Literal["linear", "resolve"], samples: int) -> NDArray[np.float64]:
-        asked = {"plan": plan, "noise": SIGMA, "options": options, "method": method}
-        return seconds(lambda: uncertainty(image, samples, **asked))
+        return seconds(lambda: samples_of(start, samples, SIGMA, method))
 
     few, most = 3, {"linear": n, "resolve": n_solved}  # linear samples are checked by so many
     turns = [
@@ -55,9 +66,9 @@ def cost_rows(n_sites: int, n: int, n_solved: int, repeat: int = 5) -> list[str]
     *methods, (inversion, _) = np.median(turns, axis=0)
     return [
         f"| {n_sites:,} | {method} | {inversion[1]:.2f} | {many} | {whole[1]:.2f} "
-        f"| {1e3 * (whole[0] - start[0]) / (many - few):.2f} "
-        f"| {1e3 * (whole[1] - start[1]) / (many - few):.2f} |"
-        for (method, many), (start, whole) in zip(most.items(), methods, strict=True)
+        f"| {1e3 * (whole[0] - first[0]) / (many - few):.2f} "
+        f"| {1e3 * (whole[1] - first[1]) / (many - few):.2f} |"
+        for (method, many), (first, whole) in zip(most.items(), methods, strict=True)
     ]
 
 
@@ -65,9 +76,9 @@ def agreement_row(peak: int, n_sites: int, n: int) -> str:
     """Error bars of the same noisy images by both methods."""
     options = InversionOptions(n_sites=n_sites, negative="clip")
     image = toroid_case(peak, noise=True).image
-    asked = {"plan": plan_sites(SOURCE, options), "noise": SIGMA, "options": options}
-    linear = uncertainty(image, n, **asked)
-    solved = uncertainty(image, n, **asked, method="resolve")
+    inversion = invert(image, source=SOURCE, options=options)
+    linear = samples_of(inversion, n, SIGMA)
+    solved = samples_of(inversion, n, SIGMA, "resolve")
 
     def compared(name: str) -> str:
         one, other = getattr(linear, name), getattr(solved, name)
@@ -92,8 +103,8 @@ def calibration_row(peak: int, kind: str, n: int, shots: int) -> str:
         images = [rng.poisson(COUNTS * clean).astype(float) for _ in range(shots)]
     noise = SIGMA if kind == "Gaussian" else "poisson"
     plan = plan_sites(SOURCE, options)
-    found = uncertainty(images[0], n, plan=plan, noise=noise, options=options)
     many = [invert(image, plan=plan, options=options) for image in images]
+    found = samples_of(many[0], n, noise)
     fields = np.array([inversion.displacement for inversion in many])
     scatter = fields.std(axis=0, ddof=1)
     of_potential = np.std([inversion.potential for inversion in many], axis=0, ddof=1)
@@ -114,7 +125,7 @@ def main() -> None:
     parser.add_argument("--n-solved", type=int, default=20)
     parser.add_argument("--shots", type=int, default=30)
     arguments = parser.parse_args()
-    uncertainty(np.ones((20, 20)) + np.eye(20), 2, noise=0.1)  # compile
+    samples_of(invert(np.ones((20, 20)) + np.eye(20)), 2, 0.1)  # compile
 
     print(f"One thread, toroid 97, noise of {SIGMA:.0%}; processor time but for the last but one\n")
     print(

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from napari_shadowinv import invert, synthetic_image
-from napari_shadowinv.inversion import Uncertainty, uncertainty
+from napari_shadowinv.inversion import ErrorSamples
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
 SHAPE = (160, 160)
@@ -49,20 +49,20 @@ def field_picture() -> None:
     rng = np.random.default_rng(3)
     shots = [rng.poisson(COUNTS * synthetic_image(truth)) for _ in range(20)]
     source = np.full(SHAPE, COUNTS)
-    found = uncertainty(shots[0], 40, source=source)
-    field, std = found.inversion.displacement[1], found.displacement_std[1]
+    field, found = sampled(shots[0], source, 40)
+    std = found.displacement_std[1]
     row = 84
     title = f"Error bars from one shot of {COUNTS:.0f} protons per pixel"
     figure, axes = page(title, 3, 2, 7.5)
     show(axes[0], shots[0], "Shot", "Protons", (0, float(np.percentile(shots[0], 99.8))), "gray")
     largest = float(np.abs(truth[1]).max())
     limits = (-largest, largest)
-    show(axes[1], field, "Displacement along x", "Displacement (px)", limits, "RdBu_r")
+    show(axes[1], field[1], "Displacement along x", "Displacement (px)", limits, "RdBu_r")
     top = float(np.percentile(std, 99.8))
     show(axes[2], std, "Its error bar", "Standard deviation (px)", (0, top), "viridis")
     axes[1].axhline(row, color=DARK, lw=1, ls="--")
     axes[2].axhline(row, color="white", lw=1, ls="--")
-    draw_cut(axes[3], field[row], std[row], truth[1, row])
+    draw_cut(axes[3], field[1, row], std[row], truth[1, row])
     tidy(axes[3], f"Cut at y = {row} px", "x (px)", "Displacement along x (px)", ASPECT)
     show_potential(axes[4], found)
     others = [invert(shot, source=source).displacement - truth for shot in shots]
@@ -70,7 +70,15 @@ def field_picture() -> None:
     save(figure, "uncertainty.png")
 
 
-def show_potential(axes: Axes, found: Uncertainty) -> None:
+def sampled(shot: FloatArray, source: FloatArray, n: int) -> tuple[FloatArray, ErrorSamples]:
+    """Return the displacement of a shot, and samples of its noise."""
+    result = invert(shot, source=source).uncertainty(n, noise="poisson", noise_only=True)
+    assert result.errors is not None
+    assert result.errors.samples is not None
+    return result.displacement, result.errors.samples
+
+
+def show_potential(axes: Axes, found: ErrorSamples) -> None:
     top = float(found.potential_std.max())
     show(
         axes, found.potential_std, "Error bar of the potential", "Standard deviation (px²)",
@@ -110,11 +118,10 @@ def limits_picture() -> None:
     figure, axes = page("What error bars from noise do not contain", 3, 1, 4.3)
     for panel, (title, truth, beam) in zip(axes, cases, strict=True):
         shot = rng.poisson(counts * synthetic_image(truth, beam / beam.mean()))
-        found = uncertainty(shot, 20, source=flat)
-        values, std = found.inversion.displacement[1, 60], found.displacement_std[1, 60]
-        draw_cut(panel, values, std, truth[1, 60])
+        field, found = sampled(shot, flat, 20)
+        draw_cut(panel, field[1, 60], found.displacement_std[1, 60], truth[1, 60])
         tidy(panel, title, "x (px)", "Displacement along x (px)", ASPECT)
-        held = np.mean(np.abs(found.inversion.displacement - truth) < found.displacement_std)
+        held = np.mean(np.abs(field - truth) < found.displacement_std)
         panel.set_xlabel(f"x (px)\ntruth within one error bar: {held:.0%} of all pixels")
     save(figure, "uncertainty-limits.png")
 

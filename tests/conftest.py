@@ -22,7 +22,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.inversion import Cells, Inversion, Report
-from napari_shadowinv.inversion.error_budget import ErrorEstimate, Errors
+from napari_shadowinv.inversion.error_budget import ErrorBudget, ErrorEstimate
 from napari_shadowinv.inversion.solution_checks import image_residual
 from napari_shadowinv.options import FitOptions, InversionOptions
 from napari_shadowinv.physics.beam import BeamSetup
@@ -120,25 +120,25 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         "flux_left": {},
         "flux_entered": {},
         "sites_reason": "as requested",
-        "errors": Errors(
-            peak=float(np.hypot(*blob.displacement).max()),
-            rms=float(np.sqrt((blob.displacement**2).sum(axis=0).mean())),
-            discretisation=ErrorEstimate(0.01, 0.02),
-            noise=ErrorEstimate(0.1, 0.05),
-            effects={"solver": ErrorEstimate(1e-5, 2e-5)},
-            edge=ErrorEstimate(0.05, 0.01),
-            sides=("left",),
-            beam=ErrorEstimate(2.0, 1.0),
-            beam_sensitivity=ErrorEstimate(0.4, 0.2),
-            sensitivities={"blur, 1 px": ErrorEstimate(0.02, 0.03)},
-            sizes={},
-            beam_variation=0.05,
-            beam_scale=0.25,
-            beam_basis="assumed",
-            noise_correlation=0.0,
-        ),
         "image_residual": image_residual(image, reprojection, np.ones(shape, dtype=bool)),
     }
+    errors = ErrorBudget(
+        peak=float(np.hypot(*blob.displacement).max()),
+        rms=float(np.sqrt((blob.displacement**2).sum(axis=0).mean())),
+        discretisation=ErrorEstimate(0.01, 0.02),
+        noise=ErrorEstimate(0.1, 0.05),
+        effects={"solver": ErrorEstimate(1e-5, 2e-5)},
+        edge=ErrorEstimate(0.05, 0.01),
+        sides=("left",),
+        beam=ErrorEstimate(2.0, 1.0),
+        beam_sensitivity=ErrorEstimate(0.4, 0.2),
+        sensitivities={"blur, 1 px": ErrorEstimate(0.02, 0.03)},
+        sizes={},
+        beam_variation=0.05,
+        beam_scale=0.25,
+        beam_basis="assumed",
+        noise_correlation=0.0,
+    )
     return Inversion(
         image=image,
         source=source,
@@ -157,6 +157,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         mask=np.ones(shape, dtype=bool),
         report=Report(**{**facts, **report}),  # type: ignore[arg-type]
         options=InversionOptions(n_sites=17, tolerance=1e-3, seed=5, negative="clip"),
+        errors=errors,
     )
 
 

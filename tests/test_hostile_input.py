@@ -41,7 +41,7 @@ from napari_shadowinv import (
 from napari_shadowinv._system.safety import LIMIT_VARIABLE, check_regular, resolved_path
 from napari_shadowinv.cli._export import _escape_cell
 from napari_shadowinv.film import Calibration, Pack, usable_pixels
-from napari_shadowinv.inversion import Inversion, plan_sites, uncertainty
+from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_toml
 from napari_shadowinv.io.files import sha256
@@ -161,13 +161,12 @@ HUGE = np.broadcast_to(np.float64(1), (300_000, 300_000))
     [
         lambda: invert(HUGE),
         lambda: plan_sites(HUGE),
-        lambda: uncertainty(HUGE, options={"units_per_quantum": 1.0}),
         lambda: fit(HUGE),
         lambda: fit(shots_of([HUGE, HUGE], strength=[1, 0.6])),
         lambda: run(Recipe(), HUGE),
         lambda: synthetic_image(np.broadcast_to(HUGE, (2, *HUGE.shape))),
     ],
-    ids=["invert", "plan_sites", "uncertainty", "fit", "fit list", "run", "forward"],
+    ids=["invert", "plan_sites", "fit", "fit list", "run", "forward"],
 )
 def test_image_too_large_for_the_memory_is_refused_first(call: Callable[[], Any]) -> None:
     with pytest.raises(InputError, match="300000 × 300000 pixels needs about"):

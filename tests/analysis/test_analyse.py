@@ -28,7 +28,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.inversion import Inversion, invert
-from napari_shadowinv.inversion.error_bars import Quantity, uncertainty
+from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -58,16 +58,12 @@ def test_bands_hold_the_truth_as_often_as_they_say(
 
 
 def test_bands_are_those_of_uncertainty(inversion: Inversion):
-    # The noise is measured in the image, here it is that of counts.
-    counts = inversion.image * inversion.report.flux_scale
-
     def mean(potential: np.ndarray, displacement: np.ndarray) -> float:
         return float(displacement[1, 20:44, 20:44].mean())
 
-    reference = uncertainty(
-        np.rint(counts), 200, source=inversion.source, quantities={"mean": mean},
-        options={"n_sites": len(inversion.cells.sites)},
-    )  # fmt: skip
+    # The noise is measured in the image, here it is that of counts.
+    sampled = inversion.uncertainty(200, noise="poisson", quantities={"mean": mean})
+    reference = sampled.errors.samples
     region = Region(rectangle=((19.5, 19.5), (43.5, 43.5)))
     (result,) = analyse(inversion, region, samples=200, unit="px")
     assert result["mean_x"].value == pytest.approx(

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 import threading
@@ -21,7 +22,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.geometry.interpolation import WIDTH
-from napari_shadowinv.inversion import Inversion, error_bars, plan_sites, samples, uncertainty
+from napari_shadowinv.inversion import ErrorSamples, Inversion, plan_sites, resampling, samples
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.poisson import border_mean
 
@@ -51,6 +52,24 @@ def counts(clean):
     return np.random.default_rng(5).poisson(200 * clean)
 
 
+def samples_of(
+    image, n, *, noise="poisson", method="linear", quantities=None, on_progress=None, **given
+) -> ErrorSamples:
+    """Samples of the noise alone of an image."""
+    inversion = invert(image, **given)
+    sampled = inversion.uncertainty(
+        n,
+        noise=noise,
+        noise_only=True,
+        method=method,
+        quantities=quantities,
+        on_progress=on_progress,
+    )
+    assert sampled.errors is not None
+    assert sampled.errors.samples is not None
+    return sampled.errors.samples
+
+
 def poisson_shot(clean, rng):
     return rng.poisson(COUNTS * clean)
 
@@ -73,7 +92,7 @@ def test_error_bars_of_one_shot_are_the_scatter_of_many(phantom, clean, plan, sh
     potentials = [inversion.potential for inversion in inversions]
     displacements = [inversion.displacement for inversion in inversions]
     for method, n in (("linear", 200), ("resolve", 20)):
-        result = uncertainty(shots[0], n, plan=plan, noise=noise, method=method, options=OPTIONS)
+        result = samples_of(shots[0], n, plan=plan, noise=noise, method=method, options=OPTIONS)
         for std, fields, truth in (
             (result.potential_std, potentials, true),
             (result.displacement_std, displacements, phantom.displacement),
@@ -92,20 +111,12 @@ def test_error_bars_of_correlated_noise_are_the_scatter_of_many():
         noise = ndimage.gaussian_filter(rng.normal(size=clean.shape), 1.2, mode="wrap")
         return clean + 0.03 * noise / noise.std()
 
-    result = uncertainty(shot(), 60, plan=sites, noise=0.03, options=OPTIONS)
+    result = samples_of(shot(), 60, plan=sites, noise=0.03, options=OPTIONS)
     assert "correlated over 1." in result.noise
     displacements = [invert(shot(), plan=sites, options=OPTIONS).displacement for _ in range(20)]
     ratio = result.displacement_std / np.std(displacements, axis=0, ddof=1)
     # Without correlation, they would be four times as small.
     assert np.median(ratio) == pytest.approx(1, abs=0.35)
-
-
-def test_the_inversion_is_that_of_the_image(counts, plan):
-    result = uncertainty(counts, 2, plan=plan)
-    alone = invert(counts, plan=plan)
-    np.testing.assert_array_equal(result.inversion.potential, alone.potential)
-    without_plan = uncertainty(counts, 2)
-    np.testing.assert_array_equal(without_plan.inversion.potential, invert(counts).potential)
 
 
 @pytest.mark.parametrize("method", ["linear", "resolve"])
@@ -114,25 +125,22 @@ def test_error_bars_hold_what_lies_beyond_the_edge(method):
     whole = gaussian_blob((64, 96), 60.0, 9.0, (30.0, 36.0)).displacement
     image = np.random.default_rng(2).poisson(1000 * synthetic_image(whole))[:, 32:]
     truth = whole[:, :, 32:]
-    result = uncertainty(
-        image,
-        24,
-        source=np.full(shape, 1000.0),
-        method=method,
-        options=InversionOptions(n_sites=1000),
-        quantities={"peak": lambda _, displacement: np.hypot(*displacement).max()},
-    )
-    inversion, std = result.inversion, result.displacement_std
-    assert inversion.pixel_errors.causes == ("noise", "edge")
+    inversion = invert(image, source=np.full(shape, 1000.0), options=InversionOptions(n_sites=1000))
+    peak = {"peak": lambda _, displacement: np.hypot(*displacement).max()}
+    errors = inversion.uncertainty(
+        24, noise="poisson", noise_only=True, method=method, quantities=peak
+    ).errors
+    result, std = errors.samples, errors.per_pixel
+    assert errors.causes == ("noise", "edge")
     total = float(np.sqrt((std**2).sum(axis=0).mean()))
-    assert total == pytest.approx(inversion.errors.total.rms, rel=0.1)
+    assert total == pytest.approx(errors.total.rms, rel=0.1)
     assert np.median(np.abs(inversion.displacement - truth) / std) == pytest.approx(0.7, abs=0.4)
     assert result.quantities["peak"].std > 0.05 * np.hypot(*truth).max()
 
 
 def test_small_noise_twice_as_large_gives_error_bars_twice_as_large(clean, plan):
     small, large = (
-        uncertainty(clean, 4, plan=plan, noise=noise, options=OPTIONS) for noise in (0.01, 0.02)
+        samples_of(clean, 4, plan=plan, noise=noise, options=OPTIONS) for noise in (0.01, 0.02)
     )
     ratio = large.potential_std / small.potential_std
     assert np.median(ratio) == pytest.approx(2, rel=0.01)
@@ -140,23 +148,23 @@ def test_small_noise_twice_as_large_gives_error_bars_twice_as_large(clean, plan)
 
 
 def test_gain_says_how_many_units_a_quantum_makes(counts, plan):
-    as_counts = uncertainty(counts, 3, plan=plan)
-    as_units = uncertainty(
+    as_counts = samples_of(counts, 3, plan=plan)
+    as_units = samples_of(
         8.0 * counts, 3, plan=plan, options=InversionOptions(units_per_quantum=8.0)
     )
     np.testing.assert_allclose(as_units.displacement_std, as_counts.displacement_std, rtol=1e-6)
-    mistaken = uncertainty(8.0 * counts, 3, plan=plan)
+    mistaken = samples_of(8.0 * counts, 3, plan=plan)
     ratio = mistaken.displacement_std / as_counts.displacement_std
     assert np.median(ratio) == pytest.approx(8**-0.5, rel=0.25)
 
 
 def test_an_array_gives_each_pixel_its_own_noise(clean, plan):
     everywhere = np.full(SHAPE, 0.05)
-    by_array = uncertainty(clean, 3, plan=plan, noise=everywhere, options=OPTIONS)
-    by_number = uncertainty(clean, 3, plan=plan, noise=0.05, options=OPTIONS)
+    by_array = samples_of(clean, 3, plan=plan, noise=everywhere, options=OPTIONS)
+    by_number = samples_of(clean, 3, plan=plan, noise=0.05, options=OPTIONS)
     np.testing.assert_array_equal(by_array.potential_std, by_number.potential_std)
     right_only = np.where(np.arange(SHAPE[1]) < 24, 0.0, everywhere)
-    lopsided = uncertainty(clean, 3, plan=plan, noise=right_only, options=OPTIONS)
+    lopsided = samples_of(clean, 3, plan=plan, noise=right_only, options=OPTIONS)
     noiseless, noisy = lopsided.displacement_std[:, :, :16], lopsided.displacement_std[:, :, 32:]
     assert np.median(noiseless) < 0.5 * np.median(noisy)
 
@@ -164,10 +172,10 @@ def test_an_array_gives_each_pixel_its_own_noise(clean, plan):
 @pytest.mark.parametrize("noise", [0.02, 0.2])
 def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, clean, plan, noise):
     choices = {"plan": plan, "noise": noise, "method": "resolve"}
-    loose = uncertainty(clean, 6, **choices, options=OPTIONS)
+    loose = samples_of(clean, 6, **choices, options=OPTIONS)
     monkeypatch.setattr(samples, "_SAMPLE_SHARE", 0.0)
     strict = OPTIONS.model_copy(update={"tolerance": 1e-6})
-    exact = uncertainty(clean, 6, **choices, options=strict)
+    exact = samples_of(clean, 6, **choices, options=strict)
     assert loose.tolerance > 1e-3 > exact.tolerance
     assert sum(loose.iterations) < sum(exact.iterations)
     for name in ("potential_std", "displacement_std"):
@@ -177,21 +185,21 @@ def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, cle
 
 
 def test_samples_start_from_the_images_weights(counts, plan):
-    result = uncertainty(counts, 5, plan=plan)
+    result = samples_of(counts, 5, plan=plan)
     assert all(result.converged)
-    assert max(result.iterations) < result.inversion.report.iterations
+    assert max(result.iterations) < invert(counts, plan=plan).report.iterations
 
 
 def test_neither_threads_nor_later_samples_change_a_bit(counts, plan):
     serial, parallel = (
-        uncertainty(counts, 2 * WIDTH + 3, plan=plan, options=InversionOptions(threads=threads))
+        samples_of(counts, 2 * WIDTH + 3, plan=plan, options=InversionOptions(threads=threads))
         for threads in (1, 3)
     )
     for name in ("potential_mean", "potential_std", "displacement_mean", "displacement_std"):
         np.testing.assert_array_equal(getattr(serial, name), getattr(parallel, name))
-    fewer = uncertainty(counts, 3, plan=plan)
+    fewer = samples_of(counts, 3, plan=plan)
     assert fewer.residuals == serial.residuals
-    reseeded = uncertainty(counts, 3, plan=plan, options=InversionOptions(seed=1))
+    reseeded = samples_of(counts, 3, plan=plan, options=InversionOptions(seed=1))
     assert not np.allclose(reseeded.potential_std, fewer.potential_std, rtol=1e-3)
 
 
@@ -201,8 +209,8 @@ def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, pla
         "noise": 0.005,
         "options": OPTIONS.model_copy(update={"tolerance": 1e-7}),
     }
-    linear = uncertainty(clean, 5, **choices)
-    solved = uncertainty(clean, 5, **choices, method="resolve")
+    linear = samples_of(clean, 5, **choices)
+    solved = samples_of(clean, 5, **choices, method="resolve")
     assert linear.nonlinearity < 0.05
     assert solved.nonlinearity == 0
     for name in ("potential_std", "displacement_std"):
@@ -211,40 +219,29 @@ def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, pla
 
 
 def test_noise_too_strong_for_a_linear_response_is_reported(clean, plan):
-    result = uncertainty(clean, 5, plan=plan, noise=1.5, options=OPTIONS)
-    assert result.nonlinearity > 0.3
-    assert "method 'resolve'" in result.warnings[0].text
+    result = invert(clean, plan=plan, options=OPTIONS).uncertainty(5, noise=1.5, noise_only=True)
+    assert result.errors.samples.nonlinearity > 0.3
+    assert result.cautions[-1].code == "samples"
 
 
 def test_each_sample_is_zero_in_the_mean_over_the_border(counts, plan):
-    assert border_mean(uncertainty(counts, 3, plan=plan).potential_mean) == pytest.approx(
+    assert border_mean(samples_of(counts, 3, plan=plan).potential_mean) == pytest.approx(
         0, abs=1e-10
     )
 
 
-def test_values_of_masked_pixels_do_not_matter(counts):
-    mask = np.ones(SHAPE, bool)
-    mask[:8, :9] = False
-    first, second = (
-        uncertainty(np.where(mask, counts, value), 2, mask=mask, options=IN_COUNTS)
-        for value in (np.nan, 1e30)
-    )
-    np.testing.assert_array_equal(first.potential_std, second.potential_std)
-    assert np.isfinite(first.potential_std).all()
-
-
-def test_samples_below_zero_are_clipped_but_such_an_image_is_refused(clean):
-    result = uncertainty(clean, 2, noise=0.5)
-    assert all(result.converged)
-    with pytest.raises(InputError, match="negative pixels"):
-        uncertainty(clean - 1.0, 2, noise=0.5)
+def test_samples_below_zero_are_clipped(clean):
+    assert all(samples_of(clean, 2, noise=0.5).converged)
 
 
 def test_samples_that_do_not_converge_are_counted(clean):
     options = InversionOptions(max_iterations=1, negative="clip")
-    result = uncertainty(clean, 2, noise=0.5, options=options)
-    assert result.converged == (False, False)
-    assert result.warnings[0].text.startswith("2 of 2 samples that were solved did not converge")
+    inversion = dataclasses.replace(invert(clean), options=options)
+    result = inversion.uncertainty(2, noise=0.5)
+    assert result.errors.samples.converged == (False, False)
+    assert "2 of 2 samples that were solved" in str(result.cautions)
+    with pytest.raises(InputError, match="the inversion did not converge"):
+        invert(clean, options=options).uncertainty(2)
 
 
 def test_progress_comes_from_the_callers_thread_and_counts_the_samples(counts):
@@ -254,9 +251,8 @@ def test_progress_comes_from_the_callers_thread_and_counts_the_samples(counts):
         steps.append(progress)
         threads.add(threading.get_ident())
 
-    uncertainty(counts, 3, on_progress=listen)
-    stages = list(dict.fromkeys(progress.stage for progress in steps))
-    assert stages == ["prepare", "sites", "transport", "read-out", "samples"]
+    samples_of(counts, 3, on_progress=listen)
+    assert {progress.stage for progress in steps} == {"samples"}
     assert threads == {threading.get_ident()}
     assert (steps[-1].step, steps[-1].total) == (3, 3)
 
@@ -269,26 +265,22 @@ def test_cancelling_among_the_samples_ends_them(counts, plan):
             steps.append(progress.step)
 
     with pytest.raises(InversionCancelled, match="samples"):
-        uncertainty(
-            counts,
-            500,
-            plan=plan,
-            on_progress=listen,
-            should_stop=lambda: max(steps, default=0) > 1,
+        invert(counts, plan=plan).uncertainty(
+            500, on_progress=listen, should_stop=lambda: max(steps, default=0) > 1
         )
     assert max(steps) == WIDTH  # samples of a block are done together
 
 
 def test_cancelling_while_samples_are_prepared_waits_for_nothing(monkeypatch, counts, plan):
-    begun, go_on = threading.Event(), threading.Event()
+    begun, go_on, inversion = threading.Event(), threading.Event(), invert(counts, plan=plan)
 
     def prepared(*_):
         begun.set()
         assert go_on.wait(60)
 
-    monkeypatch.setattr(error_bars, "LinearResampling", prepared)
+    monkeypatch.setattr(resampling, "LinearResampling", prepared)
     with pytest.raises(InversionCancelled, match="samples"):
-        uncertainty(counts, 3, plan=plan, should_stop=begun.is_set)
+        inversion.uncertainty(3, should_stop=begun.is_set)
     assert not go_on.is_set()
     go_on.set()
 
@@ -299,37 +291,37 @@ def test_cancelling_while_samples_are_prepared_waits_for_nothing(monkeypatch, co
         ({"n": 1}, "n is 1, expected a whole number of samples, at least 2"),
         ({"n": 2.5}, "n is 2.5, expected a whole number"),
         ({"noise": "gauss"}, "noise is 'gauss', expected 'poisson', a standard deviation"),
-        ({"noise": None}, "noise has values of type object"),
         ({"noise": 0.0}, "noise is zero everywhere"),
         ({"noise": -1.0}, "negative or not finite"),
         ({"noise": np.full(SHAPE, np.nan)}, "negative or not finite"),
         ({"noise": np.ones((3, 4))}, r"noise has shape \(3, 4\), image \(40, 48\)"),
         ({"noise": 1.0, "options": IN_COUNTS}, "1 units per quantum and noise is a standard"),
-        ({"options": {"units_per_quantum": 0.0}}, "greater than 0"),
         ({"options": {"units_per_quantum": 1e-30}}, "more than 1e\\+18 quanta in a pixel"),
     ],
 )
 def test_bad_arguments_are_one_clear_sentence(counts, arguments, says):
     with pytest.raises(InputError, match=says):
-        uncertainty(counts, **arguments)
+        samples_of(counts, **{"n": 2, **arguments})
 
 
 def test_an_image_that_is_not_counts_needs_a_gain(clean):
     with pytest.raises(InputError, match=r"not whole numbers.*give the image units per"):
-        uncertainty(clean)
+        samples_of(clean, 2)
 
 
 @pytest.fixture(scope="module")
-def result(counts, plan):
-    return uncertainty(counts, 3, plan=plan)
+def sampled(counts, plan):
+    return invert(counts, plan=plan).uncertainty(3, noise="poisson", noise_only=True)
 
 
 def test_dataset_has_a_deviation_beside_each_field(
-    result, proton_setup: ProtonSetup, optical_setup: OpticalSetup
+    sampled, proton_setup: ProtonSetup, optical_setup: OpticalSetup
 ):
+    result = sampled.errors.samples
     for setup in (None, proton_setup, optical_setup):
-        dataset = result.to_dataset(setup)
-        fields = set(result.inversion.to_dataset(setup).data_vars)
+        dataset = sampled.to_dataset(setup)
+        plain = dataclasses.replace(sampled, errors=None)
+        fields = set(plain.to_dataset(setup).data_vars)
         np.testing.assert_array_equal(dataset["potential_std"], result.potential_std)
         np.testing.assert_array_equal(dataset["displacement_mean"], result.displacement_mean)
         deviations = {str(name) for name in dataset.data_vars if str(name).endswith("_std")}
@@ -344,39 +336,39 @@ def test_dataset_has_a_deviation_beside_each_field(
     assert json.loads(dataset.attrs["uncertainty"])["n"] == 3
 
 
-def test_deviations_of_si_fields_belong_to_their_components(result, proton_setup: ProtonSetup):
+def test_deviations_of_si_fields_belong_to_their_components(sampled, proton_setup: ProtonSetup):
     """Protons deflected along y have met a field along x."""
-    dataset = result.to_dataset(proton_setup)
+    dataset = sampled.to_dataset(proton_setup)
     of_one_pixel = np.abs(proton_setup.path_integrated_b(np.array([1.0, 0.0])[:, None, None]))
     along_x = float(of_one_pixel[1, 0, 0])
     np.testing.assert_allclose(
-        dataset["path_integrated_b_std"], along_x * result.displacement_std[::-1], rtol=1e-12
+        dataset["path_integrated_b_std"], along_x * sampled.errors.per_pixel[::-1], rtol=1e-12
     )
 
 
-def test_a_file_keeps_the_error_bars(tmp_path: Path, result, optical_setup: OpticalSetup):
-    write(tmp_path / "shot.shadowinv", result, setup=optical_setup)
+def test_a_file_keeps_the_error_bars(tmp_path: Path, sampled, optical_setup: OpticalSetup):
+    write(tmp_path / "shot.shadowinv", sampled, setup=optical_setup)
     dataset = read(tmp_path / "shot.shadowinv")
-    np.testing.assert_array_equal(dataset["displacement_std"], result.displacement_std)
-    np.testing.assert_array_equal(dataset["potential"], result.inversion.potential)
+    np.testing.assert_array_equal(dataset["displacement_std"], sampled.errors.per_pixel)
+    np.testing.assert_array_equal(dataset["potential"], sampled.potential)
     assert json.loads(dataset.attrs["uncertainty"])["noise"] == "Poisson, 1 per quantum"
 
 
-def test_significance_is_a_fact_also_of_the_file(tmp_path: Path, result):
-    (fact,) = [fact for fact in result.inversion.facts if fact.key == "significance"]
+def test_significance_is_a_fact_also_of_the_file(tmp_path: Path, sampled):
+    (fact,) = [fact for fact in sampled.facts if fact.key == "significance"]
     assert "above 2 σ" in fact.text
     assert "(σ by noise)" in fact.text
-    path = write(tmp_path / "shot.shadowinv", result)
+    path = write(tmp_path / "shot.shadowinv", sampled)
     restored = Inversion.from_dataset(read(path))
-    assert restored.pixel_errors is not None
-    np.testing.assert_array_equal(restored.pixel_errors.std, result.displacement_std)
+    assert restored.errors is not None
+    np.testing.assert_array_equal(restored.errors.per_pixel, sampled.errors.per_pixel)
     assert fact in restored.facts
     write(path, restored, overwrite=True)
     assert fact in Inversion.from_dataset(read(path)).facts
 
 
-def test_a_damaged_standard_deviation_is_refused(result):
-    dataset = result.to_dataset()
+def test_a_damaged_standard_deviation_is_refused(sampled):
+    dataset = sampled.to_dataset()
     dataset["displacement_std"] = dataset["displacement_std"].isel(component=0, drop=True)
     with pytest.raises(InputError, match="displacement_std has shape"):
         Inversion.from_dataset(dataset)
@@ -390,7 +382,7 @@ def test_the_page_about_error_bars_works_as_it_stands_there(tmp_path: Path, monk
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(compile(block, page.name, "exec"), names)
     assert (tmp_path / "shot.shadowinv").exists()
-    middle = names["result"].potential_std[24:40, 24:40]  # type: ignore[attr-defined]
+    middle = names["samples"].potential_std[24:40, 24:40]  # type: ignore[attr-defined]
     assert 0.3 * middle.mean() < names["error_bar"] < 1.5 * middle.mean()  # type: ignore[operator]
     for target in re.findall(r"\]\((?!https:)([^)#]+)\)", text):
         assert (page.parent / target).exists(), target
@@ -406,9 +398,9 @@ def test_quantities_may_depend_on_the_first_samples() -> None:
         return {"middle": lambda potential, displacement: potential[12, 12] / spreads[0]}
 
     for method in ("linear", "resolve"):
-        chosen = uncertainty(counts, n=20, method=method, quantities=choose)
+        chosen = samples_of(counts, n=20, method=method, quantities=choose)
         middle = {"middle": lambda potential, displacement: potential[12, 12]}
-        fixed = uncertainty(counts, n=20, method=method, quantities=middle)
+        fixed = samples_of(counts, n=20, method=method, quantities=middle)
         np.testing.assert_allclose(
             chosen.quantities["middle"].samples * spreads.pop(), fixed.quantities["middle"].samples
         )

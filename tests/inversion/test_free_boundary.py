@@ -7,7 +7,6 @@ import pytest
 
 from napari_shadowinv import InputError, InversionOptions, invert, synthetic_image
 from napari_shadowinv.inversion import plan_sites
-from napari_shadowinv.inversion.error_bars import uncertainty
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.transport.sites import Margin, edge_flux
 
@@ -140,9 +139,10 @@ def test_a_start_and_a_plan_change_nothing_but_the_steps(across, plan):
 
 def test_error_bars_know_the_boundary(across, plan):
     options = FREE.model_copy(update={"n_sites": 500})
-    bars = uncertainty(across[0], 3, source=np.ones((SIDE, SIDE)), noise=0.05, options=options)
+    inversion = invert(across[0], source=np.ones((SIDE, SIDE)), options=options)
+    bars = inversion.uncertainty(3, noise=0.05, noise_only=True).errors.samples
     assert bars.potential_std.shape == (SIDE, SIDE)
-    deviation = bars.potential_mean - bars.inversion.potential
+    deviation = bars.potential_mean - inversion.potential
     assert np.abs(deviation).max() < 6 * bars.potential_std.max()
 
 

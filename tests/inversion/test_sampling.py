@@ -14,7 +14,7 @@ from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH, CloughTocher, with_gradients
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
-from napari_shadowinv.inversion import plan_sites, uncertainty
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion import samples as sampling
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import read_dual
@@ -45,18 +45,17 @@ def image():
 
 @pytest.fixture(scope="module", params=KINDS)
 def case(request, image):
-    """Options, a plan, and what `uncertainty` makes of them."""
+    """Options, a plan, and what `Inversion.uncertainty` makes of them."""
     mask = None
     if request.param == "masked":
         mask = np.ones(SHAPE, bool)
         mask[20:30, 5:25] = mask[50:, 50:] = False
     options = InversionOptions(n_sites=1000, negative="clip", **KINDS[request.param])
     plan = plan_sites(np.ones(SHAPE), options, mask=mask)
-    draw, _ = noise_of(image, NOISE, None, mask)
-    weights = invert(image, plan=plan, options=options).cells.weights
-    samples = FullResampling(plan, weights, lambda rng: draw(rng, 0.0), options)
-    clean = prepare(image, plan.source, options, mask).floored_image
-    return samples, clean
+    inversion = invert(image, plan=plan, options=options)
+    draw, _ = noise_of(image, NOISE, None, inversion.mask)
+    samples = FullResampling(plan, inversion.cells.weights, image, draw, options)
+    return samples, prepare(image, plan.source, options, mask).floored_image
 
 
 def alone(samples, clean, seed):
@@ -81,7 +80,7 @@ def test_moments_are_those_of_samples_read_out_one_by_one(case):
     """To rounding and the tolerance of the linear system; sampling errs by a tenth and more."""
     samples, clean = case
     seeds = np.random.SeedSequence(0).spawn(WIDTH + 3)
-    response = LinearResampling(samples, clean, 2)
+    response = LinearResampling(samples, 2)
     blocks = seeds[:WIDTH], seeds[WIDTH:]
     scatter = response.scatter(blocks[0], Reporter()) + response.scatter(blocks[1], Reporter())
     each = np.array([alone(samples, clean, seed) for seed in seeds])
@@ -93,9 +92,9 @@ def test_moments_are_those_of_samples_read_out_one_by_one(case):
 
 
 def test_a_sample_is_the_same_in_any_block(case):
-    samples, clean = case
+    samples, _ = case
     seeds = np.random.SeedSequence(0).spawn(WIDTH)
-    serial, parallel = LinearResampling(samples, clean, 1), LinearResampling(samples, clean, 3)
+    serial, parallel = LinearResampling(samples, 1), LinearResampling(samples, 3)
     together = serial.changes(seeds)
     np.testing.assert_array_equal(parallel.changes(seeds[5:]), together[5:])
     np.testing.assert_array_equal(
@@ -105,9 +104,10 @@ def test_a_sample_is_the_same_in_any_block(case):
 
 def test_too_many_sites_for_factors_are_left_to_the_multigrid(monkeypatch, image):
     options = InversionOptions(n_sites=1000, negative="clip")
-    factorised = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
+    inversion = invert(image, options=options)
+    factorised = inversion.uncertainty(WIDTH + 2, noise=NOISE).errors.samples
     monkeypatch.setattr(sampling, "_MOST_FACTORISED", 0)
-    iterative = uncertainty(image, WIDTH + 2, noise=NOISE, options=options)
+    iterative = inversion.uncertainty(WIDTH + 2, noise=NOISE).errors.samples
     assert not np.array_equal(iterative.potential_std, factorised.potential_std)
     for name in ("potential_std", "displacement_std"):
         bars, exact_bars = getattr(iterative, name), getattr(factorised, name)

@@ -22,7 +22,6 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import inversion_layers, sample_arrows
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion import Cells, Inversion
-from napari_shadowinv.physics.significance import PixelErrors
 
 
 def by_role(layers: list[Any]) -> dict[str, Any]:
@@ -342,7 +341,7 @@ def test_structures_of_an_inversion_are_outlined_on_its_significance(
     viewer: ViewerModel, solved: Inversion
 ) -> None:
     std = np.full_like(solved.displacement, 0.05)
-    certain = replace(solved, pixel_errors=PixelErrors(std, ("noise",)))
+    certain = replace(solved, errors=replace(solved.errors, per_pixel=std, causes=("noise",)))
     layers = by_role(add_to_viewer(viewer, certain, all_layers=True))
     expected = np.hypot(*solved.displacement) / 0.05
     np.testing.assert_allclose(layers["significance"].data, expected)

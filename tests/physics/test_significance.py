@@ -8,11 +8,10 @@ from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv.facts import Level
 from napari_shadowinv.physics.significance import (
-    PixelErrors,
     deviation_along,
     find_structures,
     significance,
-    significance_fact,
+    significance_facts,
     structures_of,
 )
 
@@ -115,8 +114,8 @@ def test_correlated_errors_alone_are_rarely_a_structure():
 
 def test_the_sentence_counts_structures_and_names_the_causes():
     displacement = np.stack([patches(6.0, 20.0), np.zeros(SHAPE)])
-    errors = PixelErrors(np.ones((2, *SHAPE)), ("noise", "beam, 5 %"))
-    fact = significance_fact(structures_of(displacement, errors), errors)
+    structures = structures_of(displacement, np.ones((2, *SHAPE)))
+    (fact,) = significance_facts(structures, ("noise", "beam, 5 %"))
     assert (fact.key, fact.level) == ("significance", Level.SOUND)
     assert fact.text == (
         "2 structures stand above 2 σ, on 2.5 % of the pixels, up to 20 σ (σ by noise; beam, 5 %)"
@@ -133,9 +132,7 @@ def test_the_sentence_counts_structures_and_names_the_causes():
     ids=["weak", "chance", "speck"],
 )
 def test_a_field_within_its_errors_is_doubtful(plane: np.ndarray, reason: str):
-    errors = PixelErrors(np.ones((2, *SHAPE)))
-    fact = significance_fact(
-        structures_of(np.stack([plane, np.zeros(SHAPE)]), errors), errors, name="E"
-    )
+    structures = structures_of(np.stack([plane, np.zeros(SHAPE)]), np.ones((2, *SHAPE)))
+    (fact,) = significance_facts(structures, (), name="E")
     assert (fact.title, fact.level) == ("Significance E", Level.DOUBTFUL)
     assert fact.text == f"no structure stands above 2 σ: {reason}"

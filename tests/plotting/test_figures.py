@@ -18,7 +18,6 @@ from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.physics.significance import PixelErrors
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.plotting import (
     comparison_figure,
@@ -383,7 +382,7 @@ def hatched(axes: Any) -> list[Any]:
 
 def test_pixels_outside_structures_are_hatched(inversion: Inversion, make_fit: MakeFit) -> None:
     std = np.full_like(inversion.displacement, 0.02)
-    certain = replace(inversion, pixel_errors=PixelErrors(std))
+    certain = replace(inversion, errors=replace(inversion.errors, per_pixel=std))
     fit = make_fit()
     for figure, number, structures in (
         (report_figure(certain), 2, certain.structures),
@@ -401,12 +400,12 @@ def test_pixels_outside_structures_are_hatched(inversion: Inversion, make_fit: M
 
 
 def test_nothing_is_hatched_without_errors_of_pixels(inversion: Inversion) -> None:
-    assert inversion.pixel_errors is None
     assert not any(hatched(axes) for axes in panels(report_figure(inversion)))
 
 
 def test_a_field_within_its_errors_is_an_alarm_below_the_figure(inversion: Inversion) -> None:
     std = np.full_like(inversion.displacement, 100.0)
-    figure = report_figure(replace(inversion, pixel_errors=PixelErrors(std)))
+    errors = replace(inversion.errors, per_pixel=std)
+    figure = report_figure(replace(inversion, errors=errors))
     (text,) = [each for each in figure.texts if "no structure stands above 2 σ" in each.get_text()]
     assert text.get_color() == ALARM_COLOUR

@@ -26,7 +26,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv._system.arrays import block_sums, coordinate_spacing, order_by_value
 from napari_shadowinv.fitting.measurements import collect_data
-from napari_shadowinv.inversion import plan_sites, uncertainty
+from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing.estimates import uniform_source
@@ -134,15 +134,6 @@ def test_plan_without_the_mask_is_refused(burnt: np.ma.MaskedArray[Any, Any]) ->
 
     masked = plan_sites(np.ones(SHOT.shape), OPTIONS, mask=~burnt.mask)
     assert np.array_equal(invert(burnt, plan=masked, options=OPTIONS).mask, ~burnt.mask)
-
-
-def test_uncertainty_draws_no_noise_under_a_mask(burnt: np.ma.MaskedArray[Any, Any]) -> None:
-    burnt = np.ma.MaskedArray(np.rint(burnt.data), burnt.mask)
-
-    expected = uncertainty(burnt.data, 2, mask=~burnt.mask, options=OPTIONS)
-
-    result = uncertainty(burnt, 2, options=OPTIONS)
-    assert np.array_equal(result.displacement_std, expected.displacement_std)
 
 
 def test_estimate_ignores_masked_pixels(burnt: np.ma.MaskedArray[Any, Any]) -> None:

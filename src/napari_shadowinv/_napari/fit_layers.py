@@ -51,10 +51,8 @@ def fit_layers(result: Result[Fit], frame: Frame, name: str, *, alone: bool = Fa
         }
         if fit.mask.shape[1:] == field.potential.shape:
             variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
-        errors, structures = fit.pixel_errors(field), fit.structures(field)
-        variables |= significance_variables(field.displacement, errors, structures)
-        if field.uncertainty is not None:
-            variables["displacement_uncertainty"] = ("component", "y", "x"), field.uncertainty
+        structures = fit.structures(field)
+        variables |= significance_variables(field.displacement, field.uncertainty, structures)
         title = _field_title(name, fit, field)
         part = {"part": field.name} if m else {}
         level = fit.headline.level

@@ -17,7 +17,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.facts import Level
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
-from napari_shadowinv.physics.significance import PixelErrors, Structures, significance
+from napari_shadowinv.physics.significance import Structures, significance
 from napari_shadowinv.physics.units import (
     ShownField,
     intensity_limits,
@@ -139,20 +139,20 @@ def field_layers(result: Result[RetrievedField], frame: Frame, name: str = "") -
     """Describe the layers of a field without images."""
     content, dataset = result.content, result.content.dataset
     field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]].assign(
-        significance_variables(content.displacement, content.pixel_errors, content.structures)
+        significance_variables(content.displacement, content.displacement_std, content.structures)
     )
     return dataset_layers(View(field, result.setup), frame, name, shared_metadata(result, name))
 
 
 def significance_variables(
-    displacement: FloatArray, errors: PixelErrors | None, structures: Structures | None
+    displacement: FloatArray, std: FloatArray | None, structures: Structures | None
 ) -> dict[str, tuple[tuple[str, ...], AnyArray]]:
     """Return the map |d|/σ and the structures in it as variables; none without errors."""
-    if errors is None or structures is None:
+    if std is None or structures is None:
         return {}
     return {
-        "displacement_uncertainty": (("component", "y", "x"), errors.std),
-        "significance": (("y", "x"), significance(displacement, errors.std)),
+        "displacement_uncertainty": (("component", "y", "x"), std),
+        "significance": (("y", "x"), significance(displacement, std)),
         "structures": (("y", "x"), structures.labels),
     }
 
@@ -167,9 +167,10 @@ def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> La
     import xarray as xr
 
     content = result.content
+    std = None if content.errors is None else content.errors.per_pixel
     dataset = xr.Dataset(
         {name: (dims, content.variable(name)) for name, (dims, _, _) in VARIABLES.items()}
-    ).assign(significance_variables(content.displacement, content.pixel_errors, content.structures))
+    ).assign(significance_variables(content.displacement, std, content.structures))
     view = View(dataset, result.setup)
     facts, level = shared_metadata(result, name), content.headline.level
     layer_data = dataset_layers(view, frame, name, facts, level)

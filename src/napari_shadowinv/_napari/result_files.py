@@ -36,10 +36,17 @@ _LOOKS, _NAME = "napari_layers", "napari_name"
 _MAX_NAMES = 3  # in a message
 
 # Attributes that are recomputed when a result is saved.
-_COMPUTED_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual", "errors_si"}
+_COMPUTED_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual"}
 _COMPUTED_ATTRIBUTES |= {"instrument", "setup", "provenance", "package_version", "created"}
 _COMPUTED_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
-_COMPUTED_ATTRIBUTES |= {"error_causes", "warnings", "seen_from", "scan_pixel_size"}
+_COMPUTED_ATTRIBUTES |= {
+    "errors",
+    "error_causes",
+    "errors_si",
+    "warnings",
+    "seen_from",
+    "scan_pixel_size",
+}
 
 _PLACEMENT = ("scale", "translate", "units")
 _TRANSFORM = ("rotate", "shear", "affine")

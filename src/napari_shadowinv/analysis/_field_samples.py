@@ -17,12 +17,10 @@ from napari_shadowinv.analysis.paths import is_inside
 from napari_shadowinv.analysis.product import FieldNoise
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import invert, plan_sites
+from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.budget import discretisation_share
-from napari_shadowinv.inversion.error_bars import Uncertainty, uncertainty
-from napari_shadowinv.inversion.noise import ImageNoise
-from napari_shadowinv.inversion.normalise import prepare
-from napari_shadowinv.options import Instrument, InversionOptions
+from napari_shadowinv.inversion.error_budget import ErrorBudget
+from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import potential_from_displacement
@@ -117,13 +115,7 @@ class ResampledInversion(SampledField):
 
     def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:
         inversion = self.inversion
-        mask = None if inversion.mask.all() else inversion.mask
-        options, noise = recorded_shot(inversion, mask)
-        plan = plan_sites(
-            inversion.source, options, mask=mask, measured=has_measured_source(inversion),
-            **callbacks,
-        )  # fmt: skip
-        coarse = self._coarse_inversion(options, mask, callbacks)
+        coarse = self._coarse_inversion(callbacks)
         measures: list[Measure] = []
 
         def quantities(changes: FloatArray) -> dict[str, Measure]:
@@ -133,28 +125,19 @@ class ResampledInversion(SampledField):
             kind = sample_type(samples, size)
             return {"all": lambda *field: measures[0](*field).astype(kind, copy=False)}
 
-        scatter = uncertainty(
-            inversion.image,
-            samples,
-            noise=noise,
-            options=options,
-            instrument=inversion.instrument,
-            quantities=quantities,
-            plan=plan,
-            **callbacks,
-        )
+        sampled = inversion.uncertainty(samples, quantities=quantities, **callbacks)
         (measure,) = measures
-        value = measure(self.potential, self.displacement)
-        repeated = scatter.quantities["all"]
-        systematic, causes = {}, ["noise", *scatter.imperfections]
+        value, errors, systematic = measure(self.potential, self.displacement), sampled.errors, {}
+        assert errors is not None
+        assert errors.samples is not None
         if coarse is not None:
             share = discretisation_share(len(inversion.cells.sites) / len(coarse.cells.sites))
             change = value - measure(coarse.potential, coarse.displacement)
             systematic["discretisation"] = share * change
-        shifted = repeated.samples
-        shifted += (value - repeated.value).astype(shifted.dtype)
-        cautions = tuple(self._sample_cautions(scatter))
-        return Evaluation(value, shifted, systematic, tuple(causes), cautions)
+        numbers, cautions = errors.samples.quantities["all"].samples, []
+        if is_noise_notable(errors):
+            cautions = [each for each in sampled.cautions if each.code == "samples"]
+        return Evaluation(value, numbers, systematic, errors.causes, tuple(cautions))
 
     def within_pixels(self) -> tuple[FloatArray, FloatArray]:
         """Return the field if the brightness had a slope within pixels.
@@ -166,69 +149,39 @@ class ResampledInversion(SampledField):
         change = np.log(np.maximum(area, LEAST_LIGHT)) / 12
         return self.potential + change, self.displacement + displacement_from_potential(change)
 
-    def _sample_cautions(self, scatter: Uncertainty, least: float = 0.2) -> Iterator[Caution]:
-        """Yield doubts about samples, if noise is not below a share of the discretisation error."""
-        errors = self.inversion.errors
-        by_noise = float(np.sqrt((scatter.displacement_std**2).sum(axis=0).mean()))
-        # Without noise, samples differ by the tolerance of the solver.
-        if errors is not None and by_noise < least * errors.discretisation.rms:
-            return
-        yield from (each for each in scatter.warnings if each.code == "samples")
-
-    def _coarse_inversion(
-        self, options: InversionOptions, mask: BoolArray | None, callbacks: Callbacks
-    ) -> Inversion | None:
+    def _coarse_inversion(self, callbacks: Callbacks) -> Inversion | None:
         """Invert the image with a quarter of the sites; None if these are fewer than 16."""
         inversion = self.inversion
-        count = (options.n_sites or 0) // 4
+        count = number_of_inner_sites(inversion) // 4
         if count < 16:
             return None
+        changes: dict[str, Any] = {"n_sites": count}
+        if inversion.options.flux == "fit":  # the image of a result is scaled by it
+            changes["flux"] = "known"
         coarse = invert(
             inversion.image,
             source=inversion.source,
-            mask=mask,
-            options=options.model_copy(update={"n_sites": count}),
+            mask=None if inversion.mask.all() else inversion.mask,
+            options=inversion.options.model_copy(update=changes),
             instrument=inversion.instrument,
             **callbacks,
         )
         return coarse if len(coarse.cells.sites) < len(inversion.cells.sites) else None
 
 
-def recorded_shot(inversion: Inversion, mask: BoolArray | None) -> tuple[InversionOptions, Any]:
-    """Return options that repeat an inversion of its own image, and its noise for `uncertainty`.
+def is_noise_notable(errors: ErrorBudget, least: float = 0.2) -> bool:
+    """Return whether samples scatter by more than a share of the discretisation error.
 
-    The image of a result is scaled to the flux of its source, and so are the noise level and the
-    units per quantum here.
+    Without noise, they differ by the tolerance of the solver.
     """
-    scale, options = inversion.report.flux_scale, inversion.options
-    changes: dict[str, Any] = {"n_sites": number_of_inner_sites(inversion)}
-    for name in ("noise_level", "units_per_quantum"):
-        if (stated := getattr(options, name)) is not None:
-            changes[name] = stated / scale
-    if options.flux == "fit":
-        changes["flux"] = "known"
-    options = options.model_copy(update=changes)
-    if options.units_per_quantum is not None:
-        return options, "poisson"
-    prepared = prepare(inversion.image, inversion.source, options, mask)
-    noise = ImageNoise(prepared.in_units(), options, inversion.instrument.noise_correlation)
-    mean = inversion.source[inversion.mask].mean()
-    deviation = mean * np.sqrt(noise.variance(inversion.image / mean))
-    return options, np.maximum(deviation, 1e-9 * float(inversion.image.max()))
+    assert errors.per_pixel is not None
+    scatter = float(np.sqrt((errors.per_pixel**2).sum(axis=0).mean()))
+    return not scatter < least * errors.discretisation.rms
 
 
 def number_of_inner_sites(inversion: Inversion) -> int:
     """Return the number of sites to ask for: without those in a margin."""
     return max(int(is_inside(inversion.cells.sites, inversion.image.shape).sum()), 4)
-
-
-def has_measured_source(inversion: Inversion) -> bool:
-    """Return whether the source of an inversion was recorded, as its error budget takes it."""
-    provenance = inversion.provenance
-    if provenance is not None and not provenance.image.measured:
-        return False
-    errors = inversion.errors
-    return errors is None or errors.beam is None or errors.beam_basis not in ("assumed", "outside")
 
 
 def sample_type(count: int, size: int, *, most_double: int = 20_000) -> type[Any]:
@@ -269,9 +222,11 @@ def _of_inversion(
     )  # fmt: skip
     is_folded = any(caution.code == "folds" for caution in inversion.cautions)
     frame = replace(frame, has_crossed_rays=is_folded)
-    yield ResampledInversion(
-        frame, inversion.potential, inversion.displacement, inversion.instrument, inversion
-    )
+    parts = frame, inversion.potential, inversion.displacement, inversion.instrument
+    if inversion.errors is None:
+        yield SampledField(*parts)
+    else:
+        yield ResampledInversion(*parts, inversion)
 
 
 def _of_fit(
@@ -289,8 +244,7 @@ def _of_fit(
         if field.samples is None or not len(field.samples):
             yield SampledField(*parts)
         else:
-            errors = fit.pixel_errors(field)
-            causes = ("noise",) if errors is None else errors.causes
+            causes = ("noise",) if field.uncertainty is None else tuple(fit.report.causes)
             yield StoredSamples(*parts, field.samples, causes)
 
 

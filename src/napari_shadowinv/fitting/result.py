@@ -40,10 +40,9 @@ from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.edge import LARGER_FIELD
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.physics.significance import (
-    PixelErrors,
     Structures,
     deviation_along,
-    significance_fact,
+    significance_facts,
     structures_of,
 )
 from napari_shadowinv.physics.units import (
@@ -497,23 +496,15 @@ class Fit(Summarised):
         if level is not Level.CONDITIONAL and self.explanation != self.assessment.short:
             yield Fact("why", "Why", self.explanation, level)
 
-    def pixel_errors(self, field: FittedField) -> PixelErrors | None:
-        """Return the total error of a field in every pixel with its causes; None if not known."""
-        if field.uncertainty is None:
-            return None
-        return PixelErrors(field.uncertainty, tuple(self.report.causes))
-
     def structures(self, field: FittedField) -> Structures | None:
         """Return the regions where a field stands above its error; None if that is not known."""
-        errors = self.pixel_errors(field)
-        return None if errors is None else structures_of(field.displacement, errors, self.used)
+        return structures_of(field.displacement, field.uncertainty, self.used)
 
     def _significance_facts(self) -> Iterator[Fact]:
         for field in self.fields:
-            errors, structures = self.pixel_errors(field), self.structures(field)
-            if errors is not None and structures is not None:
-                key, name = f"significance_{field.name}", field.name
-                yield significance_fact(structures, errors, key=key, name=name)
+            key, causes = f"significance_{field.name}", self.report.causes
+            structures = self.structures(field)
+            yield from significance_facts(structures, causes, key=key, name=field.name)
 
     def peak_error(self, field: FittedField, shown: ShownField) -> PeakError | None:
         """Return the total error of the largest magnitude of a field; None if not known."""

@@ -1,15 +1,17 @@
 from ._invert import count_sites, invert, plan_sites
-from .error_bars import Maximum, Uncertainty, uncertainty
+from .error_bars import ErrorSamples, Maximum, Quantity
+from .error_budget import ErrorBudget
 from .result import Cells, Inversion, Report
 
 __all__ = [
     "Cells",
+    "ErrorBudget",
+    "ErrorSamples",
     "Inversion",
     "Maximum",
+    "Quantity",
     "Report",
-    "Uncertainty",
     "count_sites",
     "invert",
     "plan_sites",
-    "uncertainty",
 ]

@@ -29,7 +29,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import to_figures
 from napari_shadowinv.inversion import normalise
 from napari_shadowinv.inversion.budget import Budget
-from napari_shadowinv.inversion.error_budget import Errors
+from napari_shadowinv.inversion.error_budget import ErrorBudget
 from napari_shadowinv.inversion.machine_code import loading_kernels
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import Prepared, margin_around, mask_unlit, prepare
@@ -275,9 +275,10 @@ def invert(
         quality,
         warnings=warnings,
         sites_reason=_sites_reason(levels, problem.budget, solution, inputs.start),
-        errors=errors,
+        measured=plan.measured,
     )
-    return _inversion(plan, prepared, solution, quality, inputs.instrument, options)
+    inversion = _inversion(plan, prepared, solution, quality, inputs.instrument, options)
+    return replace(inversion, errors=errors)
 
 
 class _Inputs(NamedTuple):
@@ -407,7 +408,7 @@ class _Solution(NamedTuple):
 
     levels: list[LevelSolution]
     fields: _Fields
-    wait_for_errors: Callable[[], Errors | None]
+    wait_for_errors: Callable[[], ErrorBudget | None]
     adaptive: bool  # whether the number of sites follows from the errors
     finest: bool  # whether it is the largest
     coarse: int  # sites with which structures of the image were missed; 0 if there were none
@@ -457,7 +458,11 @@ def _solve(
 
 
 def _warnings(
-    problem: _Problem, inputs: _Inputs, solution: _Solution, quality: Report, errors: Errors | None
+    problem: _Problem,
+    inputs: _Inputs,
+    solution: _Solution,
+    quality: Report,
+    errors: ErrorBudget | None,
 ) -> tuple[Caution, ...]:
     """Return all reasons to doubt an inversion, the gravest first."""
     options = problem.options
@@ -618,7 +623,7 @@ def _read_fields(
     budget: Budget,
     report: Reporter,
     seconds: dict[str, float],
-) -> tuple[_Fields, Callable[[], Errors | None]]:
+) -> tuple[_Fields, Callable[[], ErrorBudget | None]]:
     """Read the last solution, and begin to estimate its errors; return a function that waits."""
     solution, options = solutions[-1], budget.options
 
@@ -660,7 +665,7 @@ def _read_fields(
     inner = plan.within(potential)
     moves = np.ascontiguousarray(plan.within(displacement))
 
-    def estimate() -> Errors | None:
+    def estimate() -> ErrorBudget | None:
         return budget.errors(solutions, inner, moves) if solution.converged else None
 
     errors_at_end = begin(estimate, options.threads)

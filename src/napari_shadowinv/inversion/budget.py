@@ -34,8 +34,8 @@ from napari_shadowinv.instrument.effects import EFFECTS, SolvedShot, motions
 from napari_shadowinv.instrument.shapes import random_waves
 from napari_shadowinv.inversion.error_budget import (
     SHARE_OF_NOISE,
+    ErrorBudget,
     ErrorEstimate,
-    Errors,
     root_of,
     share_of,
 )
@@ -188,7 +188,7 @@ class Budget:
 
     def errors(
         self, solutions: Sequence[LevelSolution], potential: FloatArray, displacement: FloatArray
-    ) -> Errors:
+    ) -> ErrorBudget:
         """Return the errors of the last solution with its potential and displacement, (2, H, W)."""
         solved = _usable_levels(solutions)
         mask = self._prepared.mask
@@ -229,7 +229,7 @@ class Budget:
         if components is not None and basis == components.basis:
             beam = estimate(response.to(self._beams_of(response, components)))
         edge, sides = _error_by_edge(potential, displacement, mask, np.array([row, column]))
-        return Errors(
+        return ErrorBudget(
             peak=lengths.at_peak,
             rms=lengths.rms,
             discretisation=discretisation,

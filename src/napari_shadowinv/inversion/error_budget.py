@@ -1,16 +1,19 @@
-"""The errors of an inversion by their causes: `Errors`, of which each is an `ErrorEstimate`."""
+"""The errors of an inversion by their causes: `ErrorBudget`, of `ErrorEstimate`s."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import asdict, dataclass, replace
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import limit_text, percent, round_down, to_figures
 from napari_shadowinv.instrument.effects import EFFECTS
+from napari_shadowinv.inversion.error_bars import ErrorSamples
 from napari_shadowinv.physics.edge import edge_doubt
 from napari_shadowinv.physics.units import Condition, PeakError
 
@@ -53,7 +56,7 @@ class ErrorEstimate(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Errors:
+class ErrorBudget:
     """Error budget of an inversion: standard errors of the displacement, in px.
 
     It does not include the effects of a blurred image or of crossing rays.
@@ -100,7 +103,16 @@ class Errors:
         Whether structure hides the noise: its error is then the largest that the image allows.
     assumed : str
         Name of the effect, such as "registration, 0.2 px", whose size nobody stated or measured.
+    per_pixel : ndarray, shape (2, H, W), or None
+        Standard deviation of the displacement in every pixel, if `Inversion.uncertainty` computed
+        it.
+    causes : tuple of str
+        Errors in `per_pixel`, such as "noise" and "beam, 5 %".
+    samples : ErrorSamples or None
+        The samples that it is the deviation of; a file does not keep them.
     """
+
+    __pydantic_config__: ClassVar = ConfigDict(arbitrary_types_allowed=True)
 
     peak: float
     rms: float
@@ -119,6 +131,16 @@ class Errors:
     noise_correlation: float
     noise_is_bound: bool = False
     assumed: str = ""
+    per_pixel: FloatArray | None = None
+    causes: tuple[str, ...] = ()
+    samples: ErrorSamples | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all but what belongs to pixels, for JSON."""
+        content = asdict(replace(self, per_pixel=None, causes=(), samples=None))
+        for name in ("per_pixel", "causes", "samples"):
+            del content[name]
+        return content
 
     @property
     def total(self) -> ErrorEstimate:
@@ -199,7 +221,7 @@ class Errors:
         return lengths.get(self.beam_scale, to_figures(self.beam_scale))
 
     @property
-    def _measured(self) -> Errors:
+    def _measured(self) -> ErrorBudget:
         """The budget without the parts whose sizes were assumed."""
         effects = {name: error for name, error in self.effects.items() if name != self.assumed}
         beam = None if self.beam_basis in _UNMEASURED else self.beam
@@ -315,7 +337,7 @@ class Errors:
             "number of sites",
         )
 
-    def times(self, factor: float) -> Errors:
+    def times(self, factor: float) -> ErrorBudget:
         """Return the budget in another unit; 1 px of displacement is `factor` of it."""
         lengths: dict[str, Any] = {"peak": factor * self.peak, "rms": factor * self.rms}
         for name, value in vars(self).items():
@@ -325,7 +347,7 @@ class Errors:
                 lengths[name] = {cause: error.times(factor) for cause, error in value.items()}
         return replace(self, **lengths)
 
-    def with_scale(self, cause: str, size: float, share: float) -> Errors:
+    def with_scale(self, cause: str, size: float, share: float) -> ErrorBudget:
         """Return the budget of a quantity whose scale has a relative error `share` by a cause.
 
         The cause, such as "energy, 5 %", is known to `size`.

@@ -157,21 +157,27 @@ def lit_pixels(source: FloatArray, mask: BoolArray, options: InversionOptions) -
 
 
 def flooring_for(
-    source: FloatArray, options: InversionOptions, mask: BoolArray | None
+    source: FloatArray,
+    options: InversionOptions,
+    mask: BoolArray | None,
+    flux_scale: float | None = None,
 ) -> Callable[[FloatArray], FloatArray]:
     """Return a function from an image to the `floored_image` of `prepare`, for one source and mask.
 
-    It clips images instead of checking them; quantities of the source are computed once.
+    It divides by `flux_scale`, or brings the image to the source's flux. It clips images instead of
+    checking them; quantities of the source are computed once.
     """
     usable = np.ones(source.shape, bool) if mask is None else mask
     beam = check_source(source, usable)
     flux, count, unit = beam.sum(), usable.sum(), power_of_two(beam)
-    conserved = options.flux != "known"
+    conserved = flux_scale is None and options.flux != "known"
     floored_flux = masked_source(beam, usable, options).sum() if conserved else None
 
     def apply_floor(image: FloatArray) -> FloatArray:
         values = _clip_negative(np.where(usable, image, 0.0))
-        if conserved:
+        if flux_scale is not None:
+            values /= flux_scale
+        elif conserved:
             values /= values.sum() / flux
         return _raise_to_floor(values, options.floor * values.sum() / count, floored_flux) / unit
 

@@ -10,11 +10,13 @@ import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import TypeAdapter
 
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -36,7 +38,9 @@ from napari_shadowinv.facts import (
     to_figures,
     verdict_fact,
 )
-from napari_shadowinv.inversion.error_budget import Errors
+from napari_shadowinv.instrument.effects import RecordedShot
+from napari_shadowinv.inversion.error_bars import Quantities
+from napari_shadowinv.inversion.error_budget import ErrorBudget
 from napari_shadowinv.inversion.normalise import lit_pixels
 from napari_shadowinv.inversion.solution_checks import DECISIVE
 from napari_shadowinv.inversion.variables import (
@@ -50,7 +54,6 @@ from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.edge import beyond_sides
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.significance import (
-    PixelErrors,
     Structures,
     significance_facts,
     structures_of,
@@ -104,8 +107,8 @@ class Report:
         right), as a share of the source's flux in the image; else empty.
     sites_reason : str
         Reason for the number of sites.
-    errors : Errors or None
-        Error budget of the displacement; None if the solver did not converge.
+    measured : bool
+        Whether the source was recorded; else it is an estimate.
     image_residual : float
         Difference of re-projection and image, r.m.s. over the used pixels, as a share of the
         image's mean there.
@@ -127,7 +130,7 @@ class Report:
     flux_entered: dict[str, float]
     image_residual: float
     sites_reason: str = ""
-    errors: Errors | None = None
+    measured: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +195,8 @@ class Inversion(Summarised):
         How well the experiment is known, which the errors hold.
     provenance : Provenance or None
         Recipe and input files, if it was made by a recipe.
-    pixel_errors : PixelErrors or None
-        Standard deviation of the displacement in every pixel, if `uncertainty` computed it.
+    errors : ErrorBudget or None
+        Error budget of the displacement; None if the solver did not converge.
     """
 
     kind: ClassVar = ResultKind.INVERSION
@@ -211,16 +214,11 @@ class Inversion(Summarised):
     options: InversionOptions
     instrument: Instrument = field(default_factory=Instrument)
     provenance: Provenance | None = None
-    pixel_errors: PixelErrors | None = None
+    errors: ErrorBudget | None = None
 
     def _picture(self) -> FloatArray:
         (field,) = shown_fields([self.displacement], self.setup, mask=self.lit)
         return field.magnitude
-
-    @property
-    def errors(self) -> Errors | None:
-        """Error budget of the displacement; see `Report`."""
-        return self.report.errors
 
     @property
     def total_error(self) -> float | None:
@@ -246,10 +244,8 @@ class Inversion(Summarised):
     def structures(self) -> Structures | None:
         """Regions where the displacement stands above its error; None without pixel errors."""
         element = self.displacement[0].size / len(self.cells.sites)
-        errors = self.pixel_errors
-        if errors is None:
-            return None
-        return structures_of(self.displacement, errors, self.mask, element=element)
+        std = None if self.errors is None else self.errors.per_pixel
+        return structures_of(self.displacement, std, self.mask, element=element)
 
     @property
     def setup(self) -> Setup | None:
@@ -291,6 +287,134 @@ class Inversion(Summarised):
         """
         return InversionInUnits(self, setup)
 
+    @property
+    def recorded_image(self) -> FloatArray:
+        """The image in its own units, (H, W): whole numbers if it was counts."""
+        image = self.image * self.report.flux_scale
+        counts = np.rint(image)
+        return counts if np.allclose(image, counts, rtol=1e-12, atol=0) else image
+
+    def uncertainty(
+        self,
+        n: int = 200,
+        *,
+        noise: Literal["poisson"] | float | ArrayLike | None = None,
+        noise_only: bool = False,
+        method: Literal["linear", "resolve"] = "linear",
+        quantities: Quantities | None = None,
+        on_progress: OnProgress | None = None,
+        should_stop: ShouldStop | None = None,
+    ) -> Inversion:
+        """Estimate how noise and instrument scatter potential and displacement in every pixel.
+
+        Each sample is the image with fresh noise on top, inverted like the image. All share the
+        image's own noise, so their scatter is the effect of one dose of noise: the standard
+        deviation that shots of the same object would show. Each sample also draws the imperfections
+        of the instrument (beam, background, gamma, blur, absorption, registration, another field)
+        and is the mirror image, about the inversion, of the field without them. Where the object
+        goes on beyond the edge, what may lie there is added. Other errors are not included (folds
+        behind caustics).
+
+        Parameters
+        ----------
+        n : int
+            Number of samples, at least two. Random numbers come from the options' `seed`; samples
+            are worked on side by side in its `threads`, as far as memory has room, which does not
+            change the result.
+        noise : "poisson" or float or array_like of shape (H, W), optional
+            ``"poisson"``: each pixel counts quanta (photons, protons), whose number scatters by
+            its square root: a pixel of value v by √(u · v), with the options' `units_per_quantum`
+            u. Default of u: 1 for an image of whole numbers, which are taken as counts; any other
+            image needs it. Else the standard deviation of Gaussian noise, in the image's units.
+            Default: as in the error budget, counting noise if the options state
+            `units_per_quantum`, the stated `noise_level`, or else as measured in the image.
+            Gaussian noise is correlated between pixels as measured in the image. Samples that it
+            drives below zero are clipped there, whatever `options.negative` says of the image.
+        noise_only : bool, default False
+            Whether the instrument and the source count as exact.
+        method : {"linear", "resolve"}
+            ``"linear"``: by the linear response of the transport. Three samples that are solved as
+            well check it; with an instrument, 24 correct the mean and the deviation. ``"resolve"``:
+            solve the transport of each sample, which takes many times as long; for caustics and
+            strong noise.
+        quantities : dict of str to callable, or callable, optional
+            Numbers whose error bars are needed: functions of potential, (H, W), and displacement,
+            (2, H, W), that return a number or an array: a line profile, the mean of a region, an
+            integral, a peak. Several threads may call them at once. A function that returns the
+            dictionary is called with the changes of the potential in a few samples, (k, H, W), from
+            which it may choose a smoothing. Of a maximum give a `Maximum`.
+        on_progress, should_stop : callable, optional
+            As of `invert`.
+
+        Returns
+        -------
+        Inversion
+            The same, with the deviation of the displacement as ``errors.per_pixel``, all else of
+            the samples as ``errors.samples``, and cautions about them.
+
+        Raises
+        ------
+        InputError
+            If the inversion did not converge, or `n`, `noise`, `method` or `quantities` make no
+            sense.
+        InversionCancelled
+            If `should_stop` returned true.
+
+        Examples
+        --------
+        >>> from napari_shadowinv.inversion import Maximum, invert
+        >>> counts = np.random.default_rng(0).poisson(400, (24, 24))
+        >>> errors = invert(counts).uncertainty(4, noise="poisson", noise_only=True).errors
+        >>> errors.per_pixel.shape, errors.causes, errors.samples.converged
+        ((2, 24, 24), ('noise',), (True, True, True))
+        >>> peak = {"peak": Maximum(lambda potential, displacement: np.hypot(*displacement).max())}
+        >>> blurred = invert(counts, instrument={"blur": 1.0})
+        >>> errors = blurred.uncertainty(20, noise="poisson", quantities=peak).errors
+        >>> errors.causes
+        ('noise', 'beam, 5 %', 'blur, 1 px')
+        >>> low, high = errors.samples.quantities["peak"].band(0.95)
+        >>> bool(low < high)
+        True
+        """
+        from napari_shadowinv.inversion import resampling, samples  # import the solver
+
+        resampling.check_choices(n, method)
+        errors, options, measured = self.errors, self.options, self.report.measured
+        if errors is None:
+            raise InputError(
+                "the inversion did not converge, so its errors are not known: invert the image "
+                "with more iterations or another source first"
+            )
+        shot = RecordedShot(
+            image=self.recorded_image,
+            source=self.source,
+            displacement=self.displacement,
+            mask=self.mask,
+        )
+        scale, correlation = self.report.flux_scale, self.instrument.noise_correlation
+        if noise is None:
+            noise = resampling.noise_of_budget(shot, options, correlation, scale)
+        width = resampling.noise_width(errors, noise)
+        units = options.units_per_quantum
+        draw, described = samples.noise_of(shot.image, noise, units, self.mask, width)
+        draws = None
+        if not noise_only:
+            draws = resampling.instrument_draws(shot, self.instrument, errors, measured=measured)
+        usable = None if self.mask.all() else self.mask
+        sites, weights = self.cells.sites, self.cells.weights
+        plan = samples.plan_of(sites, self.source, usable, options, measured=measured)
+        images = samples.FullResampling(
+            plan, weights, shot.image, draw, options, draws,
+            flux_scale=scale if options.flux == "fit" else None,
+        )  # fmt: skip
+        fields = np.stack([self.potential, *self.displacement])
+        by_edge = resampling.changes_by_edge(errors, fields, self.mask)
+        sampler = resampling.Sampler.of(images, int(n), fields, by_edge, quantities)
+        drawn = sampler.draw(method, described, Reporter(on_progress, should_stop))
+        std, causes = drawn.displacement_std, sampler.causes
+        errors = replace(errors, per_pixel=std, causes=causes, samples=drawn)
+        return replace(self, errors=errors).with_warnings(sampler.cautions(drawn))
+
     def with_warnings(self, cautions: Iterable[Caution]) -> Inversion:
         """Return the same inversion with more warnings in its report.
 
@@ -319,9 +443,10 @@ class Inversion(Summarised):
         -------
         xarray.Dataset
             Dimensions y, x, component ("y", "x") and site. Each variable has ``units`` and
-            ``long_name``; verdict and explanation are attributes; options, report (with the errors
-            in px), setup and ``errors_si`` (the errors of the setup's main field) are JSON texts
-            in the attributes.
+            ``long_name``; verdict and explanation are attributes; options, report, errors (in px),
+            setup and ``errors_si`` (the errors of the setup's main field) are JSON texts in the
+            attributes. After `uncertainty` it has the deviations that `ErrorSamples.added_to`
+            lists.
         """
         history = {
             "format": self.kind.value,
@@ -332,8 +457,9 @@ class Inversion(Summarised):
         }
         if self.provenance is not None:
             setup = self.setup if setup is None else setup
-        if self.pixel_errors is not None:
-            history["error_causes"] = json.dumps(self.pixel_errors.causes)
+        if self.errors is not None:
+            history["errors"] = json.dumps(self.errors.to_dict())
+            history["error_causes"] = json.dumps(self.errors.causes)
         in_units = self.in_units(setup)
         errors, assessment = in_units.errors, in_units.assessment
         history |= {"verdict": assessment.verdict.value, "explanation": assessment.explanation}
@@ -341,14 +467,14 @@ class Inversion(Summarised):
             field = setup.main_field
             (unit,) = (si_field.unit for si_field in setup.si_fields if si_field.name == field.name)
             factor = np.abs(setup.field_in_si(field.name, np.ones((2, 1, 1)))).max()
-            in_si = dataclasses.asdict(errors.times(float(factor)))
+            in_si = errors.times(float(factor)).to_dict()
             history["errors_si"] = json.dumps({"field": field.name, "unit": unit, **in_si})
         dataset = dataset_from_field(
             self.displacement, self.potential, setup, attributes=history | dict(attributes or {})
         )
-        if self.pixel_errors is not None:
+        if self.errors is not None and self.errors.per_pixel is not None:
             dims, *words = DISPLACEMENT_STD
-            dataset["displacement_std"] = dims, self.pixel_errors.std, label(*words)
+            dataset["displacement_std"] = dims, self.errors.per_pixel, label(*words)
         dataset = dataset.assign(
             {
                 name: (dims, self.variable(name), label(units, long_name))
@@ -356,6 +482,8 @@ class Inversion(Summarised):
                 if name not in dataset
             }
         )
+        if self.errors is not None and self.errors.samples is not None:
+            dataset = self.errors.samples.added_to(dataset, setup)
         return dataset if self.provenance is None else self.provenance.added_to(dataset)
 
     @classmethod
@@ -384,11 +512,11 @@ class Inversion(Summarised):
         return cls(
             **arrays,
             cells=cells,
-            report=_report_schema().validate_python(content),
+            report=_schema(Report).validate_python(content),
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             instrument=Instrument.model_validate_json(dataset.attrs["instrument"]),
             provenance=Provenance.of(dataset.attrs, dataset.variables),
-            pixel_errors=_pixel_errors(dataset, "displacement_std"),
+            errors=_errors_in(dataset),
         )
 
 
@@ -414,7 +542,7 @@ class InversionInUnits:
         return field
 
     @property
-    def errors(self) -> Errors | None:
+    def errors(self) -> ErrorBudget | None:
         """Error budget of the main field, px of displacement; None if it was not estimated."""
         errors, setup, error = self.inversion.errors, self.setup, self.inversion.instrument.energy
         if errors is None or setup is None or not error:
@@ -496,7 +624,7 @@ class InversionInUnits:
                 f"{percent(report.image_residual)} of the mean (r.m.s.)",
                 short=f"residual {percent(report.image_residual)}",
             ),
-            *significance_facts(inversion.structures, inversion.pixel_errors),
+            *significance_facts(inversion.structures, () if errors is None else errors.causes),
             Fact("caustics", "Caustics", f"{percent(inversion.caustic.mean())} of the pixels"),
             *masked_fact(inversion.mask),
             *(
@@ -522,10 +650,10 @@ class InversionInUnits:
         )
         return folded(facts, _REPORT)
 
-    def _subject(self, errors: Errors) -> str:
+    def _subject(self, errors: ErrorBudget) -> str:
         return "displacement" if errors is self.inversion.errors else "field"
 
-    def _error_rows(self, errors: Errors | None) -> list[tuple[str, str]]:
+    def _error_rows(self, errors: ErrorBudget | None) -> list[tuple[str, str]]:
         """Describe an error budget in words: names and texts."""
         if errors is None:
             return []
@@ -545,18 +673,27 @@ class InversionInUnits:
 
 
 @cache
-def _report_schema() -> TypeAdapter[Report]:
-    return TypeAdapter(Report)
+def _schema(kind: type[Any]) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
 
 
-def _pixel_errors(dataset: xarray.Dataset, name: str) -> PixelErrors | None:
+def _errors_in(dataset: xarray.Dataset) -> ErrorBudget | None:
+    if "errors" not in dataset.attrs:
+        return None
+    errors: ErrorBudget = _schema(ErrorBudget).validate_json(dataset.attrs["errors"])
+    causes = json.loads(dataset.attrs.get("error_causes", "[]"))
+    std = _deviation(dataset, "displacement_std")
+    return replace(errors, per_pixel=std, causes=tuple(map(str, causes)))
+
+
+def _deviation(dataset: xarray.Dataset, name: str) -> FloatArray | None:
+    """Return the standard deviation of the displacement in a dataset; None if it has none."""
     if name not in dataset:
         return None
     std, shape = numbers_of(dataset, name), dataset["displacement"].shape
     if std.shape != shape:
         raise ValueError(f"{name} has shape {std.shape}, displacement {shape}")
-    causes = json.loads(dataset.attrs.get("error_causes", "[]"))
-    return PixelErrors(std, tuple(map(str, causes)))
+    return std
 
 
 _STORED_CAUSES = ("noise, instrument and beam",)
@@ -603,20 +740,18 @@ class RetrievedField(Summarised):
     @property
     def facts(self) -> tuple[Fact, ...]:
         """The peak of the field and its significance in words."""
-        significance = significance_facts(self.structures, self.pixel_errors)
+        significance = significance_facts(self.structures, _STORED_CAUSES)
         return (*peak_facts(self.displacement, self.setup), *significance)
 
     @property
-    def pixel_errors(self) -> PixelErrors | None:
+    def displacement_std(self) -> FloatArray | None:
         """Standard deviation of the displacement in every pixel, if the dataset contains it."""
-        errors = _pixel_errors(self.dataset, "displacement_uncertainty")
-        return errors and replace(errors, causes=_STORED_CAUSES)
+        return _deviation(self.dataset, "displacement_uncertainty")
 
     @property
     def structures(self) -> Structures | None:
         """Regions where the displacement stands above its error; None without pixel errors."""
-        errors = self.pixel_errors
-        return None if errors is None else structures_of(self.displacement, errors)
+        return structures_of(self.displacement, self.displacement_std)
 
     def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return the dataset with further attributes."""

@@ -17,58 +17,64 @@ from functools import cached_property, reduce
 from operator import add
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.special import ndtri
 
-from napari_shadowinv._system.arrays import plain_array, unpack_array
+from napari_shadowinv._system.arrays import plain_array
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import to_figures
 from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.power_diagram import PowerDiagram, pixel_shares
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.instrument.effects import InstrumentDraws
-from napari_shadowinv.inversion.normalise import flooring_for, masked_source, power_of_two
+from napari_shadowinv.inversion.normalise import (
+    flooring_for,
+    margin_around,
+    masked_source,
+    power_of_two,
+)
 from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
-from napari_shadowinv.transport.sites import Levels, Margin, SitePlan
+from napari_shadowinv.transport.sites import Levels, Margin, SiteLevel, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 
-Draw = Callable[[np.random.Generator, float], FloatArray]
-"""Returns a noisy image, with noise that a Gaussian of some standard deviation (px) correlates."""
+Draw = Callable[[np.random.Generator], FloatArray]
+"""Returns a noisy image."""
 
 _BLUR_REACH = 4.0  # standard deviations
 _MOST_QUANTA = 1e18  # numpy draws no larger Poisson numbers
 
 
 def noise_of(
-    image: ArrayLike, noise: object, units_per_quantum: float | None, mask: ArrayLike | None
+    image: FloatArray,
+    noise: object,
+    units_per_quantum: float | None,
+    usable: BoolArray,
+    blur: float = 0.0,
 ) -> tuple[Draw, str]:
-    """Return a function that draws a noisy image, and a text that describes the noise."""
-    values = np.asarray(unpack_array(image, "image")[0])
-    if values.dtype.kind not in "buif":
-        raise InputError(f"image has values of type {values.dtype}, expected real numbers")
-    usable = np.isfinite(values)
-    if mask is not None and np.shape(mask) == values.shape:
-        usable &= np.asarray(mask, dtype=bool)
-    values = np.where(usable, values, 0.0)
+    """Return a function that draws a noisy image, and a text that describes the noise.
+
+    Gaussian noise is correlated as by a Gaussian `blur`, px.
+    """
     if isinstance(noise, str):
         if noise != "poisson":
             raise InputError(
                 f"noise is {noise!r}, expected 'poisson', a standard deviation or an array of them"
             )
-        return _poisson(values, units_per_quantum)
+        return _poisson(image, units_per_quantum)
     if units_per_quantum is not None:
         raise InputError(
             f"options state {units_per_quantum:g} units per quantum and noise is a standard "
             "deviation, expected one of them: units per quantum imply Poisson noise"
         )
-    return _gaussian(values, np.asarray(plain_array(noise, "noise")), usable)
+    return _gaussian(image, np.asarray(plain_array(noise, "noise")), usable, blur)
 
 
 def _poisson(values: FloatArray, units_per_quantum: float | None) -> tuple[Draw, str]:
@@ -86,12 +92,13 @@ def _poisson(values: FloatArray, units_per_quantum: float | None) -> tuple[Draw,
             f"{values.max():g}: that is more than {_MOST_QUANTA:g} quanta in a pixel, expected "
             "fewer: check the unit"
         )
-    # A blur leaves the counting noise of many pixels as it was.
     text = f"Poisson, {units_per_quantum:g} per quantum"
-    return lambda rng, blur: units_per_quantum * rng.poisson(quanta), text
+    return lambda rng: units_per_quantum * rng.poisson(quanta), text
 
 
-def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[Draw, str]:
+def _gaussian(
+    values: FloatArray, sigma: AnyArray, usable: BoolArray, blur: float
+) -> tuple[Draw, str]:
     if sigma.dtype.kind not in "uif":
         raise InputError(
             f"noise has values of type {sigma.dtype}, expected 'poisson', a standard deviation "
@@ -109,7 +116,9 @@ def _gaussian(values: FloatArray, sigma: AnyArray, usable: BoolArray) -> tuple[D
             "deviations in the image's units"
         )
     described = f"Gaussian, {sigma:g}" if sigma.ndim == 0 else "Gaussian, pixel by pixel"
-    return lambda rng, blur: values + deviation * _normal(rng, values.shape, blur), described
+    if blur:
+        described += f", correlated over {to_figures(blur)} px"
+    return lambda rng: values + deviation * _normal(rng, values.shape, blur), described
 
 
 def _normal(rng: np.random.Generator, shape: tuple[int, ...], blur: float) -> FloatArray:
@@ -145,10 +154,12 @@ class FullResampling:
 
     plan: SitePlan
     start: FloatArray
-    draw: Callable[[np.random.Generator], FloatArray]
+    recorded: FloatArray  # the image
+    draw: Draw
     options: InversionOptions
     instrument: InstrumentDraws | None = None
     numbers: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # of all samples
+    flux_scale: float | None = None  # divisor of images, if it was fitted
 
     def sample(self, seeds: list[Seed], report: Reporter) -> tuple[FloatArray, LevelSolution]:
         """Return potential and displacement of the noisy image of one seed, (3, H, W)."""
@@ -170,8 +181,7 @@ class FullResampling:
         shot = self.instrument.shot(numbers)
         plan = _with_source(self.plan, shot.source, self.options)
         # Light is counted after it was changed, so the noise stays as it is.
-        image = shot.image + (noisy - self.instrument.recorded.image)
-        image = flooring_for(plan.source, self.options, plan.mask)(image)
+        image = self.flooring(plan.source)(shot.image + (noisy - self.recorded))
         return plan, image, 1 + float(self.instrument.scale(numbers))
 
     def to_tolerance_of_noise(self, seed: Seed) -> FullResampling:
@@ -200,12 +210,38 @@ class FullResampling:
     @cached_property
     def apply_floor(self) -> Callable[[FloatArray], FloatArray]:
         """Function from a recorded image to what the transport sees of it."""
-        return flooring_for(self.plan.source, self.options, self.plan.mask)
+        return self.flooring(self.plan.source)
+
+    def flooring(self, source: FloatArray) -> Callable[[FloatArray], FloatArray]:
+        """Return that function for another source."""
+        return flooring_for(source, self.options, self.plan.mask, self.flux_scale)
+
+
+def plan_of(
+    sites: FloatArray,
+    source: FloatArray,
+    mask: BoolArray | None,
+    options: InversionOptions,
+    *,
+    measured: bool,
+) -> SitePlan:
+    """Return the plan of one level with given sites, (n, 2), px of the source.
+
+    A mask of None uses all pixels; a `measured` source was recorded.
+    """
+    beam, unit, margin = _spread_beam(source, mask, options)
+    density = Density.from_image(beam, threads=options.threads)
+    padded = sites + (0 if margin is None else margin.width)
+    triangulation = RegularTriangulation(padded, region=density.region)
+    diagram = PowerDiagram(triangulation, density, with_moments=True, threads=options.threads)
+    level = SiteLevel(padded, diagram.masses, diagram.centroids, triangulation, beam.shape, 0)
+    levels = Levels((len(sites),), lambda count, report: level)
+    return SitePlan(source, levels, mask, margin, unit, measured)
 
 
 def _with_source(plan: SitePlan, source: FloatArray, options: InversionOptions) -> SitePlan:
     """Return the finest sites of a plan for another source."""
-    beam, unit, margin = _spread_beam(plan, source, options)
+    beam, unit, margin = _spread_beam(source, plan.mask, options)
     level = plan.levels[-1]
     density = Density.from_image(beam, threads=options.threads)
     diagram = PowerDiagram(level.triangulation, density, with_moments=True, threads=options.threads)
@@ -215,15 +251,15 @@ def _with_source(plan: SitePlan, source: FloatArray, options: InversionOptions) 
 
 
 def _spread_beam(
-    plan: SitePlan, source: FloatArray, options: InversionOptions
+    source: FloatArray, mask: BoolArray | None, options: InversionOptions
 ) -> tuple[FloatArray, float, Margin | None]:
     """Return a source as sites are spread over it, in its power of two, and its margin."""
-    beam = masked_source(source, plan.mask, options)
+    beam = masked_source(source, mask, options)
     unit = power_of_two(beam)
     beam = beam / unit
-    if plan.margin is None:
+    if options.boundary != "free":
         return beam, unit, None
-    margin = Margin.around(beam, plan.margin_width, plan.mask)
+    margin = Margin.around(beam, margin_around(beam.shape, options), mask)
     return margin.beam, unit, margin
 
 
@@ -392,11 +428,11 @@ class LinearResampling:
     def __init__(
         self,
         samples: FullResampling,
-        image: FloatArray,
         threads: int | None,
         measure: Measure | None = None,
     ) -> None:
-        self._samples, self._image, self._measure = samples, image, measure
+        self._samples, self._measure = samples, measure
+        self._image = image = samples.apply_floor(samples.recorded)
         plan, level = samples.plan, samples.plan.levels[-1]
         objective = Target.of(image, samples.options, plan.margin).objective(level)
         diagram = objective.diagram(samples.start)
@@ -456,20 +492,20 @@ class LinearResampling:
         samples, plan, level = self._samples, self._samples.plan, self._samples.plan.levels[-1]
         assert samples.instrument is not None
         options, recorded = samples.options, samples.instrument.recorded
-        beam, _, _ = _spread_beam(plan, plan.source, options)
+        beam, _, _ = _spread_beam(plan.source, plan.mask, options)
         density = Density.from_image(beam, threads=threads)
         diagram = PowerDiagram(level.triangulation, density, threads=threads)
         shares_of_source = pixel_shares(diagram, level.shape, threads=threads)
         gains = np.zeros((len(level.sites), samples.instrument.count))
         for place, step, shot in samples.instrument.steps():
             source = shot.source * (plan.source.sum() / shot.source.sum())
-            changed_beam, unit, _ = _spread_beam(plan, source, options)
+            changed_beam, unit, _ = _spread_beam(source, plan.mask, options)
             of_source = changed_beam * (unit / plan.unit) - beam
             of_image = of_source.copy()  # in a margin
             inner = plan.within(of_image)
             inner[:] = 0.0
             if shot.image is not recorded.image:
-                floored = flooring_for(source, options, plan.mask)(shot.image)
+                floored = samples.flooring(source)(shot.image)
                 inner[:] = floored * (unit / plan.unit) - self._image
             gain = self._shares @ of_image.ravel() - shares_of_source @ of_source.ravel()
             gains[:, place] = gain / step

@@ -44,7 +44,6 @@ from napari_shadowinv.shot import Shot
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.inversion.error_bars import Uncertainty
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.results import AnyResult
 
@@ -302,7 +301,7 @@ def require(dataset: xarray.Dataset, names: tuple[str, ...]) -> None:
 
 def write(
     path: str | Path,
-    result: AnyResult | Uncertainty | xarray.Dataset | AnyArray,
+    result: AnyResult | xarray.Dataset | AnyArray,
     *,
     setup: Setup | None = None,
     overwrite: bool = False,
@@ -315,7 +314,7 @@ def write(
         For a result: ``.shadowinv`` for all of it, ``.h5`` for pradformat, ``.csv`` for the
         sites; for a fit ``.shadowinv``, or ``.h5`` for its field alone. For an image: ``.tif``
         (float32), ``.npy``, ``.png`` (16 bits, its largest value white).
-    result : Inversion, Uncertainty, Fit, FilmDoses, xarray.Dataset, or ndarray of shape (H, W)
+    result : Inversion, Fit, FilmDoses, xarray.Dataset, or ndarray of shape (H, W)
         Result or image to write.
     setup : Setup, optional
         Adds SI units; pradformat needs it. A dataset, a fit and film doses bring their own.
@@ -366,8 +365,7 @@ def _as_dataset(result: Any, setup: Setup | None) -> xarray.Dataset:
         dataset: xarray.Dataset = result if is_dataset else result.to_dataset()
         return dataset
     from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.error_bars import Uncertainty
 
-    if isinstance(result, Inversion | Uncertainty):
+    if isinstance(result, Inversion):
         return result.to_dataset(setup)
     raise InputError(f"received a setup for a {result.kind.noun}, which has its own: leave it out")

@@ -3,12 +3,13 @@
 - standard deviation of the length of the displacement: `deviation_along`
 - the map |d|/σ: `significance`
 - connected regions that errors alone do not explain: `find_structures`
-- all of it in words: `significance_fact`
+- all of it in words: `significance_facts`
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,22 +20,6 @@ from napari_shadowinv.facts import Fact, Level, percent, to_figures
 
 LEVEL = 2.0
 """Standard deviations at which the border of a structure lies."""
-
-
-@dataclass(frozen=True, eq=False)
-class PixelErrors:
-    """Standard deviation of a displacement in every pixel, and its causes.
-
-    Attributes
-    ----------
-    std : ndarray, shape (2, H, W)
-        Of each component, px.
-    causes : tuple of str
-        Errors that it contains, such as "noise" and "beam, 5 %"; empty if they are not known.
-    """
-
-    std: FloatArray
-    causes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,31 +164,40 @@ def find_structures(
 
 def structures_of(
     displacement: FloatArray,
-    errors: PixelErrors,
+    std: FloatArray | None,
     mask: BoolArray | None = None,
     *,
     element: float = 1.0,
-) -> Structures:
-    """Return the structures of a displacement; see `find_structures`."""
-    return find_structures(significance(displacement, errors.std), mask, element=element)
+) -> Structures | None:
+    """Return the structures of a displacement, see `find_structures`; None without its error."""
+    if std is None:
+        return None
+    return find_structures(significance(displacement, std), mask, element=element)
 
 
-def significance_fact(
-    structures: Structures, errors: PixelErrors, *, key: str = "significance", name: str = ""
-) -> Fact:
-    """Return the structures of a field in words.
+def significance_facts(
+    structures: Structures | None,
+    causes: Sequence[str],
+    *,
+    key: str = "significance",
+    name: str = "",
+) -> list[Fact]:
+    """Return the structures of a field in words; none without structures.
 
     Parameters
     ----------
-    structures : Structures
-    errors : PixelErrors
-        Their causes are part of the sentence.
+    structures : Structures or None
+    causes : sequence of str
+        Errors that the standard deviation holds, such as "noise" and "beam, 5 %"; empty if they are
+        not known.
     key : str, optional
         Key of the fact.
     name : str, optional
         Name of the field, if there are several.
     """
-    causes = f" (σ by {'; '.join(errors.causes)})" if errors.causes else ""
+    if structures is None:
+        return []
+    by_causes = f" (σ by {'; '.join(causes)})" if causes else ""
     title = f"Significance {name}".strip()
     if structures.peaks:
         count = len(structures.peaks)
@@ -211,8 +205,8 @@ def significance_fact(
         strongest = structures.peaks[0]
         peak = f"up to {strongest:.3g} σ" if math.isfinite(strongest) else "without any error"
         text = f"{subject} above {LEVEL:g} σ, on {percent(structures.share)} of the pixels"
-        return Fact(key, title, f"{text}, {peak}{causes}")
-    text = f"no structure stands above {LEVEL:g} σ{causes}"
+        return [Fact(key, title, f"{text}, {peak}{by_causes}")]
+    text = f"no structure stands above {LEVEL:g} σ{by_causes}"
     if structures.largest > structures.limit:
         reason = f"{structures.largest:.3g} σ are reached, but by a few pixels only"
     elif structures.largest > LEVEL:
@@ -222,11 +216,4 @@ def significance_fact(
         )
     else:
         reason = f"the field reaches {to_figures(structures.largest)} σ"
-    return Fact(key, title, f"{text}: {reason}", Level.DOUBTFUL)
-
-
-def significance_facts(structures: Structures | None, errors: PixelErrors | None) -> list[Fact]:
-    """Return the significance of structures as a fact; none without pixel errors."""
-    if structures is None or errors is None:
-        return []
-    return [significance_fact(structures, errors)]
+    return [Fact(key, title, f"{text}: {reason}", Level.DOUBTFUL)]

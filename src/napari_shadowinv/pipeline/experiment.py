@@ -30,7 +30,7 @@ from napari_shadowinv.fitting.compilation import ensure_compiled as ensure_fit_c
 from napari_shadowinv.fitting.shots import NearField
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inversion_compiled
-from napari_shadowinv.inversion.error_budget import Errors
+from napari_shadowinv.inversion.error_budget import ErrorBudget
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
 from napari_shadowinv.physics.beam import BeamSetup, unit_in_title
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
@@ -466,7 +466,7 @@ def _errors_made(displacement: FloatArray, truth: FloatArray) -> tuple[float, fl
     return error, peaks[0] / peaks[1] - 1
 
 
-def _parts_of(errors: Errors) -> dict[str, float]:
+def _parts_of(errors: ErrorBudget) -> dict[str, float]:
     """Return the parts of a budget as shares of the field, by the causes' names."""
     parts = {}
     for name, part in errors.parts.items():

@@ -291,6 +291,7 @@ class InvertTask(Task):
         headline = result.headline
         entries = {
             **dataclasses.asdict(result.report),
+            "errors": None if result.errors is None else result.errors.to_dict(),
             "stages": result.report.seconds,
             "level": headline.level.value,
             "headline": str(headline),

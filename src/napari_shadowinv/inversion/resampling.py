@@ -1,0 +1,386 @@
+"""Random samples of an inversion by its noise and its instrument.
+
+- the plan of the inversion's sites: `plan_of`; its noise and instrument: `noise_of_budget`,
+  `instrument_draws`; objects beyond its edge: `changes_by_edge`
+- draw and invert samples, and sum them up: `Sampler`
+
+Each sample is the image with another draw of noise, inverted on the same sites. The scatter of the
+samples is the scatter of repeated shots of the same object (the parametric bootstrap). The
+imperfections of an instrument are drawn and removed from image and source: that is where the truth
+may be, and the sample is its mirror image about the inversion. The linear response of the solved
+transport to a small change of the image costs one linear system with a matrix that all samples
+share; to solve the transport again costs a few, each with its own. An instrument's imperfections
+are larger than noise, so with them the first 24 linear samples are solved as well, and correct the
+mean, the deviation and the skewness of all (control variates).
+
+References
+----------
+B. Efron and R. J. Tibshirani, *An Introduction to the Bootstrap* (Chapman & Hall, 1993),
+chapter 6; C. Lemieux, *Monte Carlo and Quasi-Monte Carlo Sampling* (Springer, 2009), chapter 4, for
+the correction of cheap samples by a few that are solved, and chapter 5 for Latin hypercubes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
+from functools import partial, reduce
+from itertools import chain, islice
+from operator import add
+from threading import Event
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from napari_shadowinv._system.machine import available_threads, physical_memory
+from napari_shadowinv._system.progress import Reporter
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
+from napari_shadowinv.geometry.interpolation import WIDTH
+from napari_shadowinv.instrument.effects import InstrumentDraws, RecordedShot
+from napari_shadowinv.inversion.error_bars import (
+    ErrorSamples,
+    Maximum,
+    Quantities,
+    Quantity,
+    QuantityOf,
+)
+from napari_shadowinv.inversion.error_budget import ErrorBudget
+from napari_shadowinv.inversion.noise import ImageNoise
+from napari_shadowinv.inversion.normalise import prepare
+from napari_shadowinv.inversion.samples import (
+    FullResampling,
+    LinearResampling,
+    Pairs,
+    Scatter,
+    Seed,
+    correct,
+    stratified_numbers,
+)
+from napari_shadowinv.options import BeamPrior, Instrument, InversionOptions
+from napari_shadowinv.physics.edge import edge_changes
+
+Result = TypeVar("Result")
+
+_CHECKED, _SOLVED = 3, 3 * WIDTH  # linear samples that are solved, too; with an instrument
+_LINEAR_ENOUGH, _CORRECTABLE = 0.3, 0.6  # of their change
+_MAX_BEAM_RMS = 0.9
+_POLL_SECONDS = 0.1
+_BYTES_PER_SITE, _BYTES_PER_PIXEL = 700, 150  # measured peaks of one sample, rounded up
+
+
+class _Samples(NamedTuple):
+    """The scatter of samples, and linear ones beside those that were solved."""
+
+    scatter: Scatter
+    pairs: Pairs | None
+    of_solved: list[dict[str, FloatArray]]
+    solutions: list[tuple[int, float, bool]]  # iterations, residual, converged
+
+
+@dataclass
+class Sampler:
+    """Draws samples, and measures the quantities, which are chosen by the first of them."""
+
+    resampling: FullResampling
+    fields: FloatArray  # potential and displacement of the inversion, (3, H, W)
+    by_edge: FloatArray  # (k, 3, H, W)
+    seeds: list[Seed]
+    workers: int
+    threads: int | None
+    choose: Callable[[FloatArray], Mapping[str, QuantityOf]] | None
+    functions: Mapping[str, QuantityOf] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        resampling: FullResampling,
+        n: int,
+        fields: FloatArray,
+        by_edge: FloatArray,
+        quantities: Quantities | None,
+    ) -> Sampler:
+        """Share the threads among `n` samples, draw their instruments, and choose a tolerance."""
+        options = resampling.options
+        workers = _workers(options, len(resampling.start), resampling.recorded.size)
+        # What noise drives below zero is clipped.
+        threads = max(1, available_threads(options.threads) // workers)
+        clipping = options.model_copy(update={"threads": threads, "negative": "clip"})
+        seeds = np.random.SeedSequence(options.seed).spawn(n)
+        resampling = replace(resampling, options=clipping).to_tolerance_of_noise(seeds[0])
+        if resampling.instrument is not None:
+            rng = np.random.default_rng([options.seed, *b"instrument"])
+            numbers = stratified_numbers(rng, n, resampling.instrument.count)
+            resampling = replace(resampling, numbers=numbers)
+        choose = _quantity_choice(quantities) if quantities else None
+        return cls(resampling, fields, by_edge, seeds, workers, options.threads, choose)
+
+    def measure(self, change: FloatArray, seed: Seed) -> dict[str, FloatArray]:
+        """Return the quantities of a sample, with objects beyond the edge."""
+        rng = np.random.default_rng([self.resampling.options.seed, *b"edge", *seed.spawn_key])
+        beyond = np.tensordot(rng.normal(size=len(self.by_edge)), self.by_edge, 1)
+        return _measure(self.functions, self.fields, change + beyond)
+
+    @property
+    def asked(self) -> Callable[[FloatArray, Seed], dict[str, FloatArray]] | None:
+        """Function that measures the quantities; None if there are none."""
+        return None if self.choose is None else self.measure
+
+    def _choose(self, changes: FloatArray) -> None:
+        if self.choose is not None and not self.functions:
+            self.functions = dict(self.choose(changes))
+
+    def _solve(
+        self, seeds: list[Seed], report: Reporter, solutions: list[tuple[int, float, bool]]
+    ) -> Iterator[FloatArray]:
+        # Without imperfections that it may have, the image shows where the truth may be.
+        sign = 1 if self.resampling.instrument is None else -1
+        blocks = [[seed] for seed in seeds]
+        for fields, solution in _in_order(self.resampling.sample, blocks, self.workers, report):
+            solutions.append((solution.iterations, solution.residual, solution.converged))
+            yield sign * (fields - self.fields)
+
+    def resolve(self, report: Reporter) -> _Samples:
+        """Solve all samples."""
+        seeds = self.seeds
+        solutions: list[tuple[int, float, bool]] = []
+        head = list(self._solve(seeds[:_CHECKED], report, solutions))
+        self._choose(np.array([change[0] for change in head]))
+        changes = chain(head, self._solve(seeds[_CHECKED:], report, solutions))
+        asked = self.asked
+        parts = (
+            Scatter.of(change, asked and asked(change, seed))
+            for change, seed in zip(changes, seeds, strict=True)
+        )
+        return _Samples(reduce(add, parts), None, [], solutions)
+
+    def respond(self, report: Reporter) -> _Samples:
+        """Take the linear response of all samples, and solve the first for comparison."""
+        seeds, quietly = self.seeds, Reporter(None, report.should_stop)
+        is_noise_alone = self.resampling.instrument is None
+        response = _in_thread(
+            lambda: LinearResampling(self.resampling, self.threads, self.asked),
+            quietly,
+        )
+        checked = seeds[: _CHECKED if is_noise_alone else _SOLVED]
+        solutions: list[tuple[int, float, bool]] = []
+        solved = self._solve(checked, quietly if is_noise_alone else report, solutions)
+        pairs, of_solved = None, []
+        for block in _blocks(checked):
+            linear = _in_thread(partial(response.changes, block), quietly)
+            self._choose(linear[:, 0])
+            for seed, pair in zip(
+                block, map(Pairs.of, linear, islice(solved, len(block))), strict=True
+            ):
+                pairs = pair if pairs is None else pairs + pair
+                if self.asked is not None and not is_noise_alone:
+                    of_solved.append(self.measure(pair.solved, seed))
+        parts = _in_order(response.scatter, _blocks(seeds), self.workers, report)
+        return _Samples(reduce(add, parts), pairs, of_solved, solutions)
+
+    def draw(self, method: str, noise: str, report: Reporter) -> ErrorSamples:
+        """Draw and invert the samples of some noise; linear ones are corrected by those solved."""
+        samples = self.resolve(report) if method == "resolve" else self.respond(report)
+        scatter, pairs = samples.scatter, samples.pairs
+        mean, std, of_samples = scatter.mean, scatter.std, _joined(scatter.quantities)
+        check = {"nonlinearity": 0.0, "spread_ratio": 1.0, "mean_shift": 0.0}
+        if pairs is not None:
+            check = {name: getattr(pairs.part(np.s_[1:]), name) for name in check}
+        if self.resampling.instrument is not None and pairs is not None:
+            mean, std = mean + pairs.shift, std * pairs.factor
+            for name, exact in _joined(samples.of_solved).items():
+                of_samples[name] = correct(of_samples[name], exact.astype(np.float64))
+        mean = self.fields + mean
+        std = np.sqrt(std**2 + (self.by_edge**2).sum(axis=0))
+        values = _measure(self.functions, self.fields, np.zeros_like(self.fields))
+        iterations, residuals, converged = zip(*samples.solutions, strict=True)
+        return ErrorSamples(
+            potential=self.fields[0],
+            displacement=self.fields[1:],
+            potential_mean=mean[0],
+            potential_std=std[0],
+            displacement_mean=mean[1:],
+            displacement_std=std[1:],
+            n=scatter.count,
+            noise=noise,
+            method=method,
+            **check,
+            tolerance=self.resampling.options.tolerance,
+            iterations=iterations,
+            residuals=residuals,
+            converged=converged,
+            quantities={
+                name: Quantity(value, of_samples[name], isinstance(self.functions[name], Maximum))
+                for name, value in values.items()
+            },
+        )
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """What samples hold: the noise, what is drawn of the instrument, and the edge."""
+        draws = self.resampling.instrument
+        return (
+            "noise",
+            *(() if draws is None else draws.names),
+            *("edge",) * bool(len(self.by_edge)),
+        )
+
+    def cautions(self, samples: ErrorSamples) -> Iterator[Caution]:
+        """Yield the reasons to doubt the samples."""
+        if failed := samples.converged.count(False):
+            text = (
+                f"{failed} of {len(samples.converged)} samples that were solved did not converge: "
+                "the deviations are unreliable where the samples scatter most"
+            )
+            yield Caution("samples", text)
+        has_instrument = self.resampling.instrument is not None
+        # With an instrument, samples are corrected for what is not linear, as far as that is small.
+        if samples.nonlinearity > (_CORRECTABLE if has_instrument else _LINEAR_ENOUGH):
+            cause = "noise and instrument" if has_instrument else "noise"
+            text = (
+                f"the response to {cause} is not linear: samples that were solved differ by "
+                f"{percent(samples.nonlinearity)} of what these change; use the method 'resolve'"
+            )
+            yield Caution("samples", text)
+
+
+def check_choices(n: Any, method: Any) -> None:
+    """Refuse a number of samples, or a method, that is none."""
+    if not isinstance(n, int | np.integer) or isinstance(n, bool) or n < 2:
+        raise InputError(f"n is {n!r}, expected a whole number of samples, at least 2")
+    if method not in ("linear", "resolve"):
+        raise InputError(f"method is {method!r}, expected 'linear' or 'resolve'")
+
+
+def noise_of_budget(
+    shot: RecordedShot, options: InversionOptions, correlation: float | None, flux_scale: float
+) -> Any:
+    """Return the noise of an image as the error budget takes it, for `noise_of`.
+
+    Counting noise if the options state units per quantum, else the deviation in each pixel.
+    """
+    if options.units_per_quantum is not None:
+        return "poisson"
+    image, mask = shot.image / flux_scale, shot.mask
+    prepared = prepare(shot.image, shot.source, options, mask, flux_scale=flux_scale)
+    noise = ImageNoise(prepared.in_units(), options, correlation)
+    mean = shot.source[mask].mean()
+    deviation = mean * np.sqrt(noise.variance(image / mean))
+    return flux_scale * np.maximum(deviation, 1e-9 * float(image.max()))
+
+
+def noise_width(errors: ErrorBudget, noise: Any) -> float:
+    """Return the width over which noise is drawn correlated, px."""
+    # Structure that hides the noise does not correlate noise that is stated.
+    is_hidden = errors.noise_is_bound and np.ndim(noise) == 0
+    return 0.0 if is_hidden else errors.noise_correlation
+
+
+def changes_by_edge(errors: ErrorBudget, fields: FloatArray, mask: BoolArray) -> FloatArray:
+    """Return `edge_changes` of the size in the error budget, (k, 3, H, W); k is 0 without."""
+    part = errors.parts.get("edge")
+    if part is None:
+        return np.empty((0, 3, *mask.shape))
+    changes = edge_changes(fields[0], fields[1:])
+    squares = (changes[:, 1:, mask] ** 2).sum(axis=(0, 1)).mean()
+    return np.asarray(changes * part.rms / np.sqrt(squares))
+
+
+def instrument_draws(
+    shot: RecordedShot, instrument: Instrument, errors: ErrorBudget, *, measured: bool
+) -> InstrumentDraws | None:
+    """Return the imperfections to be drawn; None if the instrument is exact."""
+    if not measured:
+        instrument = instrument.without_reference()
+    beam = instrument.beam_of(measured=measured, source=shot.source)
+    if errors.beam_variation != beam.rms:  # more was seen
+        beam = BeamPrior(rms=min(errors.beam_variation, _MAX_BEAM_RMS), length=beam.length)
+    draws = InstrumentDraws(shot, instrument, beam)
+    return draws if draws.names else None
+
+
+def _quantity_choice(
+    quantities: Quantities | None,
+) -> Callable[[FloatArray], Mapping[str, QuantityOf]]:
+    """Return a function that chooses the quantities by changes of the potential."""
+    if callable(quantities):
+        return quantities
+    functions = {} if quantities is None else quantities
+    if not isinstance(functions, Mapping) or not all(map(callable, functions.values())):
+        raise InputError(
+            f"quantities is {quantities!r}, expected a dictionary of functions of potential and "
+            "displacement"
+        )
+    return lambda _: functions
+
+
+def _measure(
+    quantities: Mapping[str, QuantityOf], fields: FloatArray, change: FloatArray
+) -> dict[str, FloatArray]:
+    """Return the quantities of fields with a change, (potential, displacement) each."""
+    potential, *displacement = fields + change
+    moves = np.array(displacement)
+    return {name: np.asarray(of(potential, moves)) for name, of in quantities.items()}
+
+
+def _joined(samples: Sequence[dict[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Return each quantity of all samples, (n, ...)."""
+    names = samples[0] if samples else {}
+    return {name: np.array([sample[name] for sample in samples]) for name in names}
+
+
+def _blocks(seeds: list[Seed]) -> list[list[Seed]]:
+    return [seeds[start : start + WIDTH] for start in range(0, len(seeds), WIDTH)]
+
+
+def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
+    """Return the number of parallel samples: one a thread, within half of the memory."""
+    threads = available_threads(options.threads)
+    memory = physical_memory()
+    if memory is None:
+        return threads
+    needed = n_sites * _BYTES_PER_SITE + n_pixels * _BYTES_PER_PIXEL
+    return max(1, min(threads, memory // 2 // needed))
+
+
+def _in_thread(work: Callable[[], Result], report: Reporter) -> Result:
+    """Work in another thread, and abandon it if this one is asked to stop."""
+    pool = ThreadPoolExecutor(1)
+    try:
+        future = pool.submit(work)
+        while not wait([future], timeout=_POLL_SECONDS).done:
+            report("samples", 0)
+        return future.result()
+    finally:
+        pool.shutdown(wait=False)
+
+
+def _in_order(
+    work: Callable[[list[Seed], Reporter], Result],
+    blocks: list[list[Seed]],
+    workers: int,
+    report: Reporter,
+) -> Iterator[Result]:
+    """Work on a few blocks of seeds at once and yield their results in the order of the seeds."""
+    # Only this thread reports and asks whether to stop: callbacks are called from no other.
+    abandoned = Event()
+    waiting: deque[Future[Result]] = deque()
+    sizes = deque(map(len, blocks))
+    done, total = 0, sum(sizes)
+    with ThreadPoolExecutor(workers) as pool:
+        try:
+            for number, block in enumerate(blocks):
+                waiting.append(pool.submit(work, block, Reporter(None, abandoned.is_set)))
+                # One more is queued than the workers can start.
+                while len(waiting) > (workers if number + 1 < len(blocks) else 0):
+                    while not wait([waiting[0]], timeout=_POLL_SECONDS).done:
+                        report("samples", done, total)
+                    yield waiting.popleft().result()
+                    done += sizes.popleft()
+                    report("samples", done, total)
+        finally:
+            abandoned.set()
