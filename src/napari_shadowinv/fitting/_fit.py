@@ -48,7 +48,7 @@ from napari_shadowinv.fitting.search import (
 from napari_shadowinv.fitting.shots import Shots, list_shots
 from napari_shadowinv.fitting.starts import collect_starts
 from napari_shadowinv.fitting.summary import field_errors, report_of, summarise
-from napari_shadowinv.fitting.verdict import MISFIT_CHI2
+from napari_shadowinv.fitting.verdict import VerdictLimits
 from napari_shadowinv.options import FitOptions, Instrument
 
 
@@ -244,7 +244,7 @@ def _with_cause(
     Blur leaves little of a pattern, so it is looked for from `least_blur` standard deviations on. A
     fit that ended further away than `most_chi2` is no start for a rival.
     """
-    is_off = pattern.is_certain or pattern.chi2 > MISFIT_CHI2
+    is_off = pattern.is_certain or pattern.chi2 > VerdictLimits.misfit_chi2
     is_blurred = data.single or pattern.blur_score > least_blur
     if not (is_off or is_blurred) or pattern.chi2 >= most_chi2:
         return pattern

@@ -25,7 +25,6 @@ _KERNELS: tuple[Any, ...] = tuple(
     for name, kernel in vars(_ray_kernels).items()
     if hasattr(kernel, "py_func") and not name.startswith("_")
 )
-_SIZE = (8, 8)
 
 
 def ensure_compiled(
@@ -54,9 +53,9 @@ def _is_kept(kernel: Any) -> bool:
 
 
 def _compile_rays(report: Reporter) -> None:
-    rays = RayModel(_SIZE, threads=1)
+    rays = RayModel((8, 8), threads=1)
     potential = np.zeros(rays.shape)
-    traced = TracedBeam(potential, rays.ray_counts(potential), rays.around(np.ones(_SIZE)))
+    traced = TracedBeam(potential, rays.ray_counts(potential), rays.around(np.ones(rays.size)))
     weights = np.ones(rays.seen)
 
     def use_jacobian() -> None:

@@ -170,12 +170,6 @@ def _squared_difference(values: FloatArray, used: BoolArray, distance: int) -> f
     return float(np.median(joined)) ** 2 if joined.size else 0.0
 
 
-SUSPECT_PATTERN = 5.0
-"""Standard deviations of a smoothed residual beyond which the model is wrong."""
-# Of fits with a right model it is -5 to 2, once 4.2: a deep fold at 30 counts a pixel. With a beam
-# that is 2 % off it is 31 and more, with absorption of 5 % 5.4 to 12.6.
-
-
 @dataclass(frozen=True)
 class Pattern:
     """Structure in the residuals of a fit.
@@ -199,6 +193,10 @@ class Pattern:
         The likeliest cause, as a clause; "" if none wins or none was looked for.
     tried : str
         All causes that were looked for.
+    suspect : float
+        Strength beyond which the model is wrong. Of fits with a right model it is -5 to 2, once
+        4.2: a deep fold at 30 counts a pixel. With a beam that is 2 % off it is 31 and more, with
+        absorption of 5 % 5.4 to 12.6.
     """
 
     strengths: FloatArray
@@ -209,6 +207,7 @@ class Pattern:
     counts_deviation: float = np.inf
     cause: str = ""
     tried: str = ""
+    suspect: float = 5.0
 
     @property
     def largest(self) -> float:
@@ -218,7 +217,7 @@ class Pattern:
     @property
     def is_certain(self) -> bool:
         """Whether the pattern shows that the model is wrong."""
-        return self.largest > SUSPECT_PATTERN
+        return self.largest > self.suspect
 
     def lacks_counts(self, deviations: float = 4.0) -> bool:
         """Return whether the noise is smaller than counts make it, by so many deviations."""

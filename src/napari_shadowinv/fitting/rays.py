@@ -22,12 +22,8 @@ from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.fitting import _ray_kernels as kernels
 from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
 
-_SHARED = 2.0  # spacings at rest: width of an edge where rays count in both pixels, evenly then
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
-_PARTS = 2  # of a Jacobian's rows, each with sums of its own
 _GUARD = 2  # px around the detector, for rays that miss it
-# Rays, rows of an image, and entries of a Jacobian that are worth a thread.
-_WORTH_A_THREAD, _WORTH_A_THREAD_ROWS, _WORTH_A_PRODUCT = 20_000, 200, 100_000
 
 
 class Pulls(NamedTuple):
@@ -141,14 +137,17 @@ class RayModel:
         ray_counts = np.rint(np.maximum(most, 0.5) * self._at_rest).astype(np.int64)
         return np.asarray(np.minimum(ray_counts, MOST_RAYS))
 
-    def image(self, traced: TracedBeam) -> FloatArray:
-        """Return the flux that lands in each pixel, with the shape `seen`."""
+    def image(self, traced: TracedBeam, fewest_rows: int = 200) -> FloatArray:
+        """Return the flux that lands in each pixel, with the shape `seen`.
+
+        Fewer rows are not worth a thread.
+        """
         corners = np.zeros((_BANDS, 4 * math.prod(self._guarded)))
         reached = np.zeros((_BANDS, 2), np.int64)
         self._in_ranges(kernels.deposit, _BANDS, traced, corners, reached)
         image, width = np.zeros(self.seen), self._guarded[1]
         threads, sums = available_threads(self.threads), (corners, reached, width, _GUARD, image)
-        in_ranges(kernels.add_corners, len(image), threads, *sums, smallest=_WORTH_A_THREAD_ROWS)
+        in_ranges(kernels.add_corners, len(image), threads, *sums, smallest=fewest_rows)
         return image
 
     def gradient(
@@ -229,6 +228,8 @@ class RayModel:
         weights: Sequence[FloatArray],
         slopes: Sequence[FloatArray],
         lights: Sequence[FloatArray],
+        parts: int = 2,
+        fewest: int = 100_000,
     ) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return Jᵀ s w (s J v + l) and w (s J v + l) of each image, in one pass over J.
 
@@ -238,19 +239,23 @@ class RayModel:
             J and v, changes of its columns.
         weights, slopes, lights : sequence of ndarray
             w, s and l: images with the shape `seen`.
+        parts : int, default 2
+            Of the rows of a Jacobian, each with sums of its own.
+        fewest : int, default 100,000
+            Entries of a Jacobian that are worth a thread.
         """
         pulls = [np.empty(self.seen) for _ in jacobians]
-        totals = [np.zeros((_PARTS, each.shape[1])) for each in jacobians]
+        totals = [np.zeros((parts, each.shape[1])) for each in jacobians]
         works = []
         for k, (jacobian, change) in enumerate(zip(jacobians, changes, strict=True)):
             images = [each[k].reshape(-1) for each in (weights, slopes, lights, pulls)]
             rows = jacobian.shape[0]
-            for part in range(_PARTS):
-                bounds = rows * part // _PARTS, rows * (part + 1) // _PARTS
+            for part in range(parts):
+                bounds = rows * part // parts, rows * (part + 1) // parts
                 arguments = *bounds, _entries(jacobian), change, *images, totals[k][part]
                 works.append(partial(kernels.normal_times, *arguments))
         threads = available_threads(self.threads)
-        run_together(works, threads if jacobians[0].nnz > _WORTH_A_PRODUCT else 1)
+        run_together(works, threads if jacobians[0].nnz > fewest else 1)
         return [total.sum(axis=0) for total in totals], pulls
 
     def displacement(self, potential: FloatArray) -> FloatArray:
@@ -275,15 +280,25 @@ class RayModel:
         return self.seen[0] + 2 * _GUARD, self.seen[1] + 2 * _GUARD
 
     def _in_ranges(
-        self, kernel: Callable[..., Any], ranges: int, traced: TracedBeam, *rest: Any
+        self,
+        kernel: Callable[..., Any],
+        ranges: int,
+        traced: TracedBeam,
+        *rest: Any,
+        fewest: int = 20_000,
+        shared: float = 2.0,
     ) -> None:
-        """Call a kernel for ranges, in threads."""
+        """Call a kernel for ranges, in threads.
+
+        Fewer rays are not worth one. Near an edge, `shared` spacings at rest wide, rays count in
+        both pixels, evenly then.
+        """
         potential, counts, beam, frame = traced
         frame_px = self._to_pixels(at_rest() if frame is None else frame)
         threads = available_threads(self.threads)
-        if (counts[0] * counts[1]).sum() < _WORTH_A_THREAD:
+        if (counts[0] * counts[1]).sum() < fewest:
             threads = 1
-        steepness = self._at_rest / KNOT / _SHARED
+        steepness = self._at_rest / KNOT / shared
         splines, size = _tables(), self._guarded
         rays = kernels.Rays(potential, counts, beam, splines, frame_px, self.pad, steepness, size)
         in_ranges(kernel, ranges, threads, rays, *rest, smallest=1, uneven=True)

@@ -15,10 +15,8 @@ from napari_shadowinv.fitting.search import Start
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 
-# Widths of the pixels, and of the smoothing, of each stage of the search.
-_FROM_FAR = ((4, 2.0), (4, 1.0), (2, 1.0))
-_FROM_NEAR = ((4, 2.0), (2, 2.0), (2, 1.0))
-_FROM_FIELD = ((4, 1.0), (2, 1.0))
+Stages = tuple[tuple[int, float], ...]
+"""Widths of the pixels, and of the smoothing, of each stage of a search."""
 
 
 def collect_starts(
@@ -28,6 +26,9 @@ def collect_starts(
     *,
     shares: Sequence[float] = (1.0, 1.4, 1.9, 2.4),
     rounded: float = 8.0,
+    from_far: Stages = ((4, 2.0), (4, 1.0), (2, 1.0)),
+    from_near: Stages = ((4, 2.0), (2, 2.0), (2, 1.0)),
+    from_field: Stages = ((4, 1.0), (2, 1.0)),
 ) -> list[Start]:
     """Return the starting points: no field, a field that is known, and inversions by transport.
 
@@ -42,10 +43,10 @@ def collect_starts(
     if data.start is not None:
         candidates.append(Start("given", ((2, 1.0),), data.start, is_held))
     if not data.single:
-        candidates.append(Start("from far", _FROM_FAR, beam_held=is_held))
-    candidates.append(Start("from near", _FROM_NEAR, beam_held=is_held))
+        candidates.append(Start("from far", from_far, beam_held=is_held))
+    candidates.append(Start("from near", from_near, beam_held=is_held))
     if data.unknown and not data.single:
-        candidates.append(Start("from far, beam held", _FROM_FAR, beam_held=True))
+        candidates.append(Start("from far, beam held", from_far, beam_held=True))
     if scene.strengths.shape[1] > 1 or data.unknown:
         return candidates
     sizes = np.abs(scene.strengths[:, 0])  # zero where the object does not deflect: a blank shot
@@ -58,7 +59,7 @@ def collect_starts(
     if not data.single:
         return [*candidates, Start("transport", ((2, 2.0), (2, 1.0)), potential, is_held)]
     return candidates + [
-        Start(f"{share:g} × transport", _FROM_FIELD, share * potential) for share in shares
+        Start(f"{share:g} × transport", from_field, share * potential) for share in shares
     ]
 
 

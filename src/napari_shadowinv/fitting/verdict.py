@@ -17,7 +17,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Assessment, Verdict, limit_text, percent, to_figures
 from napari_shadowinv.fitting.instrument import TITLES
 from napari_shadowinv.fitting.noise_match import NoiseMatch
-from napari_shadowinv.fitting.pattern import SUSPECT_PATTERN, Pattern, noise_amplification
+from napari_shadowinv.fitting.pattern import Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
 from napari_shadowinv.physics.edge import LARGER_FIELD, beyond_sides, edge_doubt
@@ -69,8 +69,6 @@ def hidden_contrast(
     return max(shares)
 
 
-MISFIT_CHI2 = 1.3
-"""χ² of an image beyond which the model does not explain it."""
 _UNDERESTIMATED = {"blur", "gamma", "absorption"}
 
 
@@ -87,6 +85,7 @@ class VerdictLimits:
     energies the r.m.s. ratio was 1.2, of weak rings 1.4: hence the safety.
     """
 
+    misfit_chi2: float = 1.3  # of an image that the model does not explain
     chi2_at_edge: float = 5.0  # of a misfit by an edge alone
     quiet_chi2: float = 0.4  # an estimated noise may be too large by a third
     as_good: float = 0.03  # of the objective
@@ -198,7 +197,7 @@ def assess_verdict(evidence: Evidence) -> Assessment:
 
 def _not_explained(case: Evidence) -> Answer:
     chi2, pattern = case.fit.chi2, case.pattern
-    misfits = chi2 > MISFIT_CHI2
+    misfits = chi2 > case.limits.misfit_chi2
     if not misfits.any():
         return None
     causes = "noise, source (uniform, measured or unknown) or point spread may be wrong"
@@ -435,7 +434,7 @@ def _pattern_text(pattern: Pattern, names: Sequence[str]) -> str:
     patterned = [
         f"{name}: {strength:.0f}"
         for name, strength in zip(names, pattern.strengths, strict=True)
-        if strength > SUSPECT_PATTERN
+        if strength > pattern.suspect
     ]
     cause = _cause_text(pattern) or (
         "source, brightness, point spread, dark level or registration may be wrong, or the "
