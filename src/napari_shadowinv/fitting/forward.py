@@ -519,8 +519,8 @@ class Linear:
 
     def _light_change(self, change: Unknowns, k: int) -> FloatArray:
         """The change of an image by numbers that act where it is seen."""
-        seen = self.seen[k]
-        return change.brightness[k] * seen.image + seen.effects.push(change, k, np.zeros(()))
+        of_brightness = change.brightness[k] * self.seen[k].image
+        return np.asarray(of_brightness + self.seen[k].effects.push(change, k, np.zeros(())))
 
     def _add_light_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
         """Add derivatives by numbers that act where an image is seen."""
