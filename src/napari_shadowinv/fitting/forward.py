@@ -363,6 +363,9 @@ class Scene(PriorTerms):
             for k, light in enumerate(entering):
                 light.effects.add_pulls(slope, k, of_logarithm[k])
             self.imperfect.pull_shapes(of_logarithm, slope.common, slope.separate)
+        return self._only_free(slope)
+
+    def _only_free(self, slope: Unknowns) -> Unknowns:
         frames = np.where(self.free_frames, slope.frames, 0.0)
         frames[0] = 0
         brightness = np.where(self.free_brightness, slope.brightness, 0.0)
