@@ -25,15 +25,14 @@ class NoiseMatch:
         Variance of a pixel over the one that is used.
     correlation : float
         Standard deviation of the Gaussian that has blurred the noise, px; 0 for white noise.
-    is_estimated, is_hidden : bool
-        Whether the noise was estimated, and whether structure may hide much more than that.
+    is_estimated : bool
+        Whether the noise was estimated.
     """
 
     factors: FloatArray
     expected_chi2: FloatArray
     correlation: float
     is_estimated: bool
-    is_hidden: bool
 
     def relative_chi2(self, chi2: FloatArray) -> FloatArray:
         """Return χ² over the expected one; residuals below the stated noise are no misfit."""
@@ -68,7 +67,6 @@ def match_noise(
     *,
     is_estimated: bool,
     too_large: float = 2.5,
-    hidden: float = 9.0,
 ) -> NoiseMatch:
     """Compare the noise of images with its standard deviations, all in units of the beams.
 
@@ -81,17 +79,15 @@ def match_noise(
         Standard deviation of the blur that correlates the noise, px, if it is stated.
     is_estimated : bool
         Whether the standard deviations are those of differences between neighbouring pixels.
-    too_large, hidden : float, default 2.5 and 9
-        A variance that is stated is too large, and one that was estimated hides noise, where it is
-        so many times that of the calm parts, or these have so many times its own.
+    too_large : float, default 2.5
+        A variance is too large where it is so many times that of the calm parts.
     """
     factors, expected = np.ones((2, len(excess)))
-    correlation, is_hidden = 0.0, False
+    correlation = 0.0
     for k, planes in enumerate(zip(excess, brightness, used, strict=True)):
         noise = measure_correlation(*planes, width)
         variance = float(np.median(deviations[k][used[k]] ** 2))
         if noise.is_bound:
-            is_hidden |= is_estimated and noise.white_variance > hidden * variance
             continue
         is_too_large = variance > too_large * noise.variance > 0
         if noise.blurred and noise.white < variance / 2 and (is_estimated or not is_too_large):
@@ -102,4 +98,4 @@ def match_noise(
             continue
         expected[k] = noise.variance / (factors[k] * variance)
         correlation = max(correlation, noise.width)
-    return NoiseMatch(factors, expected, correlation, is_estimated, is_hidden)
+    return NoiseMatch(factors, expected, correlation, is_estimated)

@@ -321,18 +321,6 @@ def _errors_large(case: Evidence) -> Answer:
     return Assessment(Verdict.UNCERTAIN, _limited(case), report.next_step, explanation)
 
 
-def _noise_unmeasured(case: Evidence) -> Answer:
-    if not (case.single and case.noise is not None and case.noise.is_hidden):
-        return None
-    return _doubt(
-        Verdict.UNCERTAIN,
-        "structure fills the image and hides the noise",
-        "noise that is correlated over a few pixels, as of smoothed or resampled images, looks "
-        "like it",
-        "give the noise and its correlation",
-    )
-
-
 def _search_unfinished(case: Evidence) -> Answer:
     if case.fit.report.converged:
         return None
@@ -374,7 +362,6 @@ _RULES = (
     _beyond_edge,
     _other_answers,
     _errors_large,
-    _noise_unmeasured,
     _search_unfinished,
     _object_masked,
     _conditional,
