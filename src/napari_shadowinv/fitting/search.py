@@ -41,16 +41,19 @@ SMALL_PX = 80  # shorter side of images with too few pixels for an instrument's 
 SMOOTHNESS_RATIO = 0.1  # of them
 
 
+Stages = tuple[tuple[int, float], ...]
+"""Side of a pixel, and blur in such pixels, at each stage of a descent."""
+
+
 @dataclass(frozen=True)
 class Start:
-    """Where a descent begins: a potential in px² at the pixels, or none; pixels and blurs of it.
+    """Where a descent begins: a potential in px² at the pixels, or none; and its stages.
 
-    `stages` are (side of a pixel, blur in such pixels). In all but the last an unknown beam may be
-    held.
+    In all but the last an unknown beam may be held.
     """
 
     name: str
-    stages: tuple[tuple[int, float], ...]
+    stages: Stages
     potential: FloatArray | None = None
     beam_held: bool = False
 
@@ -99,7 +102,7 @@ class _Descent(NamedTuple):
 
     start: Start
     minimum: Minimum
-    stages: Sequence[tuple[int, float]]
+    stages: Stages
 
     def run(
         self, scene: Scene, on_step: OnStep, steps: int = 60, spacing: float = 1 / 3

@@ -11,12 +11,9 @@ from napari_shadowinv._system.progress import OnStep, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.measurements import FitData
-from napari_shadowinv.fitting.search import Start
+from napari_shadowinv.fitting.search import Stages, Start
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
-
-Stages = tuple[tuple[int, float], ...]
-"""Widths of the pixels, and of the smoothing, of each stage of a search."""
 
 
 def collect_starts(
