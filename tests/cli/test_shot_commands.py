@@ -1011,6 +1011,8 @@ def test_rerun_lists_the_changes(folder: Path, shot: Path, refused: Callable[...
     refused("rerun", "first.shadowinv", "--overwrite", names=("shot.npy", "does not exist"))
     write("bare.shadowinv", invert(np.ones((8, 8))))
     refused("rerun", "bare.shadowinv", names=("bare.shadowinv", "has no provenance"))
+    (folder / "notes.md").write_text("a toroid")
+    refused("rerun", "notes.md", names="notes.md is a text file")
 
 
 @pytest.mark.parametrize("place", ["{folder}/private/shot.npy", "../private/shot.npy"])
@@ -1346,7 +1348,7 @@ def test_a_full_disk_costs_the_figure_but_not_the_result(
     result = shadowinv(
         "invert", shot, "--set=options.n_sites=300", "--out", out, "--figure", figure
     )
-    assert result.exit_code == (2 if full == "result" else 0)
+    assert result.exit_code == (2 if full == "result" else 1)
     (line,) = result.stderr.splitlines()
     assert f"{disk}/a." in line
     assert "cannot be written (No space left on device): free some disk space" in line
@@ -1363,7 +1365,7 @@ def test_a_figure_that_fails_does_not_cost_the_result(
 
     monkeypatch.setattr("napari_shadowinv.plotting.figures.report_figure", fail)
     result = shadowinv("invert", shot, "--set=options.n_sites=300")
-    assert result.exit_code == 0, result.output
+    assert result.exit_code == 1, result.output
     assert sorted(content(folder)) == ["shot.npy", "shot.shadowinv"]
     assert "the figure shot.png could not be drawn" in result.stderr
     assert "latex was not able" in result.stderr

@@ -34,7 +34,9 @@ shadowinv analyse a.shadowinv 'profile 99,20 99,180 width=5' --unit 'MG um'
 
 shadowinv analyse night.shadowinv.zarr 'region center=99,99 radius=40' --times 1e-9
 
-Without a product the command lists them. Exit codes: 0 written; 2 invalid input; 130 cancelled.
+Without a product the command lists them.
+
+Exit codes: 0 written; 1 no figure; 2 invalid input; 130 cancelled.
 """
 
 
@@ -119,6 +121,7 @@ def analyse(
             say(table)
         if outputs:
             say(two_columns("Files", written_rows(outputs, failed)))
+    _inputs.exit_unless_drawn(failed)
 
 
 def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:

@@ -36,7 +36,7 @@ shadowinv film --new scans
 
 shadowinv film scans/pack.toml --layers layers
 
-Exit codes: 0 written; 2 invalid input, nothing written; 130 cancelled.
+Exit codes: 0 written; 1 no figure; 2 invalid input, nothing written; 130 cancelled.
 """
 
 
@@ -123,6 +123,7 @@ def film(
     if not quiet:
         say(film_table(doses))
         say(two_columns("Film pack", [*fact_rows(doses.facts), *written_rows(written, failed)]))
+    _inputs.exit_unless_drawn(failed)
 
 
 def film_table(doses: FilmDoses) -> Table:

@@ -26,7 +26,7 @@ shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --set fit.fields
 
 shadowinv fit shots.csv --setup setup.toml --source unknown --noise poisson
 
-Exit codes: 0 determined; 2 invalid input; 3 another verdict; 130 cancelled.
+Exit codes: 0 determined; 1 no figure; 2 invalid input; 3 another verdict; 130 cancelled.
 """
 
 
@@ -101,3 +101,4 @@ def fit(
         fit_rows = _fit_result.fit_rows(result_fit, names, printed)
         say(two_columns("Fit", [*fit_rows, *written_rows(outputs, failed)]))
     exit_unless_sound(result_fit, result, left_out)
+    _inputs.exit_unless_drawn(failed)

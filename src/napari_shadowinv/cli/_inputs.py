@@ -6,10 +6,12 @@ the work, and their files are written after it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from typer import Exit
 
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.cli._flags import FitFlags, InversionFlags, ShotFlags
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.results import AnyResult
 
+EXIT_NO_FIGURE = 1
 Output = tuple[Path | None, tuple[str, ...]]  # a file and the endings that it may have
 
 
@@ -151,6 +154,12 @@ def write_figures(figures: Mapping[Path, Callable[[], Figure]], overwrite: bool)
             text = f"the figure {path} could not be drawn, everything else is written: {reason}"
             say_on_stderr(text, "yellow")
     return failed
+
+
+def exit_unless_drawn(failed: Collection[Path]) -> None:
+    """Exit with an error code if `write_figures` could not write a figure."""
+    if failed:
+        raise Exit(EXIT_NO_FIGURE)
 
 
 def recipe_from(flags: InversionFlags, settings: Settings) -> Recipe:

@@ -48,7 +48,7 @@ shadowinv plan shot.shadowinv --setup next.toml --sweep counts=100,300,1000
 
 Phantoms: toroid, four_toroids, coaxial, wakefield, blob.
 
-Exit codes: 0 determined; 2 invalid input; 3 not determined; 130 cancelled.
+Exit codes: 0 determined; 1 no figure; 2 invalid input; 3 not determined; 130 cancelled.
 """
 
 
@@ -122,6 +122,7 @@ def plan(
         say(two_columns("Sweep" if is_sweep else "Plan", rows))
     if not result.is_determined:
         raise Exit(EXIT_NOT_CONVERGED)
+    _inputs.exit_unless_drawn(failed)
 
 
 def _file_of(text: str) -> Path | None:

@@ -76,7 +76,7 @@ shadowinv invert shot.tif --source reference.tif --setup setup.toml --bin 4
 
 shadowinv invert shot.tif --step 'hot-pixels 6' --set options.tolerance=1e-4
 
-Exit codes: 0 success; 2 invalid input; 3 written, but not converged; 130 cancelled.
+Exit codes: 0 success; 1 no figure; 2 invalid input; 3 written, but not converged; 130 cancelled.
 """
 
 
@@ -131,6 +131,7 @@ def invert(
         ]
         say(two_columns(f"{shot.path}, {size_text(inversion.image)}", rows))
     exit_unless_sound(inversion, result)
+    _inputs.exit_unless_drawn(failed)
 
 
 @notify_errors
@@ -150,7 +151,7 @@ def rerun(
     """
     from napari_shadowinv.pipeline.rerun import collect_rerun
 
-    target = out or Path(f"{result.stem}_again{result.suffix}")
+    target = out or Path(f"{result.stem}_again{RESULT.suffix}")
     again_out, figure = _inputs.result_and_figure(result, target, figure)
     files = _inputs.result_outputs(ResultKind.INVERSION, again_out, figure)
     _inputs.check_outputs(files, overwrite)
@@ -179,6 +180,7 @@ def rerun(
         ]
         say(two_columns("Rerun", rows))
     exit_unless_sound(content, again_out, again.left_out)
+    _inputs.exit_unless_drawn(failed)
 
 
 FORWARD_SECTIONS: Sections = {"view": SizedView, "trace": TraceOptions}
@@ -367,6 +369,7 @@ def demo(
     ]
     say(two_columns("Demo", rows))
     exit_unless_sound(inversion, result)
+    _inputs.exit_unless_drawn(failed)
 
 
 def _error_text(estimate: FloatArray, truth: FloatArray) -> str:
