@@ -18,7 +18,7 @@ ON_SCREEN := xvfb-run -a -s "-screen 0 2560x1440x24"
 ON_BOTH_CORES := -n 2 --dist loadfile
 CORE_PYTHON ?= $(BIN)/python
 CORE_TOOLS := "pytest>=8.2" "pytest-xdist>=3.6" "hypothesis>=6.100" "shapely>=2.0" "pyamg>=5.1" \
-	"pyyaml>=6.0" "threadpoolctl>=3.2"
+	"pyyaml>=6.0" "pooch>=1.8"
 CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/io tests/inversion tests/preprocessing \
 	tests/cli/test_shot_commands.py tests/plotting tests/stack/test_lazy.py tests/stack/test_run.py \
 	tests/stack/test_statistics.py

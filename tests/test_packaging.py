@@ -10,6 +10,7 @@ import tomllib
 from configparser import ConfigParser
 from email import message_from_string
 from email.message import Message
+from importlib.metadata import requires
 from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
@@ -119,14 +120,42 @@ def test_the_classifiers_exist(metadata: Message) -> None:
     assert set(metadata.get_all("Classifier", [])) <= trove_classifiers.classifiers
 
 
+def names_in(needs: list[str]) -> set[str]:
+    return {re.split(r"[^\w-]", need)[0].lower().replace("_", "-") for need in needs}
+
+
 def test_napari_is_no_requirement_of_the_core(metadata: Message) -> None:
-    required = [
-        re.split(r"[^\w-]", need)[0].lower()
-        for need in metadata.get_all("Requires-Dist", [])
-        if "extra ==" not in need
-    ]
+    needs = metadata.get_all("Requires-Dist", [])
+    required = names_in([need for need in needs if "extra ==" not in need])
     assert "numpy" in required
-    assert not {"napari", "qtpy", "pyqt6", "pyside6", "pytest"} & set(required)
+    assert not {"napari", "qtpy", "pyqt6", "pyside6", "pytest"} & required
+
+
+MODULES = {"PIL": "pillow", "skimage": "scikit-image"}  # whose names differ from their packages'
+
+
+def test_the_page_of_dependencies_has_all_that_is_declared_and_imported(metadata: Message) -> None:
+    page = (ROOT / "docs" / "dependencies.md").read_text("utf-8")
+    rows = re.findall(
+        r"^\| (?!package|extra)([a-z][\w-]+) \| .* \| ([\w, -]*)\|$", page, re.MULTILINE
+    )
+    brought_by = {name: names_in(text.split(", ")) - {""} for name, text in rows}
+    needs = metadata.get_all("Requires-Dist", [])
+    assert brought_by.keys() == names_in([need for need in needs if "extra ==" not in need])
+    for name, brought in brought_by.items():
+        assert brought <= names_in(requires(name) or []), name
+    imported = {
+        MODULES.get(name, name.replace("_", "-"))
+        for path in PACKAGE.rglob("*.py")
+        if "_napari" not in path.parts
+        for name in re.findall(
+            r"^ *(?:from|import) ([\w]+)(?: import|\.| as|$)", path.read_text("utf-8"), re.MULTILINE
+        )
+        if name not in {*sys.stdlib_module_names, "napari_shadowinv"}
+    }
+    optional = imported - brought_by.keys() - set().union(*brought_by.values())
+    assert optional <= {"distributed", "imageio-ffmpeg", "pooch"}
+    assert all(name in page for name in optional)
 
 
 # The citation
@@ -199,6 +228,7 @@ def test_read_the_docs_builds_what_make_docs_builds() -> None:
 
 
 CONDA_NAMES = {"dask": "dask-core", "matplotlib": "matplotlib-base"}  # without windows and servers
+OF_EXTRAS = {"h5netcdf[h5py]": "h5py", "tifffile[codecs]": "imagecodecs"}  # conda has no extras
 
 
 def test_the_conda_recipe_requires_what_the_wheel_requires(metadata: Message) -> None:
@@ -207,6 +237,7 @@ def test_the_conda_recipe_requires_what_the_wheel_requires(metadata: Message) ->
     for need in metadata.get_all("Requires-Dist", []):
         match = re.fullmatch(r"([\w-]+)(?:\[.*\])?(>=[\d.]+)", need)
         if match:
+            needs |= {OF_EXTRAS[name] for name in OF_EXTRAS if need.startswith(name)}
             needs.add(f"{CONDA_NAMES.get(match[1].lower(), match[1].lower())} {match[2]}")
     context = recipe["context"]
     run = recipe["requirements"]["run"]

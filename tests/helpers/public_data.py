@@ -5,12 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pooch
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.io.public_images import PUBLIC_FILES, cache_folder, fetch_public_file
+from napari_shadowinv.io.public_images import PUBLIC_FILES, fetch_public_file
 
 SHARED_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+CACHE = Path(pooch.os_cache("napari-shadowinv"))
 
 # px/(G cm) by the constants in the example's notes: q/(m c v), lengths in cm, 10 µm pixels.
 _DONUT_SHIFT = 4.803e-10 / (1.67e-24 * 3e10 * 5.24e9) * 20 / (21.4 / 1.4) / 1e-3
@@ -29,10 +31,10 @@ def public_file(name: str) -> Path:
     if (SHARED_DATA / name).is_file():
         return SHARED_DATA / name
     # Without a network, wait for one timeout only.
-    if _failures and not (cache_folder() / name).is_file():
+    if _failures and not (CACHE / name).is_file():
         pytest.skip(_failures[0])
     try:
-        return fetch_public_file(name)
+        return fetch_public_file(name, cache=CACHE)
     except OSError as error:
         _failures.append(str(error))
         pytest.skip(str(error))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -92,9 +91,9 @@ def test_without_a_network_the_menu_says_so_once(
     from napari._app_model import get_app_model
 
     name = next(name for name in public_images.PUBLIC_FILES if name.startswith("burner/"))
-    file = replace(public_images.PUBLIC_FILES[name], address=f"http://127.0.0.1:9/{name}")
+    file = public_images.PUBLIC_FILES[name] | {"address": f"http://127.0.0.1:9/{name}"}
     monkeypatch.setitem(public_images.PUBLIC_FILES, name, file)
-    monkeypatch.setattr(public_images, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr("pooch.os_cache", lambda name: tmp_path)
     window = make_napari_viewer()
     in_loop(lambda: get_app_model().commands.execute_command("napari-shadowinv.burner").result())
     (message,) = messages

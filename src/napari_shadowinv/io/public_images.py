@@ -1,4 +1,4 @@
-"""Published images and tables, downloaded on request, verified by checksum and cached.
+"""Published images and tables, which pooch downloads on request, verifies and keeps.
 
 - any file of the list `public_files.csv`: `fetch_public_file`
 - the plume of an alcohol burner with its reference: `fetch_burner`
@@ -7,35 +7,15 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-
-@dataclass(frozen=True)
-class PublicFile:
-    """A file in a public repository, at a fixed commit, whose licence allows its use."""
-
-    name: str  # path in the cache, such as rcf/HDV2.tif
-    size: int  # in bytes
-    sha256: str  # checksum, hexadecimal
-    licence: str  # of the repository, as an SPDX identifier
-    address: str  # URL
-
+from napari_shadowinv.errors import InputError
 
 _LIST = files(__package__).joinpath("public_files.csv").read_text(encoding="utf-8")
-PUBLIC_FILES = {
-    name: PublicFile(name, int(size), *texts)
-    for name, size, *texts in list(csv.reader(_LIST.splitlines()))[1:]
-}
-"""By name. The burner's first file is the reference beam, the others are frames."""
-
-
-def cache_folder() -> Path:
-    """Return the folder of the user in which downloaded files are kept."""
-    import pooch
-
-    return Path(pooch.os_cache("napari-shadowinv"))
+PUBLIC_FILES = {row["name"]: row for row in csv.DictReader(_LIST.splitlines())}
+"""By name, with size, sha256, licence (SPDX) and address; a name is a path in the cache, such as
+rcf/HDV2.tif. The burner's first file is the reference beam, the others are frames."""
 
 
 def fetch_public_file(name: str, *, cache: Path | None = None, timeout: float = 10.0) -> Path:
@@ -55,56 +35,40 @@ def fetch_public_file(name: str, *, cache: Path | None = None, timeout: float = 
 
     Raises
     ------
+    InputError
+        If the package pooch is missing.
     OSError
         If the file cannot be downloaded, or its checksum differs; nothing is kept then.
     """
-    import pooch
-
-    file = PUBLIC_FILES[name]
-    path = (cache or cache_folder()) / name
-    pooch.get_logger().setLevel("ERROR")
     try:
-        pooch.retrieve(
-            file.address,
-            f"sha256:{file.sha256}",
-            fname=path.name,
-            path=path.parent,
-            downloader=pooch.HTTPDownloader(timeout=timeout),
-        )
+        import pooch
+    except ModuleNotFoundError:
+        raise InputError(
+            f"{name} is downloaded by the package pooch, which is missing: install it with pip "
+            "install 'napari-shadowinv[samples]'"
+        ) from None
+    address, checksum = PUBLIC_FILES[name]["address"], f"sha256:{PUBLIC_FILES[name]['sha256']}"
+    path = (cache or Path(pooch.os_cache("napari-shadowinv"))) / name
+    pooch.get_logger().setLevel("ERROR")
+    downloader = pooch.HTTPDownloader(timeout=timeout)
+    try:
+        pooch.retrieve(address, checksum, path.name, path.parent, downloader=downloader)
     except (OSError, ValueError) as error:
-        reason = "no connection"
-        if isinstance(error, ValueError):
-            reason = "its checksum differs"
-        elif (response := getattr(error, "response", None)) is not None:
+        reason = "its checksum differs" if isinstance(error, ValueError) else "no connection"
+        if (response := getattr(error, "response", None)) is not None:
             reason = f"the server answered {response.status_code}"
         raise OSError(
             f"{path.name} could not be downloaded ({reason}): connect to the network, or save "
-            f"{file.address} in {path.parent}"
+            f"{address} in {path.parent}"
         ) from error
     return path
 
 
 def fetch_burner(frames: int = 1, *, cache: Path | None = None) -> list[Path]:
-    """Download the reference beam and the first frames of a burner's plume.
+    """Download the reference beam and the first frames, 1 to 11, of a burner's plume.
 
-    The data belong to doi:10.1016/j.expthermflusci.2025.111562.
-
-    Parameters
-    ----------
-    frames : int
-        Number of frames, 1 to 11.
-    cache : Path, optional
-        Folder in which the files are kept. Default: the user's cache folder.
-
-    Returns
-    -------
-    list of Path
-        The reference beam and the frames in order of time, 8-bit BMP of 1152×928 px.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be downloaded, or its checksum differs.
+    They are 8-bit BMP of 1152×928 px in the order of time, of
+    doi:10.1016/j.expthermflusci.2025.111562. Cache and errors as of `fetch_public_file`.
     """
     names = [name for name in PUBLIC_FILES if name.startswith("burner/")]
     return [fetch_public_file(name, cache=cache) for name in names[: 1 + frames]]
