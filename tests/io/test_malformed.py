@@ -166,16 +166,17 @@ GOOD: dict[str, Callable[[Path], object]] = {
     "shot.h5": prad(NOISE),
     "shot.png": picture,
     "shot.bmp": picture,
+    "shot.jpg": picture,
 }
 ZERO = NOISE[:0]
 RANDOM = np.random.default_rng(7).integers(128, 256, 9000).astype(np.uint8).tobytes()
-CUT = ["five.mat", "seven.mat", "hdf.mat", "shot.b16", "two.spe", "three.spe"]
+CUT = GOOD.keys() - {"shot.txt"}  # whose first rows are an image, too
 
 BAD: dict[str, tuple[str, Callable[[Path], object]]] = {
     **{f"empty {name}": (name, text(b"")) for name in GOOD},
     **{
         f"{share} of {name}": (name, cut(GOOD[name], share))
-        for name in CUT
+        for name in sorted(CUT)
         for share in (0.01, 0.5, 0.95)
     },
     "wrong magic mat": ("a.mat", patched(mat5(NOISE), (0, b"X"))),
@@ -246,7 +247,8 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("good")
     for name, write in GOOD.items():
         write(folder / name)
-        np.testing.assert_array_equal(read(folder / name).image, NOISE)
+        if name != "shot.jpg":
+            np.testing.assert_array_equal(read(folder / name).image, NOISE)
 
 
 @pytest.mark.filterwarnings("ignore:Image size")

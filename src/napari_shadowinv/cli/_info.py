@@ -41,13 +41,14 @@ def file_table(path: Path, variable: str | None = None) -> Table:
 
 def _rows(path: Path, variable: str | None) -> _summary.Rows:
     from napari_shadowinv.io import read
-    from napari_shadowinv.io.field_grids import describe_field_grid, is_field_grid
+    from napari_shadowinv.io.field_grids import is_field_grid
     from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.frames import find_frames
-    from napari_shadowinv.io.hdf5_arrays import read_hdf5
+    from napari_shadowinv.io.hdf5_arrays import list_sizes, read_hdf5
 
     if variable is None and is_field_grid(path):
-        return [*describe_field_grid(path)]
+        kind = "fields on a grid: trace particles with shadowinv forward"
+        return [("kind", kind), *list_sizes(path)]
     frames = find_frames(path, variable)
     if len(frames) > 1:
         return _frame_rows(read(path, variable=variable), frames[0].variable)

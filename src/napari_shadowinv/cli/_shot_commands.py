@@ -428,7 +428,7 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     kind = kind_of(path)
     if variable is not None and kind in ("hdf5", "pradformat", "shadowinv"):
         return Field(_displacement(path, read_hdf5(path, variable)))
-    if variable is not None or kind == "mat":
+    if variable is not None or kind in ("mat", "hdf5"):
         return Field(_displacement(path, read_radiograph(path, variable=variable).image))
     if kind in ("pradformat", "shadowinv"):
         return _field_of_result(path, read_dataset(path))

@@ -1,11 +1,11 @@
 """Arrays of numpy, ``.npy``: `read_npy`, an image or frame `read_npy_plane`, `write_npy`.
 
-- lengths of the axes that count the frames of an array in any file: `frame_axes`
+Frames of an array in any file: lengths of their axes, `frame_axes`; the one that a name ends with,
+`frame_number`.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from io import BytesIO
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 
 from napari_shadowinv._system.safety import as_file_errors, check_size
 from napari_shadowinv._typing import AnyArray
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, InputError
 
 FRAME_INDEX = re.compile(r"(?P<name>.*)\[(?P<index>\d+(,\d+)*)\]")  # of an array, as data[3]
 
@@ -35,16 +35,14 @@ def frame_axes(path: Path, title: str, shape: tuple[int, ...]) -> tuple[int, ...
     return shape[:-2]
 
 
-def check_one_frame(path: Path, axes: tuple[int, ...], title: str = "") -> None:
-    """Refuse many frames where one image is expected; `title` is the array's, if it has a name."""
-    if math.prod(axes) == 1:
-        return
-    first = ",".join("0" * len(axes))
-    advice = f"choose one, such as '{title}[{first}]', or " if title else ""
-    raise FileFormatError(
-        f"{path} holds {math.prod(axes)} frames{title and f' in {title!r}'}: expected one image; "
-        f"{advice}invert all as a stack of shots"
-    )
+def frame_number(path: Path, match: re.Match[str], axes: tuple[int, ...]) -> int:
+    """Return the number over all `axes` of the frame that a `FRAME_INDEX` names."""
+    index = tuple(map(int, match["index"].split(",")))
+    if len(index) != len(axes) or any(map(int.__ge__, index, axes)):
+        last = ",".join(str(length - 1) for length in axes)
+        frames = f"frames from [{','.join('0' * len(axes))}] to [{last}]" if axes else "one image"
+        raise InputError(f"{path} has no {match[0]!r}: it holds {frames}; correct the index")
+    return int(np.ravel_multi_index(index, axes)) if axes else 0
 
 
 @as_file_errors
@@ -80,11 +78,9 @@ def count_npy(path: Path) -> tuple[int, ...]:
     return frame_axes(path, "an array", _map_npy(path).shape)
 
 
-def read_npy_plane(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
+def read_npy_plane(path: Path, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
     """Read an image, or a frame of many."""
-    if number is None:
-        check_one_frame(path, count_npy(path))
-    return read_npy(path, number or 0), {}
+    return read_npy(path, number), {}
 
 
 def write_npy(path: Path, array: AnyArray, pixel_size: float | None = None) -> None:

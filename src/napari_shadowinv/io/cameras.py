@@ -22,11 +22,18 @@ import numpy as np
 from napari_shadowinv._system.safety import check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.arrays import check_one_frame
 from napari_shadowinv.io.files import check_promise
 
 _B16_HEADER, _B16_EXTENDED_HEADER = 24, 128
 _SPE_HEADER = 4100
+_SPE_FIELDS = np.dtype(
+    {
+        "names": ["width", "code", "height", "footer", "frames", "version"],
+        "formats": ["<u2", "<i2", "<u2", "<u8", "<i4", "<f4"],
+        "offsets": [42, 108, 656, 678, 1446, 1992],
+        "itemsize": _SPE_HEADER,
+    }
+)
 _SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
 _SPE_REGION = re.compile(rb'<DataBlock\b[^>]*\btype="Region"[^>]*>')
 _SPE_STRIDE = re.compile(rb'<DataBlock\b(?=[^>]*\btype="Frame")[^>]*\bstride="(\d{1,12})"')
@@ -39,10 +46,7 @@ def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     check_promise(path, "PCO", _B16_HEADER, len(header))
     _, start, width, height, extended = struct.unpack("<5i", header[4:_B16_HEADER])
     if start < _B16_HEADER:
-        raise FileFormatError(
-            f"{path} is damaged: its PCO header gives its length as {start} bytes, expected at "
-            f"least {_B16_HEADER}; copy it again"
-        )
+        raise ValueError(f"its PCO header gives its length as {start} bytes")
     is_colour = struct.unpack_from("<i", header, 24)[0] == 1 if len(header) >= 28 else False
     if extended == -1 and start >= _B16_EXTENDED_HEADER and is_colour:
         raise FileFormatError(
@@ -62,12 +66,10 @@ class _Spe(NamedTuple):
     version: float
 
 
-def read_spe(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
+def read_spe(path: Path, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
     """Read a frame in its own dtype, shape (H, W), with ``bits``, ``version``."""
     layout = _spe_layout(path)
-    if number is None:
-        check_one_frame(path, (layout.frames,))
-    start = _SPE_HEADER + (number or 0) * layout.stride
+    start = _SPE_HEADER + number * layout.stride
     array = _read_frame(path, "SPE", start, layout.shape, layout.dtype)
     return array, {"bits": 8 * array.dtype.itemsize, "version": round(layout.version, 2)}
 
@@ -81,27 +83,22 @@ def _spe_layout(path: Path) -> _Spe:
     with path.open("rb") as file:
         header = file.read(_SPE_HEADER)
     check_promise(path, "SPE", _SPE_HEADER, len(header))
-    height, width = _unpack_number(header, "H", 656), _unpack_number(header, "H", 42)
-    frames, version = _unpack_number(header, "i", 1446), _unpack_number(header, "f", 1992)
-    code = _unpack_number(header, "h", 108)
+    fields = np.frombuffer(header, _SPE_FIELDS)[0]
+    width, height, frames, code, footer = (
+        int(fields[name]) for name in ("width", "height", "frames", "code", "footer")
+    )
+    version = float(fields["version"])
     if code not in _SPE_TYPES:
-        raise FileFormatError(
-            f"{path} is not an SPE file or is damaged: its data type is {code}, expected one of "
-            f"{', '.join(map(str, _SPE_TYPES))}; export it as TIFF"
-        )
+        raise ValueError(f"its data type is {code}, which no SPE file has")
     dtype = np.dtype(_SPE_TYPES[code])
     stride = height * width * dtype.itemsize
     if frames < 1:
-        raise FileFormatError(f"{path} holds {frames} frames: expected at least one; save it again")
+        raise ValueError(f"it holds {frames} frames")
     if version >= 3:
-        stride = max(stride, _footer_stride(path, _unpack_number(header, "Q", 678)))
+        stride = max(stride, _footer_stride(path, footer))
     end = _SPE_HEADER + (frames - 1) * stride + height * width * dtype.itemsize
     check_promise(path, "SPE", end, path.stat().st_size)
     return _Spe(frames, (height, width), dtype, stride, version)
-
-
-def _unpack_number(header: bytes, code: str, offset: int) -> Any:
-    return struct.unpack_from(f"<{code}", header, offset)[0]
 
 
 def _footer_stride(path: Path, start: int, most_bytes: int = 2_000_000) -> int:
@@ -125,10 +122,7 @@ def _read_frame(
 ) -> AnyArray:
     height, width = shape
     if min(shape) < 1:
-        raise FileFormatError(
-            f"{path} is damaged: its {header} header gives a frame of {height}×{width} pixels; "
-            "copy or save it again"
-        )
+        raise ValueError(f"its {header} header gives a frame of {height}×{width} pixels")
     count = height * width
     check_promise(path, header, start + count * dtype.itemsize, path.stat().st_size)
     check_size(path, 8 * count)

@@ -5,7 +5,8 @@
 - refuse pictures in colour: `check_grey`; frames of which some are no shots: `check_shots`
 
 Each convention is applied where a file uses it: packed and missing values of CF (NetCDF); factors,
-pixel masks, limits and pixel sizes of NeXus; white as zero and the origin of HDF5 Image.
+pixel masks, limits and pixel sizes of NeXus; white as zero and the origin of HDF5 Image; the order
+of axes of MATLAB 7.3.
 
 References
 ----------
@@ -29,7 +30,7 @@ import numpy as np
 from napari_shadowinv._system.arrays import METRES
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.hdf5 import load_dataset, member
+from napari_shadowinv.io.hdf5 import load_dataset, member, plain_value
 
 _PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned")
 _LIMITS = ("valid_range", "valid_min", "valid_max")
@@ -42,6 +43,8 @@ def decode_values(path: Path, dataset: Any, values: AnyArray, number: int | None
 
     `number` is that of a frame over all leading axes; None for the whole array.
     """
+    if is_of_matlab(dataset):  # what is beside it is other variables
+        return values
     attributes = _attributes(dataset, (*_PACKED, *_LIMITS))
     stored = values
     if attributes.keys() & set(_PACKED):
@@ -58,9 +61,14 @@ def decode_values(path: Path, dataset: Any, values: AnyArray, number: int | None
     return values
 
 
+def is_of_matlab(dataset: Any) -> bool:
+    """Return whether MATLAB 7.3 wrote an array: with its axes turned round, columns first."""
+    return "MATLAB_class" in dataset.attrs
+
+
 def check_grey(path: Path, dataset: Any) -> None:
     """Refuse an array that HDF5 Image declares to be a picture in colour."""
-    kind = _text(dataset.attrs.get("IMAGE_SUBCLASS", ""))
+    kind = plain_value(dataset.attrs.get("IMAGE_SUBCLASS", ""))
     if kind == "IMAGE_TRUECOLOR" or (kind == "IMAGE_INDEXED" and "PALETTE" in dataset.attrs):
         raise FileFormatError(
             f"{path} holds {dataset.name!r} as a picture in colour ({kind}): expected numbers "
@@ -142,7 +150,7 @@ def read_meaning(
                 notes.append(f"{int(pixels.sum())} pixels left out, {name} of the file")
     if not usable.all():
         image = np.where(usable, image, np.nan)
-    origin = _text(marks.get("DISPLAY_ORIGIN", ""))
+    origin = str(plain_value(marks.get("DISPLAY_ORIGIN", "")))
     if origin in _FLIPS:
         image, usable = np.flip(image, _FLIPS[origin]), np.flip(usable, _FLIPS[origin])
         notes.append(f"first pixel in the corner {origin} (DISPLAY_ORIGIN): turned to the top left")
@@ -157,6 +165,8 @@ def read_meaning(
 
 def _detectors(path: Path, dataset: Any) -> Iterator[Any]:
     """Yield the group of an array, and the detector of its entry if there is only one."""
+    if is_of_matlab(dataset):
+        return
     yield dataset.parent
     instrument = member(path, dataset.parent.parent, "instrument")
     groups: list[Any] = (
@@ -166,7 +176,7 @@ def _detectors(path: Path, dataset: Any) -> Iterator[Any]:
         group
         for group in groups
         if hasattr(group, "keys")
-        and (_text(group.attrs.get("NX_class", "")) == "NXdetector" or "pixel_mask" in group)
+        and (plain_value(group.attrs.get("NX_class", "")) == "NXdetector" or "pixel_mask" in group)
     ]
     if len(detectors) == 1 and detectors[0] != dataset.parent:
         yield detectors[0]
@@ -201,7 +211,7 @@ def _pixel_size(path: Path, detector: Any) -> float | None:
         item = member(path, detector, name)
         if item is None or item.size != 1 or item.dtype.kind not in "iuf":
             return None
-        unit = METRES.get(_text(item.attrs.get("units", "")))
+        unit = METRES.get(str(plain_value(item.attrs.get("units", ""))))
         if unit is None:
             return None
         sizes.append(float(np.ravel(load_dataset(path, item))[0]) * unit)
@@ -212,8 +222,3 @@ def _pixel_size(path: Path, detector: Any) -> float | None:
 def _attributes(dataset: Any, names: tuple[str, ...]) -> dict[str, Any]:
     # By name: walking all attributes of a damaged file may never end.
     return {name: dataset.attrs[name] for name in names if name in dataset.attrs}
-
-
-def _text(value: Any) -> str:
-    first = np.ravel(value)[0] if np.size(value) else ""
-    return first.decode(errors="replace") if isinstance(first, bytes) else str(first)

@@ -36,7 +36,7 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.other_detectors import Tracks
 from napari_shadowinv.io.files import check_promise
 
@@ -148,20 +148,11 @@ def _read_header(
     """
     check_promise(path, "CPSA", _HEADER.size, len(data))
     version, columns, rows, _, pixel, _, _, _, _, _, width, height = _HEADER.unpack_from(data)
-    if version >= 0:
-        raise FileFormatError(
-            f"{path} is no CR-39 scan or damaged: its version is {version}, expected a negative "
-            "number; export the tracks again"
-        )
-    if min(columns, rows, width, height) < 1 or not 0 < pixel <= widest_pixel:
-        raise FileFormatError(
-            f"{path} is damaged: its CPSA header gives {columns} × {rows} frames of "
-            f"{width} × {height} pixels of {pixel:g} µm; copy it again"
-        )
-    if columns * rows > most_frames:
-        raise FileFormatError(
-            f"{path} is damaged: its CPSA header gives {columns} × {rows} frames, expected at most "
-            f"{most_frames}; copy it again"
+    is_scan = version < 0 < min(columns, rows, width, height) and 0 < pixel <= widest_pixel
+    if not is_scan or columns * rows > most_frames:
+        raise ValueError(
+            f"version {version}, {columns} × {rows} frames of {width} × {height} pixels of "
+            f"{pixel:g} µm are of no scan"
         )
     check_promise(path, "CPSA", _HEADER.size + columns * rows * _FRAME.size, len(data))
     return (columns, rows), pixel, np.array([width, height]) * (pixel * 1e-6)
@@ -177,9 +168,8 @@ def _read_frames(path: Path, data: bytes, shape: tuple[int, int]) -> AnyArray:
         check_promise(path, f"frame {number + 1}", at + _FRAME.size, len(data))
         _, x, y, hits, _, _, _, _, column, row = _FRAME.unpack_from(data, at)
         if hits < 0 or not (0 <= column < columns and 0 <= row < rows) or filled[column, row]:
-            raise FileFormatError(
-                f"{path} is damaged: frame {number + 1} is at column {column}, row {row} with "
-                f"{hits} tracks; expected each place of {columns} × {rows} once; copy it again"
+            raise ValueError(
+                f"frame {number + 1} is at column {column}, row {row} with {hits} tracks"
             )
         filled[column, row] = True
         at += _FRAME.size

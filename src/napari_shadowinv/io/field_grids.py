@@ -1,7 +1,6 @@
 """Electric and magnetic fields on 3-D grids from files.
 
-- whether a file holds them: `is_field_grid`; read them: `read_field_grid`; list them without
-  reading: `describe_field_grid`
+- whether a file holds them: `is_field_grid`; read them: `read_field_grid`
 
 Two layouts of HDF5 files are read: openPMD (https://github.com/openPMD/openPMD-standard, version 1
 and 2), which most particle-in-cell codes write, and NetCDF 4 as xarray writes a dataset with the
@@ -20,15 +19,20 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_memory, check_regular
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.hdf5 import check_arrays, load_dataset, member, members, open_hdf5
+from napari_shadowinv.io.hdf5 import (
+    check_arrays,
+    load_dataset,
+    member,
+    members,
+    open_hdf5,
+    plain_value,
+)
 from napari_shadowinv.physics.field_grid import AXES, FieldGrid, field_grid
 
 _HDF5_MARK = b"\x89HDF\r\n\x1a\n"
 _COMPONENT = re.compile(r"[BE]_?[xyz]", re.IGNORECASE)
 _EXPECTED = "an openPMD file or a NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez"
 _SAME_PLACE = 1e-6  # of a cell
-# By the powers of length, mass, time, current, temperature, amount and luminous intensity.
-_UNITS = {(0, 1, -2, -1, 0, 0, 0): "T", (1, 1, -3, -1, 0, 0, 0): "V/m"}
 
 
 @as_file_errors
@@ -44,51 +48,6 @@ def is_field_grid(path: Path) -> bool:
             _COMPONENT.fullmatch(name) and getattr(item, "ndim", 0) >= len(AXES)
             for name, item in members(content)
         )
-
-
-@as_file_errors
-def describe_field_grid(path: Path, *, most: int = 10) -> list[tuple[str, str]]:
-    """Return title and text of the kind, and of each field with its shape, unit and spacing."""
-    with open_hdf5(path) as content:
-        is_openpmd = "openPMD" in content.attrs
-        standard = f"openPMD {_text(content.attrs['openPMD'])}" if is_openpmd else "NetCDF"
-        rows = [("kind", f"fields on a grid ({standard}): trace particles with shadowinv forward")]
-        if not is_openpmd:
-            fields = [(name, item) for name, item in members(content) if _COMPONENT.fullmatch(name)]
-            units = (_text(item.attrs.get("units", "")) for _, item in fields)
-            return rows + [
-                (name, f"{_shape_text(item)} {unit}")
-                for (name, item), unit in zip(fields, units, strict=True)
-            ]
-        base = _text(content.attrs.get("basePath", "/data/%T/"))
-        parent: Any = member(path, content, base.partition("%T")[0].strip("/")) or {}
-        meshes = _text(content.attrs.get("meshesPath", "fields/"))
-        for number in sorted(filter(str.isdecimal, parent), key=int)[:most]:
-            for name, record in members(member(path, parent[number], meshes) or {}):
-                parts = [("", record)] if hasattr(record, "shape") else members(record)
-                rows += [
-                    ("/".join(filter(None, (number, name, key))), _mesh_text(record, part))
-                    for key, part in parts
-                ]
-        return rows
-
-
-def _mesh_text(record: Any, part: Any) -> str:
-    dimension = tuple(np.ravel(record.attrs.get("unitDimension", ())).astype(int).tolist())
-    unit = _UNITS.get(dimension, "of the SI unit")
-    scale = float(np.ravel(part.attrs.get("unitSI", 1.0))[0])
-    metres = np.ravel(record.attrs.get("gridSpacing", ())) * np.ravel(
-        record.attrs.get("gridUnitSI", 1.0)
-    )
-    labels = map(_text, np.ravel(record.attrs.get("axisLabels", ())))
-    spacing = ", ".join(f"{axis} {side:g}" for axis, side in zip(labels, metres, strict=False))
-    return f"{_shape_text(part)}, in {scale:g} {unit}, spacing {spacing or 'unknown'} m"
-
-
-def _shape_text(item: Any) -> str:
-    # A constant component has its shape as an attribute.
-    shape = item.shape if hasattr(item, "shape") else np.ravel(item.attrs["shape"])
-    return "×".join(map(str, shape))
 
 
 @as_file_errors
@@ -137,7 +96,7 @@ def read_field_grid(path: Path, *, iteration: str | int | None = None) -> FieldG
 
 def _read_openpmd(path: Path, content: Any, iteration: str | int | None) -> FieldGrid:
     group = _choose_iteration(path, content, iteration)
-    meshes = member(path, group, _text(content.attrs.get("meshesPath", "fields/")))
+    meshes = member(path, group, plain_value(content.attrs.get("meshesPath", "fields/")))
     records = {
         symbol: record
         for symbol in ("B", "E")
@@ -160,7 +119,7 @@ def _read_openpmd(path: Path, content: Any, iteration: str | int | None) -> Fiel
 
 def _choose_iteration(path: Path, content: Any, iteration: str | int | None, most: int = 10) -> Any:
     """Return the group of the only iteration, or of the chosen one."""
-    base = _text(content.attrs.get("basePath", "/data/%T/"))
+    base = plain_value(content.attrs.get("basePath", "/data/%T/"))
     parent = member(path, content, base.partition("%T")[0].strip("/"))
     names = [] if parent is None else [name for name in parent if name.isdecimal()]
     if not names:
@@ -177,8 +136,8 @@ def _choose_iteration(path: Path, content: Any, iteration: str | int | None, mos
 
 def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a vector field, components and axes in the order (z, y, x), its spacing and middle."""
-    geometry = _text(record.attrs.get("geometry", "cartesian"))
-    labels = [_text(name).lower() for name in np.ravel(record.attrs.get("axisLabels", []))]
+    geometry = plain_value(record.attrs.get("geometry", "cartesian"))
+    labels = [plain_value(name).lower() for name in np.ravel(record.attrs.get("axisLabels", []))]
     if geometry != "cartesian" or sorted(labels) != sorted(AXES):
         raise InputError(
             f"{path} has {symbol} on a {geometry} mesh with the axes "
@@ -194,7 +153,7 @@ def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatA
     unit = np.broadcast_to(np.ravel(record.attrs["gridUnitSI"]).astype(float), len(AXES))
     spacing = np.ravel(record.attrs["gridSpacing"]).astype(float) * unit
     offset = np.ravel(record.attrs["gridGlobalOffset"]).astype(float) * unit
-    step = -1 if _text(record.attrs.get("dataOrder", "C")) == "F" else 1
+    step = -1 if plain_value(record.attrs.get("dataOrder", "C")) == "F" else 1
     # An array is read with its slowest axis first; the labels of Fortran order begin with the
     # fastest.
     labels, spacing, offset = labels[::step], spacing[::step], offset[::step]
@@ -255,7 +214,3 @@ def _collocate(parts: Sequence[AnyArray], places: FloatArray) -> tuple[list[AnyA
                     "0 to 0.5, as in a staggered mesh"
                 )
     return parts, place
-
-
-def _text(value: Any) -> str:
-    return value.decode() if isinstance(value, bytes) else str(value)

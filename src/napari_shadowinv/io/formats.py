@@ -14,6 +14,7 @@ import codecs
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Literal
@@ -38,7 +39,7 @@ class Format:
     reader: str = ""  # of a path: image and metadata, which replace those of `read`, or a dataset
     named_reader: str = ""  # the same, of a path and the name of an array, or the tracks to count
     # Of a path, and the name of an array if it is known: the lengths of the axes that count frames.
-    # The readers then take the number of a frame.
+    # The readers then take the number of a frame, by default that of the first.
     counter: str = ""
     default: str = ""  # of a path: the name of the array that is read without one
     lister: str = ""  # of a path: the names of all images that it may hold
@@ -67,6 +68,19 @@ class Format:
         names = () if variable is None else (variable,)
         numbers = {} if number is None else {"number": number}
         return function(self.named_reader if names else self.reader)(path, *names, **numbers)
+
+    def read_one(self, path: Path, variable: str | None = None) -> Any:
+        """Return the content of a file that has no more than one frame."""
+        variable = self.array_name(path, variable)
+        axes = self.count_frames(path, variable)
+        if prod(axes) == 1:
+            return self.read(path, variable)
+        first = f"{variable}[{','.join('0' * len(axes))}]"
+        advice = "" if variable is None else f"choose one, such as {first!r}, or "
+        raise FileFormatError(
+            f"{path} holds {prod(axes)} frames: expected one image; {advice}invert all as a stack "
+            "of shots"
+        )
 
     def count_frames(self, path: Path, variable: str | None = None) -> tuple[int, ...]:
         """Return the lengths of the axes that count frames; none if the file holds one image."""
@@ -113,7 +127,7 @@ NPY = Format(
     reader="arrays:read_npy_plane", counter="arrays:count_npy", image_writer="arrays:write_npy",
 )
 MATLAB = Format(
-    "mat", (".mat",), "MATLAB", _HDF5, test="matlab:is_matlab",
+    "mat", (".mat",), "MATLAB", ((0, b"MATLAB"),), test="matlab:is_matlab",
     reader="matlab:read_mat", named_reader="matlab:read_mat", counter="matlab:count_mat",
     lister="matlab:image_names",
 )
@@ -193,55 +207,10 @@ IMAGE_WRITERS = {
 NETCDF_SUFFIX = HDF5.suffixes[-1]
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 
-_CAMERA_RAW = "a raw file of a photographic camera, whose pixels have different colour filters"
-
-# What files of other formats begin with, as regular expressions.
-_FOREIGN_FORMATS = {
-    rb"Andor Technology": "an Andor SIF file",
-    rb"PK\x03\x04": "a zip archive (such as NPZ or XLSX)",
-    rb"\x1f\x8b|BZh|\xfd7zXZ|7z\xbc\xaf": "a compressed file (gzip, bzip2, xz or 7z)",
-    rb"%PDF|%!PS": "a PDF or PostScript document",
-    rb"GIF8": "a GIF picture",
-    rb"SIMPLE  =": "a FITS file",
-    rb"CDF[\x01\x02\x05]": "a NetCDF 3 file",
-    rb"\s*\{\s*(HeaderID|EDF_|HEADER_BYTES|ByteOrder|Dim_1)": "an ESRF EDF file",
-    rb"CI\x2c\0": "a Phantom CINE movie",
-    rb"IM.[\x00-\x1f]": "a Hamamatsu HIS or IMG file",
-    rb"\0\x70[\x44\x64]\0": "a PerkinElmer HIS file",
-    rb"\0\0\0[\x03\x04]": "a DigitalMicrograph DM3 or DM4 file",
-    rb".{208}MAP [\x44\x11\0]": "an MRC file",
-    rb"P[1-7Ff]\s": "a PGM or PPM picture (Netpbm)",
-    rb".{128}DICM": "a DICOM file",
-    rb"ZISRAWFILE": "a Zeiss CZI file",
-    rb"\xda\xce\xbe\x0a": "a Nikon ND2 file",
-    rb"\x70\0\0\0.{4}\x2a": "a Leica LIF file",
-    rb"NRRD": "an NRRD file",
-    rb"\x76\x2f\x31\x01": "an OpenEXR picture",
-    rb".{4}ftypcrx|II\x2a\0.{4}CR|II(RO|RS|U\0)|MMOR|FUJIFILMCCD-RAW|FOVb": _CAMERA_RAW,
-    rb".{4}ftyp(hei|hev|mif|msf|avi)": "a HEIC or AVIF picture",
-    rb".{4}ftyp|RIFF.{4}AVI |\x1aE\xdf\xa3|LUCAM-RECORDER|\xed\xfe\0\0": "a movie",
-    rb"RIFF.{4}WEBP": "a WebP picture",
-    rb"\0\0\0\x0cjP  |\xff\x4f\xff\x51": "a JPEG 2000 picture",
-    rb"\0\0\0\x0cJXL |\xff\x0a": "a JPEG XL picture",
-    rb"\xd0\xcf\x11\xe0": "an OLE file (such as .xls, .oib or .zvi)",
-    rb"8BPS|gimp xcf": "a project of a picture program",
-    rb"\x0e\x03\x13\x01": "an HDF4 file",
-    rb"# vtk DataFile": "a VTK file",
-    rb"\s*<(\?xml|svg|html|!DOCTYPE)": "an XML or HTML document",
-}
-# Endings of files without a mark, or with one that many programs share.
-_CAMERA_RAW_SUFFIXES = re.compile(
+# Their marks are those of TIFF.
+_CAMERA_RAW = re.compile(
     r"\.(nef|nrw|cr2|arw|sr2|dng|pef|srw|3fr|iiq|erf|kdc|dcr|mef|mos)", re.IGNORECASE
 )
-_RAW_SUFFIXES = re.compile(r"\.(raw|img|fli|mraw|im7|imx|his|sif|edf|cine|mrc|dcm)", re.IGNORECASE)
-
-
-def _foreign_title(head: bytes, suffix: str) -> str | None:
-    """Name the format of a file that another program marks as its own."""
-    if _CAMERA_RAW_SUFFIXES.fullmatch(suffix):
-        return _CAMERA_RAW
-    marks = (title for mark, title in _FOREIGN_FORMATS.items() if re.match(mark, head, re.DOTALL))
-    return next(marks, None)
 
 
 @as_file_errors
@@ -257,14 +226,11 @@ def format_of(path: Path, *, head_bytes: int = 4100) -> Format:
         head = file.read(head_bytes)
     if not head:
         raise FileFormatError(f"{path} is empty (0 bytes): expected {READABLE}; copy it again")
-    title = _foreign_title(head, path.suffix)
-    for each in FORMATS:
-        if title is None and each.fits(path, head):
-            return each
-    if title is None and (raw := _RAW_SUFFIXES.fullmatch(path.suffix)):
-        title = f"a file of a camera's own program, such as FLI's ({raw[1].upper()})"
-    elif title is None:
-        title = "a text file" if _is_text(head) else "not in a recognised image format"
+    title = "a text file" if _is_text(head) else "not in a recognised image format"
+    if _CAMERA_RAW.fullmatch(path.suffix):
+        title = "a raw file of a photographic camera, whose pixels have different colour filters"
+    elif fitting := [each for each in FORMATS if each.fits(path, head)]:
+        return fitting[0]
     raise FileFormatError(
         f"{path} is {title}: expected {READABLE}; export the image to one of these, such as "
         "16-bit TIFF"

@@ -1,6 +1,7 @@
 """Structure of HDF5 files; images in them are in `hdf5_arrays`.
 
-- `open_hdf5`; an item, `member`, or all of a group, `members`; its values, `load_dataset`
+- `open_hdf5`; an item, `member`, or all of a group, `members`; its values, `load_dataset`, and an
+  attribute, `plain_value`
 - refuse a file whose arrays are elsewhere or too large: `check_arrays`
 - write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
 
@@ -65,6 +66,15 @@ def _refuse_other_file(path: Path, name: str, origin: str) -> None:
     )
 
 
+def plain_value(value: Any) -> Any:
+    """Turn an attribute into a Python value; MATLAB writes bytes and arrays of one."""
+    if isinstance(value, np.ndarray) and value.size == 1:
+        value = value.reshape(-1)[0]
+    if isinstance(value, bytes):
+        return value.decode("utf-8", errors="replace")
+    return value.item() if isinstance(value, np.generic) else value
+
+
 def members(group: Any) -> Iterator[tuple[str, Any]]:
     """Yield names and items of a group, except items in other files."""
     import h5py
@@ -76,45 +86,43 @@ def members(group: Any) -> Iterator[tuple[str, Any]]:
 
 def load_dataset(path: Path, dataset: Any) -> AnyArray:
     """Return the values of an array, refusing missing ones, which HDF5 would replace by zeros."""
-    check_size(path, memory_bytes(path, dataset, dataset.size))
-    check_filters(path, dataset)
+    check_array(path, dataset, dataset.size)
     _check_promise(path, dataset)
     return np.asarray(dataset[()])
 
 
-def check_filters(path: Path, dataset: Any) -> None:
-    """Refuse an array that is compressed by a filter that HDF5 does not have."""
+def check_array(path: Path, dataset: Any, count: int, before: int = 0) -> int:
+    """Refuse an array in other files, one compressed by a filter that is missing, or too large.
+
+    Returns the bytes in memory of `count` values of it, and of what was read `before`.
+    """
     import h5py
 
+    if origin := stored_elsewhere(dataset):
+        _refuse_other_file(path, dataset.name, origin)
+    itemsize = int(dataset.dtype.itemsize)
+    # One chunk may be far larger than what is used of it.
+    chunk_bytes = int(np.prod(dataset.chunks or (0,), dtype=float)) * itemsize
+    total = before + int(max(chunk_bytes, count * max(8, itemsize)))
+    check_size(path, total)
     layout = dataset.id.get_create_plist()
-    filters = [layout.get_filter(k) for k in range(layout.get_nfilters())]
-    missing = [each for each in filters if not h5py.h5z.filter_avail(each[0])]
-    if missing:
+    for code, _, _, title in map(layout.get_filter, range(layout.get_nfilters())):
         with suppress(ImportError):
-            import_module("hdf5plugin")  # adds its filters
-            missing = [each for each in missing if not h5py.h5z.filter_avail(each[0])]
-    for code, _, _, title in missing:
-        label = f"{code}, {title.decode(errors='replace')}" if title else str(code)
-        raise FileFormatError(
-            f"{path} holds {dataset.name!r} compressed by a filter that is not installed "
-            f"({label}): install the package hdf5plugin, or save it with gzip"
-        )
+            if not h5py.h5z.filter_avail(code):
+                import_module("hdf5plugin")  # adds its filters
+        if not h5py.h5z.filter_avail(code):
+            label = f"{code} {title.decode(errors='replace')}".strip()
+            raise FileFormatError(
+                f"{path} holds {dataset.name!r} compressed by a filter that is not installed "
+                f"({label}): install the package hdf5plugin, or save it with gzip"
+            )
+    return total
 
 
 def _check_promise(path: Path, dataset: Any) -> None:
     stored = int(dataset.id.get_storage_size())
     is_packed = dataset.id.get_create_plist().get_nfilters() > 0
     check_promise(path, "HDF5", dataset.nbytes, DEFLATE_RATIO * stored if is_packed else stored)
-
-
-def memory_bytes(path: Path, dataset: Any, count: int) -> int:
-    """Return the bytes in memory of values of an array, which must be in the file itself."""
-    if origin := stored_elsewhere(dataset):
-        _refuse_other_file(path, dataset.name, origin)
-    itemsize = int(dataset.dtype.itemsize)
-    # One chunk may be far larger than what is used of it.
-    chunk_bytes = int(np.prod(dataset.chunks or (0,), dtype=float)) * itemsize
-    return int(max(chunk_bytes, count * max(8, itemsize)))
 
 
 def stored_elsewhere(dataset: Any) -> str:
@@ -134,8 +142,7 @@ def check_arrays(path: Path) -> None:
     total = 0
     with open_hdf5(path) as file:
         for dataset in _iterate_datasets(path, file):
-            total += memory_bytes(path, dataset, dataset.size)
-            check_size(path, total)
+            total = check_array(path, dataset, dataset.size, total)
             # The length of a dimension without coordinates is an array without values.
             if dataset.id.get_storage_size() or "CLASS" not in dataset.attrs:
                 _check_promise(path, dataset)

@@ -3,7 +3,7 @@
 - an array, or one of its frames: `read_hdf5`; as an image with all that the file says of it:
   `read_plane`
 - the number of frames: `count_frames`; the array to take without a name: `default_array`
-- the choice, for messages: `list_arrays`
+- the choice, for messages: `list_arrays`; all arrays: `list_sizes`
 """
 
 from __future__ import annotations
@@ -18,24 +18,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
+from napari_shadowinv._system.safety import as_file_errors, check_regular
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.arrays import FRAME_INDEX, check_one_frame, frame_axes
+from napari_shadowinv.io.arrays import FRAME_INDEX, frame_axes, frame_number
 from napari_shadowinv.io.conventions import (
     check_grey,
     check_shots,
     decode_values,
+    is_of_matlab,
     read_meaning,
 )
 from napari_shadowinv.io.field_grids import is_field_grid
 from napari_shadowinv.io.hdf5 import (
     MAX_LINKS,
-    check_filters,
+    check_array,
     load_dataset,
     member,
-    memory_bytes,
     open_hdf5,
+    plain_value,
     stored_elsewhere,
 )
 
@@ -49,22 +50,20 @@ def read_hdf5(path: Path, name: str) -> AnyArray:
     """Read the values of an array of any shape, ``shots/3/image``, NaN where it has none."""
     with open_hdf5(path) as file:
         dataset, number = _find_array(path, file, name)
-        stored = load_dataset(path, dataset) if number is None else _frame(path, dataset, number)
+        stored = _stored(path, dataset, number)
         return decode_values(path, dataset, stored, number)
 
 
 @as_file_errors
-def read_plane(path: Path, name: str, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
+def read_plane(path: Path, name: str, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
     """Read one array as an image, or frame `number` of it over the axes before the last two."""
     with open_hdf5(path) as file:
         dataset, frame_in_name = _find_array(path, file, name)
-        axes = frame_axes(path, repr(name), dataset.shape)
+        frame_axes(path, repr(name), dataset.shape)
         check_grey(path, dataset)
-        number = frame_in_name if number is None else number
-        if number is None:
-            check_one_frame(path, axes, name)
-        stored = _frame(path, dataset, number or 0)
-        image, metadata = read_meaning(path, dataset, stored, number or 0)
+        number = number if frame_in_name is None else frame_in_name
+        stored = _stored(path, dataset, number)
+        image, metadata = read_meaning(path, dataset, stored, number)
         return image, {"kind": "hdf5", "variable": name, **metadata}
 
 
@@ -113,13 +112,18 @@ def image_names(path: Path) -> list[str]:
         return [name for name in names if not name.endswith("pixel_mask")]
 
 
+def _stored(path: Path, dataset: Any, number: int | None) -> AnyArray:
+    """Return all values of an array or one frame, rows first: MATLAB stores columns first."""
+    values = load_dataset(path, dataset) if number is None else _frame(path, dataset, number)
+    return values.swapaxes(-1, -2) if is_of_matlab(dataset) else values
+
+
 def _frame(path: Path, dataset: Any, number: int) -> AnyArray:
     """Read one frame, refusing one that is not written, which HDF5 would replace by zeros."""
     index = (
         tuple(map(int, np.unravel_index(number, dataset.shape[:-2]))) if dataset.ndim > 2 else ()
     )
-    check_size(path, memory_bytes(path, dataset, math.prod(dataset.shape[-2:])))
-    check_filters(path, dataset)
+    check_array(path, dataset, math.prod(dataset.shape[-2:]))
     if not index:
         return load_dataset(path, dataset)
     if not _is_written(dataset, index):
@@ -132,10 +136,10 @@ def _frame(path: Path, dataset: Any, number: int) -> AnyArray:
 
 def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
     """Return an array by its name, and the number of the frame that the name ends with."""
-    item, index = _member_or_default(path, file, name), None
-    if item is None and (match := FRAME_INDEX.fullmatch(name)):
-        item = _member_or_default(path, file, match["name"])
-        index = tuple(map(int, match["index"].split(",")))
+    item = _member_or_default(path, file, name)
+    frame = FRAME_INDEX.fullmatch(name) if item is None else None
+    if frame is not None:
+        item = _member_or_default(path, file, frame["name"])
     if item is None:
         raise InputError(f"{path} has no array {name!r}: it holds {list_arrays(file, name)}")
     if item.dtype.kind not in "buif" or not item.shape:
@@ -143,14 +147,7 @@ def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
             f"{path} holds {name!r} as {_KINDS.get(item.dtype.kind, 'one number')}: expected an "
             f"array of real numbers; the file holds {list_arrays(file, name)}"
         )
-    if index is None:
-        return item, None
-    axes = item.shape[:-2]
-    if len(index) != len(axes) or any(map(int.__ge__, index, axes)):
-        last = ",".join(str(length - 1) for length in axes)
-        frames = f"frames from [{','.join('0' * len(axes))}] to [{last}]" if axes else "one image"
-        raise InputError(f"{path} has no {name!r}: the array holds {frames}; correct the index")
-    return item, int(np.ravel_multi_index(index, axes)) if axes else 0
+    return item, None if frame is None else frame_number(path, frame, item.shape[:-2])
 
 
 def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
@@ -161,8 +158,7 @@ def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
     for _ in range(MAX_LINKS):
         if not isinstance(item, h5py.Group):
             break
-        default = next((item.attrs[key] for key in _DEFAULTS if key in item.attrs), None)
-        default = default.decode() if isinstance(default, bytes) else default
+        default = next((plain_value(item.attrs[k]) for k in _DEFAULTS if k in item.attrs), None)
         item = member(path, item, default) if isinstance(default, str) else None
     return item if isinstance(item, h5py.Dataset) else None
 
@@ -187,6 +183,13 @@ class _HDF5Object(NamedTuple):
     def __str__(self) -> str:
         notes = ", ".join(filter(None, (self.size, self.reason)))
         return f"{self.name!r} ({notes})"
+
+
+@as_file_errors
+def list_sizes(path: Path, *, most: int = 40) -> list[tuple[str, str]]:
+    """Return the names of the first arrays, and their shapes and types."""
+    with open_hdf5(path) as file:
+        return [(each.name, each.size) for each in itertools.islice(_objects(file), most)]
 
 
 def list_arrays(file: Any, name: str = "", *, most: int = 8) -> str:
@@ -216,6 +219,8 @@ def _objects(file: Any, most_visits: int = 10_000) -> Iterator[_HDF5Object]:
     while groups:
         prefix, group = groups.popleft()
         for name in group:
+            if name.startswith("#"):  # MATLAB's own
+                continue
             visited += 1
             if visited > most_visits:
                 return
@@ -237,7 +242,7 @@ def _objects(file: Any, most_visits: int = 10_000) -> Iterator[_HDF5Object]:
 
 
 def _size_text(dataset: Any) -> str:
-    shape = "×".join(map(str, dataset.shape))
+    shape = "×".join(map(str, dataset.shape[::-1] if is_of_matlab(dataset) else dataset.shape))
     return f"{shape} {dataset.dtype}" if dataset.dtype.kind in "buif" else shape
 
 
@@ -247,6 +252,11 @@ def _reason(dataset: Any) -> str:
         return _ONE_AXIS
     if dataset.dtype.kind in _KINDS:
         return _KINDS[dataset.dtype.kind]
-    if 0 in dataset.shape:
+    if 0 in dataset.shape or "MATLAB_empty" in dataset.attrs:
         return "empty"
+    if is_of_matlab(dataset) and min(dataset.shape[-2:]) < 2:
+        return _ONE_AXIS
+    is_triple = dataset.ndim == 3 and dataset.shape[0] == 3
+    if is_of_matlab(dataset) and is_triple and dataset.dtype == np.uint8:
+        return "a picture in colour"
     return "in another file" if stored_elsewhere(dataset) else ""

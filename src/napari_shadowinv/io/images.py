@@ -10,10 +10,9 @@
 from __future__ import annotations
 
 import math
-import threading
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -97,7 +96,7 @@ def read_scan(path: Path) -> Scan:
         If it has no colours.
     """
     file_format = format_of(path)
-    content = file_format.read(path) if file_format.is_scan else None
+    content = file_format.read_one(path) if file_format.is_scan else None
     if not isinstance(content, tuple) or content[0].ndim != 3 or content[0].shape[-1] != 3:
         raise InputError(f"{path} is no picture in colour: expected a scan in red, green and blue")
     pixels, metadata = content
@@ -105,16 +104,12 @@ def read_scan(path: Path) -> Scan:
 
 
 def check_picture(path: Path, name: str, array: AnyArray) -> None:
-    """Refuse an array that is no picture of real numbers."""
+    """Refuse an array that is no picture."""
     is_picture = array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (2, 3, 4))
     if not is_picture or array.size == 0:
         raise FileFormatError(
             f"{path} holds a {name} array of shape {array.shape}: expected one picture, "
             "(height, width) or with 3 or 4 colour channels last; save one plane"
-        )
-    if array.dtype.kind not in "buif":
-        raise FileFormatError(
-            f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
         )
 
 
@@ -197,27 +192,12 @@ def read_png(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     return array, {**metadata, "bits": max(bits, 8)}
 
 
-_PILLOW_LIMIT = threading.Lock()
-
-
-def _open_picture(file: BinaryIO) -> Any:
-    """Open a picture without pillow's limit of pixels; ours on memory follows."""
-    from PIL import Image
-
-    with _PILLOW_LIMIT:
-        before, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-        try:
-            return Image.open(file)
-        finally:
-            Image.MAX_IMAGE_PIXELS = before
-
-
 def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Read a PNG, BMP or JPEG: upright, with NaN at transparent pixels."""
-    from PIL import ExifTags, ImageOps
+    from PIL import ExifTags, Image, ImageOps
 
     # A file object, because pillow may believe the name.
-    with path.open("rb") as file, _open_picture(file) as picture:
+    with path.open("rb") as file, Image.open(file) as picture:
         area = math.prod(picture.size)
         # A pixel has one bit at least.
         check_promise(path, "picture", area // 8, DEFLATE_RATIO * path.stat().st_size)
@@ -256,7 +236,7 @@ def _pixels_and_gaps(picture: Any) -> tuple[AnyArray, BoolArray | None]:
 
 
 def _light_warnings(
-    form: str, info: dict[str, Any], gamma_tolerance: float = 0.01
+    form: str | None, info: dict[Any, Any], gamma_tolerance: float = 0.01
 ) -> tuple[Caution, ...]:
     """Warn of pixels that are no linear measure of the light by their format."""
     profile = info.get("icc_profile")
@@ -271,7 +251,7 @@ def _light_warnings(
     return (gamma_warning(kind),)
 
 
-def _printed_sides(info: dict[str, Any]) -> tuple[float, ...]:
+def _printed_sides(info: dict[Any, Any]) -> tuple[float, ...]:
     """Return width and height of a pixel (m) by the dots per inch of a picture, if it has them."""
     dots = tuple(map(float, info.get("dpi", (0, 0))))
     return tuple(INCH_M / each for each in dots) if min(dots) > 1 else ()

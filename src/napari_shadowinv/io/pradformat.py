@@ -24,7 +24,7 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
-from napari_shadowinv.io.hdf5 import hdf5_in_memory, load_dataset, member, open_hdf5
+from napari_shadowinv.io.hdf5 import hdf5_in_memory, load_dataset, member, open_hdf5, plain_value
 from napari_shadowinv.io.read_write import require
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.setup import Setup, Species, setup_from_dict
@@ -73,16 +73,7 @@ _ATTRIBUTES = """
 def _root_attributes(path: Path) -> dict[str, Any]:
     with open_hdf5(path) as file:
         names = [name for name in _ATTRIBUTES.split() if name in file.attrs]
-        return {name: _as_python_value(file.attrs[name]) for name in names}
-
-
-def _as_python_value(value: Any) -> Any:
-    """Turn an HDF5 attribute into a Python value; MATLAB writes bytes and arrays of one."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.reshape(-1)[0]
-    if isinstance(value, bytes):
-        return value.decode("utf-8", errors="replace")
-    return value.item() if isinstance(value, np.generic) else value
+        return {name: plain_value(file.attrs[name]) for name in names}
 
 
 def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Dataset:

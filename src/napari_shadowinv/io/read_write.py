@@ -123,8 +123,10 @@ def _read_file(
             f"{path} is neither a MATLAB nor an HDF5 file nor a CR-39 scan (its kind is "
             f"{file_format.name!r}): variable {variable!r} does not apply; leave it out"
         )
-    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = file_format.read(
-        path, variable, number
+    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = (
+        file_format.read_one(path, variable)
+        if number is None
+        else file_format.read(path, variable, number)
     )
     if not isinstance(content, tuple):
         return content

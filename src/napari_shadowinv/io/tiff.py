@@ -4,8 +4,7 @@
 - a plane as TIFF: `write_tiff`
 
 Thumbnails, pyramids and masks are no frames. Values are turned from white-is-zero, colour tables,
-ImageJ's and GDAL's calibrations and the roots of gel scanners into light; pixels that a file calls
-transparent or without data become NaN.
+ImageJ's calibrations and the roots of gel scanners into light; transparent pixels become NaN.
 """
 
 from __future__ import annotations
@@ -23,6 +22,7 @@ import numpy as np
 import tifffile
 from tifffile import PHOTOMETRIC
 
+from napari_shadowinv._system.arrays import METRES
 from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.cautions import Caution
@@ -39,14 +39,13 @@ from napari_shadowinv.io.images import (
     square_warnings,
     without_pixels,
 )
-from napari_shadowinv.io.text import LENGTHS
 
 _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
 _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}
 
 _JPEG = {6, 7}
 _ALPHA = {1, 2}  # of the tag ExtraSamples
-_UNITS_M: dict[Any, float] = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M, **LENGTHS}
+_UNITS_M: dict[Any, float] = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH_M, **METRES}
 
 
 class _Layout(NamedTuple):
@@ -54,7 +53,6 @@ class _Layout(NamedTuple):
 
     n_frames: int
     pages: tuple[int, ...]  # numbers of their directories; only one if they follow each other
-    masks: tuple[int, ...] = ()
     left_out: tuple[str, ...] = ()  # sizes of smaller pictures
 
 
@@ -86,9 +84,10 @@ def _find_frames(path: Path, _modified_ns: int, size: int) -> _Layout:
         _check_directories(path, tiff, size)
         series = [level for each in tiff.series for level in each.levels]
         pictures = [s for s in series if not (s.keyframe.is_reduced or s.keyframe.is_subifd)]
-        frames = [(s, s.keyframe) for s in pictures]
-        masks = [s for s, key in frames if key.is_mask or key.photometric == PHOTOMETRIC.MASK]
-        pictures = [s for s in pictures if s not in masks]
+        mask = PHOTOMETRIC.MASK
+        pictures = [
+            s for s in pictures if not (s.keyframe.is_mask or s.keyframe.photometric == mask)
+        ]
         if not pictures:
             raise FileFormatError(
                 f"{path} holds no picture but thumbnails or masks: expected an image; export it "
@@ -105,11 +104,11 @@ def _find_frames(path: Path, _modified_ns: int, size: int) -> _Layout:
             )
         count = sum(series.size // series.keyframe.size for series in shots)
         if count > len(tiff.pages):
-            return _Layout(count, (_first_of_stored_together(path, shots, size),), (), sizes)
+            return _Layout(count, (_first_of_stored_together(path, shots, size),), sizes)
         if count == 1:
             _check_imagej_promise(path, tiff, shots[0].keyframe, size)
-        pages, covers = (tuple(sorted(p.index for s in g for p in s)) for g in (shots, masks))
-        return _Layout(count, pages, covers, sizes)
+        pages = tuple(sorted(page.index for series in shots for page in series))
+        return _Layout(count, pages, sizes)
 
 
 def _sides(series: Any) -> tuple[int, int]:
@@ -153,15 +152,9 @@ def count_tiff_frames(path: Path) -> int:
     return _layout_of(path).n_frames
 
 
-def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str, Any]]:
-    """Read frame `number`, from 0, of a TIFF; without a number its only one."""
+def read_tiff(path: Path, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
+    """Read frame `number`, from 0, of a TIFF."""
     layout = _layout_of(path)
-    if number is None and layout.n_frames != 1:
-        raise FileFormatError(
-            f"{path} has {layout.n_frames} frames: expected one image; invert all of them as a "
-            "stack of shots, or save the frame you need separately"
-        )
-    number = number or 0
     is_stored_together = layout.n_frames > len(layout.pages)
     with _open_tiff(path) as tiff:
         page = tiff.pages[layout.pages[0 if is_stored_together else number]].aspage()
@@ -175,10 +168,7 @@ def read_tiff(path: Path, number: int | None = None) -> tuple[AnyArray, dict[str
             array = page.asarray()
         if "S" in page.axes:
             array = np.moveaxis(array, page.axes.index("S"), -1)
-        missing = _missing_pixels(tiff, page, array)
-        if len(layout.masks) in (1, layout.n_frames):
-            cover = tiff.pages[layout.masks[min(number, len(layout.masks) - 1)]].aspage()
-            missing |= _covered_pixels(path, cover, missing)
+        missing = _transparent_pixels(page, array)
         array, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
         check_picture(path, "TIFF", array)
         array, turned = _turn_upright(without_pixels(array, missing), _tag(tiff, page, 274))
@@ -247,25 +237,10 @@ def _without_alpha(page: Any, array: AnyArray) -> AnyArray:
     return array[..., 0] if array.shape[-1] == 2 else array[..., :-1]
 
 
-def _missing_pixels(tiff: Any, page: Any, array: AnyArray) -> BoolArray:
-    """Return where a frame is transparent or without data."""
-    try:
-        fill = float(_tag(tiff, page, 42113, "nan"))
-    except ValueError:
-        fill = math.nan
-    is_fill = np.equal(array, np.float32(fill) if array.dtype == np.float32 else fill)
-    missing: BoolArray = np.asarray(is_fill if array.ndim == 2 else is_fill.all(axis=-1))
+def _transparent_pixels(page: Any, array: AnyArray) -> BoolArray:
     if array.ndim == 3 and _without_alpha(page, array) is not array:
-        missing |= array[..., -1] == 0
-    return missing
-
-
-def _covered_pixels(path: Path, cover: Any, frame: BoolArray) -> BoolArray:
-    """Return where a page that is a mask has zeros; nowhere if it has another size."""
-    if cover.shape != frame.shape:
-        return np.zeros_like(frame)
-    _check_complete(path, cover)
-    return np.asarray(cover.asarray() == 0)
+        return np.asarray(array[..., -1] == 0)
+    return np.zeros(array.shape[:2], bool)
 
 
 def _convert_values(
@@ -294,7 +269,7 @@ def _convert_values(
         return (white - array).astype(array.dtype), ("0 is white, inverted as the file says",)
     if page.photometric == PHOTOMETRIC.PALETTE and page.colormap is not None and array.ndim == 2:
         return np.moveaxis(page.colormap[:, array.astype(np.intp)], 0, -1), ()
-    return _scale(_tag(tiff, page, 42112), array)
+    return array, ()
 
 
 def _calibrate(
@@ -316,22 +291,6 @@ def _calibrate(
     return values, (f"values calibrated by ImageJ: {text or 0}",)
 
 
-def _scale(text: Any, array: AnyArray) -> tuple[AnyArray, tuple[str, ...]]:
-    """Apply the scale and offset of GDAL's metadata."""
-    if not isinstance(text, str):
-        return array, ()
-    samples = 1 if array.ndim == 2 else array.shape[-1]
-    stated = {"scale": np.ones(samples), "offset": np.zeros(samples)}
-    for item in ElementTree.fromstring(text.strip("\0 \n")).iter("Item"):
-        role, sample = item.get("role"), int(item.get("sample", 0))
-        if role in stated and sample < samples:
-            stated[role][sample] = float(item.text or "nan")
-    if (stated["scale"] == 1).all() and not stated["offset"].any():
-        return array, ()
-    factor, offset = (each if array.ndim == 3 else each[0] for each in stated.values())
-    return array * factor + offset, ("scale and offset applied as the file says",)
-
-
 def _turn_upright(array: AnyArray, orientation: Any) -> tuple[AnyArray, tuple[str, ...]]:
     """Return an array as it is seen, by the tag Orientation, and a note if it was stored else."""
     if orientation not in range(2, 9):
@@ -342,12 +301,10 @@ def _turn_upright(array: AnyArray, orientation: Any) -> tuple[AnyArray, tuple[st
 
 
 def _warnings(page: Any, layout: _Layout) -> tuple[Caution, ...]:
-    profile, curve = page.tags.valueof(34675), page.tags.valueof(301)
+    profile = page.tags.valueof(34675)
     cautions = []
     if profile is not None and not is_linear_profile(bytes(profile)):
         cautions.append(gamma_warning("a TIFF with a colour profile"))
-    elif curve is not None and not _is_straight(np.asarray(curve, dtype=np.float64)):
-        cautions.append(gamma_warning("a TIFF with a transfer function"))
     elif page.photometric == PHOTOMETRIC.YCBCR or (
         page.compression in _JPEG and page.dtype == np.uint8
     ):
@@ -359,11 +316,6 @@ def _warnings(page: Any, layout: _Layout) -> tuple[Caution, ...]:
         )
         cautions.append(Caution("file", text))
     return tuple(cautions)
-
-
-def _is_straight(curve: AnyArray) -> bool:
-    line = np.linspace(curve.flat[0], curve.flat[-1], curve.size)
-    return bool(np.abs(curve - line).max() <= 0.01 * max(np.ptp(curve), 1.0))
 
 
 def _pixel_sides(tiff: Any, page: Any) -> tuple[tuple[float, ...], bool]:
