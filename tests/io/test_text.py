@@ -170,7 +170,7 @@ def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
         (("x,y,z", "1,2,3"), r"could not convert string 'x'"),
         (("1 2 3",), r"holds 1 rows of numbers: expected at least two"),
         (("# nothing", ""), r"holds 0 rows of numbers"),
-        (("# energy = 14.7 cm", "1 2"), r"line 1 has '14.7 cm' for energy"),
+        (("# energy = 14.7 cm", "1 2"), r"line 1 has '14.7 cm' for energy: .* converted to MeV"),
         (("# pixel size: 3 apples", "1 2"), r"line 1 has '3 apples' for pixel_size"),
     ],
 )

@@ -39,11 +39,6 @@ from napari_shadowinv._system.tables import is_number
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 
-LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "nm": 1e-9}
-LENGTHS |= dict.fromkeys(("um", "µm", "μm", "micron", "microns"), 1e-6)
-_UNITS = {**LENGTHS, "mev": 1.0, "kev": 1e-3, "ev": 1e-6}
-_ENERGY_UNITS = {"mev", "kev", "ev"}
-
 _NAMES = {
     "source_object_distance": "source_object_distance source_object_dist s2r",
     "object_image_distance": "object_image_distance object_image_dist",
@@ -55,11 +50,10 @@ _NAMES = {
 _KEYS = {key: name for name, keys in _NAMES.items() for key in keys.split()}
 # Plain words in other programs' files, where without a unit they mean something else.
 _KEYS_WITH_UNIT = {"s2r", "s2d", "bin", "ep"}
-_PARTICLE_ENERGY = "energy"  # without a unit in MeV
 _ENTRY = re.compile(
     r"^[#%\s]*(?P<key>[^\W\d][\w\- ()\[\]]*?)\s*(?P<sign>[=:]\s*|\s)(?P<value>[-+.\d].*)$"
 )
-_VALUE = re.compile(r"^(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*(?P<unit>[^\W\d]*)\s*$")
+_UNIT = re.compile(r"[pnµμumckMG]?m|[kMG]?eV")
 _BLOCK = re.compile(r"^[#%]\s*(flux2D|flux2D_ref|mask)\s*(?:\(\s*(\d+)\s*,\s*(\d+)\s*\))?\s*$")
 _SELECTED = re.compile(r"^[#%]\s*([xy])-mask\s+([\d.]+)\s*%?\s*-\s*([\d.]+)")
 
@@ -208,36 +202,33 @@ def _parse_rows(path: Path, rows: list[bytes]) -> FloatArray:
     return image
 
 
-def _parse_geometry(path: Path, number: int, line: str, most: int = 200) -> dict[str, float]:
+def _parse_geometry(
+    path: Path, number_of_line: int, line: str, most: int = 200
+) -> dict[str, float]:
     """Return the geometry in the setup's units that a comment, no prose, states: one or none."""
+    from napari_shadowinv.physics.beam import number_in_unit
     from napari_shadowinv.physics.setup import beam_quantities
 
     entry = _ENTRY.match(line) if len(line) <= most else None
     if entry is None:
         return {}
-    words = [word for word in re.split(r"[\W_]+", entry["key"].lower()) if word]
-    unit = words.pop() if len(words) > 1 and words[-1] in _UNITS else ""
-    key, quantities = "_".join(words), beam_quantities()
+    words = [word for word in re.split(r"[\W_]+", entry["key"]) if word]
+    unit = words.pop() if len(words) > 1 and _UNIT.fullmatch(words[-1]) else ""
+    key, text, quantities = "_".join(words).lower(), entry["value"].strip(), beam_quantities()
     name = key if key in quantities else _KEYS.get(key)
-    value = _VALUE.match(entry["value"])
-    unit = (value["unit"].lower() if value else "") or unit
-    needs_unit = key in _KEYS_WITH_UNIT or key in quantities.keys() - {_PARTICLE_ENERGY}
-    if name is None or (needs_unit and not unit):
+    needs_unit = key in _KEYS_WITH_UNIT or (key in quantities and quantities[key].unit == "m")
+    if name is None or (needs_unit and not unit and is_number(text)):
         return {}
-    expected = quantities[name].unit.lower() if name in quantities else "m"
-    unit = unit or expected
-    fits = {unit, expected} <= _UNITS.keys() and (unit in _ENERGY_UNITS) == (
-        expected in _ENERGY_UNITS
-    )
-    if value is not None and fits and is_number(value["number"]):
-        return {name: float(value["number"]) * (_UNITS[unit] / _UNITS[expected])}
-    if entry["sign"].isspace():
-        # Prose that happens to begin with a key and a number.
-        return {}
-    raise FileFormatError(
-        f"{path}, line {number} has {entry['value'][:30]!r} for {name}: expected a number and "
-        f"a unit such as {'14.7 MeV' if expected in _ENERGY_UNITS else '1.4 cm'}; correct it"
-    )
+    expected = quantities[name].unit if name in quantities else "m"
+    try:
+        number = f"{text} {unit or expected}" if is_number(text) else text
+        return {name: number_in_unit(number, expected)}
+    except ValueError as error:
+        if entry["sign"].isspace():  # prose that happens to begin with a key and a number
+            return {}
+        raise FileFormatError(
+            f"{path}, line {number_of_line} has {text[:30]!r} for {name}: {error}"
+        ) from None
 
 
 def _complete_distances(geometry: dict[str, float]) -> dict[str, float]:
