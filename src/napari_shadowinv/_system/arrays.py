@@ -34,9 +34,7 @@ PIXELS, SQUARE_PIXELS = "px", "px²"
 _UNNAMED = re.compile(r"dim_\d+")  # xarray's names for dimensions that got none
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9}
 METRES |= {"metre": 1.0, "meter": 1.0, "micrometer": 1e-6, "micron": 1e-6, "millimeter": 1e-3}
-_PIXEL_NAMES = {"px", "pixel", "pixels"}
-_SQUARES = {f"{name}{power}" for name in _PIXEL_NAMES for power in ("²", "^2", "**2", "2")}
-_UNITS = {PIXELS: _PIXEL_NAMES, SQUARE_PIXELS: _SQUARES}
+_UNITS = {PIXELS: ("px", "pixel"), SQUARE_PIXELS: ("px²", "pixel**2")}  # the last of datasets
 
 
 def unpack_array(
@@ -211,8 +209,21 @@ def coordinate_spacing(values: Any, name: str, *, uneven: float = 1e-2) -> float
     """
     if not _is_labelled(values):
         return None
-    sizes = [_spacing(values, dim, name, uneven) for dim in PLANE if dim in values.dims]
-    lengths = [size for size in sizes if size is not None]
+    lengths = []
+    for dim in PLANE:
+        coordinate = values.coords.get(dim)
+        places: AnyArray = np.asarray([] if coordinate is None else coordinate.values)
+        if places.ndim != 1 or len(places) < 2 or places.dtype.kind not in "iuf":
+            continue
+        steps = np.diff(places.astype(np.float64))
+        mean = float(steps.mean())
+        if not np.isfinite(steps).all() or np.abs(steps - mean).max() > uneven * abs(mean):
+            raise InputError(
+                f"{name} has coordinates along {dim} that are not evenly spaced: expected pixels "
+                "of one size; resample it, or drop the coordinates"
+            )
+        if metres := METRES.get(str(coordinate.attrs.get("units", "")).strip()):
+            lengths.append(abs(mean) * metres)
     if len(lengths) == len(PLANE) and abs(lengths[0] - lengths[1]) > uneven * max(lengths):
         raise InputError(
             f"{name} has pixels of {lengths[0]:.4g} m along y and {lengths[1]:.4g} m along x by "
@@ -256,25 +267,6 @@ def _order_axes(array: Any, name: str, dims: Sequence[str], unit: str) -> Any:
             f"{', '.join(map(repr, dims))}: {step} them"
         )
     return array.transpose(*leading, *plane).data
-
-
-def _spacing(array: Any, dim: str, name: str, uneven: float) -> float | None:
-    """Return the distance between pixels along one dimension in m, or None if unknown."""
-    if dim not in array.coords:
-        return None
-    coordinate = array.coords[dim]
-    places: AnyArray = np.asarray(coordinate.values)
-    if places.ndim != 1 or len(places) < 2 or places.dtype.kind not in "iuf":
-        return None
-    steps = np.diff(places.astype(np.float64))
-    mean = float(steps.mean())
-    if not np.isfinite(steps).all() or np.abs(steps - mean).max() > uneven * abs(mean):
-        raise InputError(
-            f"{name} has coordinates along {dim} that are not evenly spaced: expected pixels of "
-            "one size; resample it, or drop the coordinates"
-        )
-    metres = METRES.get(str(coordinate.attrs.get("units", "")).strip())
-    return None if metres is None else abs(mean) * metres
 
 
 def block_sums(planes: FloatArray | BoolArray, side: int) -> FloatArray:

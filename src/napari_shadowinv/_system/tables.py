@@ -29,7 +29,6 @@ class Table(NamedTuple):
 
     path: Path
     header: list[str]  # column names in lower case
-    titles: list[str]  # column names as in the file
     rows: dict[int, list[str]]  # by line in the file, each with as many cells as there are columns
 
     def position_of(self, column: str) -> int:
@@ -58,8 +57,7 @@ def read_table(path: Path) -> Table:
     """
     records = _records(path, small_text(path, _EXPECTED, "utf-8-sig"))
     _, names = next(records, (0, []))
-    titles = _without_empty_end(names)
-    header = [name.lower() for name in titles]
+    header = [name.lower() for name in _without_empty_end(names)]
     rows = {}
     for line, cells in records:
         if len(_without_empty_end(cells)) > len(header):
@@ -70,7 +68,7 @@ def read_table(path: Path) -> Table:
         rows[line] = [*cells, *[""] * len(header)][: len(header)]
     if header and not rows:
         raise InputError(f"{path} has no rows below its column names: expected at least one")
-    return Table(path, header, titles, rows)
+    return Table(path, header, rows)
 
 
 def read_rows(
@@ -155,19 +153,16 @@ def _records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
     header = next((line for line in lines if line.strip(f" {_SEPARATORS}\n")), "")
     separator = max(_SEPARATORS, key=header.count)
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True)
-    while True:
-        line = reader.line_num + 1
-        try:
-            cells = [cell.strip() for cell in next(reader)]
-        except StopIteration:
-            return
-        except csv.Error as error:
-            raise FileFormatError(
-                f"{path}, line {line} cannot be read ({error}): expected {_EXPECTED}, with quotes "
-                "in pairs; correct it"
-            ) from None
-        if any(cells):
-            yield line, cells
+    try:
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                yield reader.line_num, cells
+    except csv.Error as error:
+        raise FileFormatError(
+            f"{path}, line {reader.line_num} cannot be read ({error}): expected {_EXPECTED}, with "
+            "quotes in pairs; correct it"
+        ) from None
 
 
 def _is_comment(line: str) -> bool:
