@@ -153,15 +153,17 @@ def _records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
     header = next((line for line in lines if line.strip(f" {_SEPARATORS}\n")), "")
     separator = max(_SEPARATORS, key=header.count)
     reader = csv.reader(lines, delimiter=separator, skipinitialspace=True, strict=True)
+    line = 1
     try:
         for row in reader:
             cells = [cell.strip() for cell in row]
             if any(cells):
-                yield reader.line_num, cells
+                yield line, cells
+            line = reader.line_num + 1
     except csv.Error as error:
         raise FileFormatError(
-            f"{path}, line {reader.line_num} cannot be read ({error}): expected {_EXPECTED}, with "
-            "quotes in pairs; correct it"
+            f"{path}, line {line} cannot be read ({error}): expected {_EXPECTED}, with quotes in "
+            "pairs; correct it"
         ) from None
 
 
