@@ -26,6 +26,7 @@ from napari_shadowinv import (
     InversionOptions,
     ProtonSetup,
     Recipe,
+    Shot,
     invert,
     read,
     run_stack,
@@ -115,10 +116,9 @@ def make_store(path: Path) -> None:
     blobs = [gaussian_blob(SHAPE, 2 + n, 4.0, (10, 12 + n)) for n in range(4)]
     shots = np.stack([synthetic_image(blob.displacement, source) for blob in blobs])
     run_stack(
-        shots,
+        Shot(shots, source=source),
         path,
         Recipe(setup=SETUP, options=OPTIONS),
-        source=source,
         run=RunOptions(variables=VARIABLES),
     )
 

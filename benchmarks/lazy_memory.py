@@ -23,7 +23,7 @@ import numpy as np
 import psutil
 import tifffile
 
-from napari_shadowinv import InversionOptions, Recipe, read, run_stack
+from napari_shadowinv import InversionOptions, Recipe, Shot, read, run_stack
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.stack import RunStatus
@@ -96,10 +96,9 @@ def measure(shots: Any, folder: Path, arguments: argparse.Namespace) -> dict[str
         _, cpu_before = next(iter(client.run(usage).values()))
         began = time.perf_counter()
         run_stack(
-            shots,
+            Shot(shots, source=source),
             out,
             Recipe(options=options),
-            source=source,
             scheduler=client,
             on_progress=note,
             run=RunOptions(variables=["potential"]),

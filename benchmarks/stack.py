@@ -148,10 +148,9 @@ def speedup(arguments: argparse.Namespace, folder: Path) -> None:
     def timed(client: Client) -> float:
         start = time.perf_counter()
         run_stack(
-            shots.shots,
+            Shot(shots.shots, source=shots.source),
             folder / "night.shadowinv.zarr",
             shots.recipe,
-            source=shots.source,
             reader=shots.reader,
             scheduler=client,
             on_progress=lambda told: told.outcome and ended.append(told.outcome),
@@ -217,10 +216,9 @@ def stream(arguments: argparse.Namespace, folder: Path) -> None:
 
         start = time.perf_counter()
         run_stack(
-            paths,
+            Shot(paths, source=np.full((100, 100), 1000.0)),
             out,
             Recipe(options=InversionOptions(threads=1)),
-            source=np.full((100, 100), 1000.0),
             reader=streamed,
             scheduler=client,
             on_progress=note,

@@ -37,7 +37,7 @@ import numpy as np
 import psutil
 import tifffile
 
-from napari_shadowinv import InversionOptions, Recipe, run_stack
+from napari_shadowinv import InversionOptions, Recipe, Shot, run_stack
 from napari_shadowinv.io.store import DONE, SKIPPED, StackStore
 from napari_shadowinv.pipeline import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Bin
@@ -92,10 +92,9 @@ def kept_up(folder: Path, recipe: Recipe, count: int, rate: float) -> str:
     thread = threading.Thread(target=camera)
     thread.start()
     watch_stack(
-        live,
+        Shot(live, source=iio.imread(BURNER / "Image_00000.bmp").astype(float)),
         folder / f"live_{rate:g}.shadowinv.zarr",
         recipe,
-        source=iio.imread(BURNER / "Image_00000.bmp").astype(float),
         reader=partial(read_shot, channel=None),
         on_progress=note,
         watch=WatchOptions(max_shots=count),
@@ -124,7 +123,11 @@ def against_a_run(folder: Path, recipe: Recipe, count: int) -> None:
 
     out = folder / "there.shadowinv.zarr"
     watch_stack(
-        live, out, recipe, source=source, on_progress=note, watch=WatchOptions(max_shots=count)
+        Shot(live, source=source),
+        out,
+        recipe,
+        on_progress=note,
+        watch=WatchOptions(max_shots=count),
     )
     watched = (ends[-1] - ends[2]) / (count - 3)  # the first decide on sites
     times: list[float] = []
@@ -136,10 +139,9 @@ def against_a_run(folder: Path, recipe: Recipe, count: int) -> None:
     for some in (files[:1], files):
         began = time.perf_counter()
         run_stack(
-            some,
+            Shot(some, source=source),
             folder / "run.shadowinv.zarr",
             with_all,
-            source=source,
             scheduler="synchronous",
             run=RunOptions(overwrite=True),
         )
@@ -203,10 +205,9 @@ def latest(folder: Path, seconds: float, rate: float, side: int, sites: int) -> 
     out = folder / "latest.shadowinv.zarr"
     cpu = time.process_time()
     watch_stack(
-        live,
+        Shot(live, source=np.full((side, side), 1000.0 / 8)),
         out,
         Recipe(options=InversionOptions(n_sites=sites or None)),
-        source=np.full((side, side), 1000.0 / 8),
         on_progress=note,
         should_stop=is_over,
         watch=WatchOptions(latest=True),
@@ -274,10 +275,9 @@ def stack_rate(folder: Path, count: int, sites: int | None, side: int = 512) -> 
     with local_client(cores) as client:
         warm_up(6 * cores, folder, client)
         run_stack(
-            f"{path}::data",
+            Shot(f"{path}::data", source=np.full((side, side), 1000.0)),
             out,
             Recipe(options=options),
-            source=np.full((side, side), 1000.0),
             scheduler=client,
             on_progress=note,
             run=RunOptions(overwrite=True),

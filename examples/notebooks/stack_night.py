@@ -19,6 +19,7 @@ from napari_shadowinv import (
     InversionOptions,
     OpticalSetup,
     Recipe,
+    Shot,
     invert_stack,
     read,
     run_stack,
@@ -70,7 +71,7 @@ print(f"Dashboard: http://127.0.0.1:{port}/status")
 setup = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=20e-6)
 good = sorted(path for path in night.glob("shot_*.tif") if path.stat().st_size)
 recipe = Recipe(options=InversionOptions(n_sites=2000), setup=setup)
-stack = invert_stack(good, recipe, source=night / "reference.tif")
+stack = invert_stack(Shot(good, source=night / "reference.tif"), recipe)
 one = stack.potential.isel(shot=2).compute()
 print(f"{stack.sizes['shot']} shots; the third has a peak of {float(one.max()):.1f} px²")
 
@@ -82,10 +83,9 @@ print(f"{stack.sizes['shot']} shots; the third has a peak of {float(one.max()):.
 
 # %%
 result = run_stack(
-    str(night / "shot_*.tif"),
+    Shot(str(night / "shot_*.tif"), source=night / "reference.tif"),
     night / "night.shadowinv.zarr",
     recipe,
-    source=night / "reference.tif",
     run=RunOptions(overwrite=True),
 )
 for name, status in zip(result.name.values, result.status.values, strict=True):

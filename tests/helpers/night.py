@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from napari_shadowinv import InversionOptions, Recipe, synthetic_image
+from napari_shadowinv import InversionOptions, Recipe, Shot, synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import RunOptions
+from napari_shadowinv.preprocessing import Estimate
 
 SHAPE = (24, 28)
 OPTIONS = InversionOptions(n_sites=100)
@@ -25,21 +26,21 @@ def make_shots(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([synthetic_image(blob.displacement, source) for blob in blobs]), source
 
 
-def grouped(choices: dict[str, Any], model: type[BaseModel] | None = RunOptions) -> dict[str, Any]:
-    """Group choices into the arguments of `run_stack`, `watch_stack` or `invert_stack`."""
-    fields = {
-        "options": "options",
-        "setup": "setup",
-        "filters": "steps",
-        "instrument": "instrument",
-    }
+def grouped(
+    images: Any, choices: dict[str, Any], model: type[BaseModel] | None = RunOptions
+) -> tuple[Shot, dict[str, Any]]:
+    """Group choices: shots with their source and masks, and arguments of `run_stack` and others."""
+    fields = {name: name for name in ("options", "setup", "instrument")} | {"filters": "steps"}
+    if isinstance(choices.get("source"), Estimate):
+        fields["source"] = "source"
     parts = {fields[name]: value for name, value in choices.items() if name in fields}
+    filled = {name: value for name, value in parts.items() if value is not None}
+    of_all = ("source", "mask", "source_mask")
+    shots = Shot(images, **{k: choices[k] for k in of_all if k in choices and k not in fields})
     names = set() if model is None else set(model.model_fields)
-    arguments = {k: v for k, v in choices.items() if k not in names and k not in fields}
-    if parts:
-        filled = {name: value for name, value in parts.items() if value is not None}
-        arguments.setdefault("recipe", Recipe(**filled))
+    others = {k: v for k, v in choices.items() if k not in {*names, *fields, *of_all}}
+    arguments = {"recipe": Recipe(**filled), **others}
     if model is not None:
         options = model(**{name: choices[name] for name in names & choices.keys()})
         arguments["run" if model is RunOptions else "watch"] = options
-    return arguments
+    return shots, arguments

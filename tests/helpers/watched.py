@@ -23,18 +23,18 @@ class Watched:
     """A folder watched in a thread, and its progress."""
 
     def __init__(self, folder: Path, out: Path, **choices: Any) -> None:
-        self.folder, self.out = folder, out
+        self.out = out
         self.events: list[RunStatus] = []
         self.error: Exception | None = None
         self._stop = threading.Event()
         defaults = {"source": SOURCE, "options": OPTIONS, "pattern": "*.npy", "settle": SETTLE}
-        self._choices = grouped(defaults | choices, WatchOptions)
+        self._shots, self._choices = grouped(folder, defaults | choices, WatchOptions)
         self._thread = threading.Thread(target=self._watch)
 
     def _watch(self) -> None:
         try:
             self.result = watch_stack(
-                self.folder,
+                self._shots,
                 self.out,
                 on_progress=self.events.append,
                 should_stop=self._stop.is_set,

@@ -607,8 +607,8 @@ def test_each_shot_of_a_stack_has_the_sites_that_it_needs(tmp_path):
     assert alone[0].report.n_sites < alone[1].report.n_sites
     shots, recipe = np.stack([easy, hard, easy]), Recipe(options=options)
     out = tmp_path / "stack.shadowinv.zarr"
-    store = run_stack(shots, out, recipe, source=source, run={"dtype": "float64"})
-    lazy = invert_stack(shots, recipe, source=source)
+    store = run_stack(Shot(shots, source=source), out, recipe, run={"dtype": "float64"})
+    lazy = invert_stack(Shot(shots, source=source), recipe)
     for index, expected in enumerate(alone):
         report = json.loads(str(store.report.values[index]))
         assert report["n_sites"] == expected.report.n_sites
@@ -629,7 +629,7 @@ def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path)
     assert recorded.beam_sensitivity.rms > 0
     for beam, is_measured in (({}, False), ({"source": np.ones(image.shape)}, True)):
         out = tmp_path / f"{is_measured}.shadowinv.zarr"
-        store = run_stack(image[None], out, Recipe(options=options), **beam)
+        store = run_stack(Shot(image[None], **beam), out, Recipe(options=options))
         (report,) = (json.loads(str(text)) for text in store.report.values)
         assert (report["errors"]["beam"] is None) == is_measured
 
@@ -646,7 +646,7 @@ def test_each_estimate_of_a_source_is_a_beam_that_nobody_measured(method, tmp_pa
     bare = np.hypot(*(np.indices(image.shape) - 31.5)) > 20 if estimate.uses_mask else None
     recipe = Recipe(source=estimate, setup=setup, options=InversionOptions(n_sites=400))
     shot = run(recipe, Shot(image, source_mask=bare)).errors
-    store = run_stack(image[None], tmp_path / "s.shadowinv.zarr", recipe, source_mask=bare)
+    store = run_stack(Shot(image[None], source_mask=bare), tmp_path / "s.shadowinv.zarr", recipe)
     of_stack = json.loads(str(store.report.values[0]))["errors"]
     if method == "kriged":
         assert shot.beam_basis == of_stack["beam_basis"] == "outside"

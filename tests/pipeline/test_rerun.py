@@ -141,7 +141,7 @@ def shot_of_stack(folder: Path) -> Example:
     recipe = Recipe(steps=STEPS, mask=Path("mask.tif"), setup=SETUPS[0], options=options)
     run = {"dtype": "float64"}
     run_stack(
-        paths, "a.shadowinv.zarr", recipe, source="beam.npy", scheduler="synchronous", run=run
+        Shot(paths, source="beam.npy"), "a.shadowinv.zarr", recipe, scheduler="synchronous", run=run
     )
     return Example(read_stack(Path("a.shadowinv.zarr")).isel(shot=1).load(), paths[1])
 

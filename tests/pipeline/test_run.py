@@ -364,7 +364,7 @@ def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: Fl
     assert_same(run(recipe, shot), invert(image, source=beam, options=OPTIONS))
     with pytest.raises(InputError, match="but names no file"):
         invert_stack(np.stack([image, image]), recipe)
-    stack = invert_stack(np.stack([image, image]), recipe, source=beam)
+    stack = invert_stack(Shot(np.stack([image, image]), source=beam), recipe)
     np.testing.assert_array_equal(stack.displacement[1], run(recipe, shot).displacement)
 
 

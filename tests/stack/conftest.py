@@ -29,7 +29,8 @@ class Night:
     def run(self, out: Path, **changes):
         """Invert its files into a store; choices of `run_stack` may differ."""
         choices = {"shots": self.glob, "source": self.source, "options": OPTIONS, **changes}
-        return run_stack(choices.pop("shots"), out, **grouped(choices))
+        shots, arguments = grouped(choices.pop("shots"), choices)
+        return run_stack(shots, out, **arguments)
 
     def path(self, index: int) -> Path:
         return self.folder / f"shot_{index}.npy"

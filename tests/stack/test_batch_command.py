@@ -159,18 +159,6 @@ def test_names_that_are_no_text_are_kept_as_their_bytes(night, folder):
     assert failed["name"] == r"shot_\xfc.npy"
 
 
-def test_shots_that_came_since_are_appended_when_it_is_resumed(night, store):
-    np.save(night.path(6), night.images[3])
-    np.save(night.folder / "shot_00.npy", night.images[1])  # sorts before others
-    result = batch("--setup", "setup.toml", "--resume")
-    assert result.exit_code == 0
-    assert "8 done, 0 failed, 0 pending" in flat(result.output)
-    assert "2 shots in" in flat(result.output)
-    names = StackStore(store).names
-    assert names[:6] == tuple(f"shot_{i}.npy" for i in range(6))
-    assert set(names[6:]) == {"shot_00.npy", "shot_6.npy"}
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -201,18 +189,6 @@ def test_nothing_is_written_among_the_files_of_a_store(store):
         assert result.exit_code == 2
         assert "is inside the store being read" in flat(result.output)
     assert sorted(store.rglob("*")) == before
-
-
-def test_status_names_shots_with_lost_or_bad_reports(store):
-    assert "n_sites = 100, accuracy" in flat(shadowinv("info", store).stdout)
-    chunk = store / "report" / "c" / "0"
-    chunk.unlink()
-    for reason in ("its report is missing", "its report is damaged"):
-        result = shadowinv("info", store)
-        assert result.exit_code == 0, result.output
-        assert "5 done, 0 failed, 0 pending, 1 damaged" in flat(result.output)
-        assert f"shot_0.npy: {reason}" in flat(result.output)
-        chunk.write_bytes(b"junk")
 
 
 def test_a_tiff_with_pages_a_mask_and_bins(night, folder):

@@ -13,7 +13,7 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from napari_shadowinv import invert, run_stack
+from napari_shadowinv import Shot, invert, run_stack
 from napari_shadowinv.cli import app
 from napari_shadowinv.pipeline.shot_table import ShotRow
 
@@ -44,7 +44,7 @@ def run_job_array() -> None:
 def test_python_blocks_of_the_page_keep_their_promise(folder, night):
     names: dict[str, Any] = {}
     run_job_array()
-    run_stack("shots/*.tif", "live.shadowinv.zarr", source="reference.tif")
+    run_stack(Shot("shots/*.tif", source="reference.tif"), "live.shadowinv.zarr")
     lines = [f"{number}, {number}.5\n" for number in (5, 0, 3, 1, 2, 4)]
     Path("day.csv").write_text("".join(["shot, delay (ns)\n", *lines]))
     blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

@@ -12,7 +12,7 @@ import tifffile
 import zarr
 
 from helpers.store_content import content
-from napari_shadowinv import FileFormatError, InputError, InversionOptions, read
+from napari_shadowinv import FileFormatError, InputError, read
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.io.store_writing import ShotWriter
@@ -113,34 +113,6 @@ def test_pending_and_failed_shots_stay_so_until_their_turn(night, out, hidden):
     assert list(StackStore(out).statuses()) == [1, 1, 2, 1, 1, 0]
     assert list(night.run(out).status) == [1, 1, 2, 1, 1, 1]
     assert list(night.run(out, redo_failed=True).status) == [DONE] * 6
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (lambda n: np.save(n.path(2), n.images[2] + 1), r"shot 2 \(shot_2.npy\) has changed"),
-        (lambda n: n.path(1).unlink(), r"4 there, 5 given, without shot_1.npy"),
-    ],
-)
-def test_earlier_shots_must_be_there_unchanged(night, out, hidden, spoil, words):
-    hidden(4, 5)
-    night.run(out)
-    before = content(out, "status", "name", "report")
-    hidden()
-    spoil(night)
-    with pytest.raises(InputError, match=words):
-        night.run(out)
-    assert content(out, "status", "name", "report") == before
-    assert StackStore(out).names == tuple(f"shot_{i}.npy" for i in range(4))
-
-
-def test_options_are_checked_as_ever(night, out, hidden):
-    hidden(5)
-    night.run(out)
-    hidden()
-    with pytest.raises(InputError, match="different options"):
-        night.run(out, options=InversionOptions(n_sites=90))
-    assert len(StackStore(out).names) == 5
 
 
 def test_sources_arrive_with_their_shots(night, out, hidden):

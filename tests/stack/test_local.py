@@ -44,9 +44,9 @@ def test_the_setting_of_dask_is_the_default(night, out):
 
 
 def test_shots_are_told_one_by_one_in_whatever_portions_they_are_given(night, out, monkeypatch):
-    from napari_shadowinv.stack._run import _Run
+    from napari_shadowinv.stack._run import StoreRun
 
-    monkeypatch.setattr(_Run, "run_on", partialmethod(_Run.run_on, portion=4))
+    monkeypatch.setattr(StoreRun, "run", partialmethod(StoreRun.run, portion=4))
     ended = []
     night.run(out, on_progress=lambda news: news.outcome and ended.append(news.outcome.index))
     assert sorted(ended) == list(range(6))

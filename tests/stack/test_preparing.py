@@ -14,6 +14,7 @@ from napari_shadowinv import (
     InversionOptions,
     ProtonSetup,
     Recipe,
+    Shot,
     invert,
     invert_stack,
     read,
@@ -78,8 +79,10 @@ def test_sources_are_guessed_from_filtered_shots(night, out, bare, usable):
         "options": OPTIONS,
         "variables": ("potential", "source", "weights"),
     }
-    written = run_stack(shots, out, **grouped({**arguments, "dtype": "float64"}))
-    lazy = invert_stack(shots, **grouped(arguments, None))
+    stack, choices = grouped(shots, {**arguments, "dtype": "float64"})
+    written = run_stack(stack, out, **choices)
+    stack, choices = grouped(shots, arguments, None)
+    lazy = invert_stack(stack, **choices)
     assert (written.status == DONE).all()
     for index in (0, 3):
         expected = alone(shots[index], usable, bare)
@@ -102,7 +105,7 @@ def test_a_measured_source_is_blurred_as_its_shots(night, out):
     )
     sources = np.stack([night.source] * 6)
     for source in (night.source, sources):
-        stack = invert_stack(night.images, Recipe(steps=blur, options=OPTIONS), source=source)
+        stack = invert_stack(Shot(night.images, source=source), Recipe(steps=blur, options=OPTIONS))
         np.testing.assert_array_equal(stack.potential[1].compute(), expected.potential)
         np.testing.assert_array_equal(stack.source.values.reshape(-1, 24, 28)[0], expected.source)
 
@@ -110,7 +113,7 @@ def test_a_measured_source_is_blurred_as_its_shots(night, out):
 def test_a_uniform_beam_is_shared_and_may_be_flattened(night):
     flatten = (HighPassFilter(width=9.0),)
     stack = invert_stack(
-        night.images, Recipe(steps=flatten, options=OPTIONS), source=UniformEstimate()
+        night.images, Recipe(steps=flatten, source=UniformEstimate(), options=OPTIONS)
     )
     expected = invert(high_pass(night.images[2], 9.0), options=OPTIONS)
     np.testing.assert_allclose(stack.potential[2].compute(), expected.potential, rtol=0, atol=1e-9)
@@ -165,7 +168,7 @@ def test_nonsense_is_refused_before_anything_is_computed(night, out, arguments, 
 def test_an_estimate_that_cannot_be_made_fails_its_shot_alone(night, out):
     spoilt = night.images.copy()
     spoilt[2] = 0
-    written = run_stack(spoilt, out, Recipe(options=OPTIONS), source=LowPassEstimate(width=6))
+    written = run_stack(spoilt, out, Recipe(source=LowPassEstimate(width=6), options=OPTIONS))
     assert list(written.status) == [1, 1, 2, 1, 1, 1]
 
 
@@ -236,11 +239,9 @@ def test_doubts_of_a_source_are_in_the_report_of_each_shot(night, out):
         (IsotropicEstimate(), None, ""),
     ):
         run_stack(
-            shots,
+            Shot(shots, source_mask=source_mask),
             out,
-            Recipe(setup=near, options=OPTIONS),
-            source=source,
-            source_mask=source_mask,
+            Recipe(setup=near, source=source, options=OPTIONS),
             scheduler="synchronous",
             run=RunOptions(variables=("potential", "source"), overwrite=True),
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from napari_shadowinv import InputError, InversionOptions, Recipe, invert_stack, run_stack
+from napari_shadowinv import InputError, InversionOptions, Recipe, Shot, invert_stack, run_stack
 from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.stack import stack_statistics
 
@@ -14,7 +14,7 @@ OPTIONS = InversionOptions(n_sites=100)
 
 def test_statistics_equal_numpy_and_are_lazy(night, optical_setup):
     stack = invert_stack(
-        night.images, Recipe(options=OPTIONS, setup=optical_setup), source=night.source
+        Shot(night.images, source=night.source), Recipe(options=OPTIONS, setup=optical_setup)
     )
     statistics = stack_statistics(stack)
     assert all(variable.chunks for variable in statistics.data_vars.values())
@@ -35,10 +35,13 @@ def test_shots_that_failed_do_not_count(night, tmp_path):
     images[2] = 0
     out = tmp_path / "night.shadowinv.zarr"
     written = run_stack(
-        images, out, Recipe(options=OPTIONS), source=night.source, run=RunOptions(dtype="float64")
+        Shot(images, source=night.source),
+        out,
+        Recipe(options=OPTIONS),
+        run=RunOptions(dtype="float64"),
     )
     good = [0, 1, 3, 4, 5]
-    alone = invert_stack(night.images[good], Recipe(options=OPTIONS), source=night.source)
+    alone = invert_stack(Shot(night.images[good], source=night.source), Recipe(options=OPTIONS))
     statistics, expected = stack_statistics(written), stack_statistics(alone)
     np.testing.assert_allclose(statistics.potential_mean, expected.potential_mean, rtol=1e-9)
     np.testing.assert_allclose(statistics.potential_std, expected.potential_std, rtol=1e-9)
@@ -48,7 +51,7 @@ def test_shots_that_failed_do_not_count(night, tmp_path):
 
 
 def test_one_shot_has_no_spread(night):
-    stack = invert_stack(night.images[:1], Recipe(options=OPTIONS), source=night.source)
+    stack = invert_stack(Shot(night.images[:1], source=night.source), Recipe(options=OPTIONS))
     assert np.isnan(stack_statistics(stack).potential_std).all()
 
 

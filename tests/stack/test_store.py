@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from napari_shadowinv import InversionOptions, Recipe, run_stack
+from napari_shadowinv import InversionOptions, Recipe, Shot, run_stack
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.store import StackStore, read_stack
@@ -24,7 +24,10 @@ OPTIONS = InversionOptions(n_sites=100)
 def store(night, tmp_path) -> Path:
     path = tmp_path / "run.shadowinv.zarr"
     run_stack(
-        night.images[:2], path, Recipe(options=OPTIONS), source=night.source, scheduler="threads"
+        Shot(night.images[:2], source=night.source),
+        path,
+        Recipe(options=OPTIONS),
+        scheduler="threads",
     )
     return path
 

@@ -153,22 +153,6 @@ def test_damaged_shot_is_pending_until_it_is_redone(any_night, store):
     assert np.isnan(read(store).displacement[3]).all()
 
 
-def test_done_shot_whose_file_turns_bad_loses_every_field(make_night, out):
-    night = make_night(2)
-    names = ("potential", "displacement", "caustic", "weights")
-    night.run(out, variables=names)
-    field(out, 1, "potential").unlink()
-    np.save(night.path(1), 0 * night.images[1])
-    ShotWriter.of(StackStore(out)).reopen(1)
-    written = night.run(out, variables=names)
-    assert written.status.values.tolist() == [DONE, FAILED]
-    for name in ("potential", "displacement", "weights"):
-        assert np.isnan(written[name][1]).all()
-        assert np.isfinite(written[name][0]).all()
-    assert not written.caustic[1].any()
-    assert shadowinv("info", out, "--verify").exit_code == 0
-
-
 @pytest.mark.parametrize("way", ["reopened", "failed"])
 def test_shot_that_was_done_keeps_no_field(make_night, out, way):
     names = ("potential", "displacement", "caustic", "weights")

@@ -85,7 +85,8 @@ def inverted(shots: Any, out: Path, **more: Any) -> Any:
     """The store of a table, made in this process."""
     arguments = {"setup": SETUP, "options": OPTIONS, "source": "beam.npy"} | more
     arguments["dtype"] = "float64"
-    return run_stack(shots, out, scheduler="synchronous", **grouped(arguments))
+    shots, choices = grouped(shots, arguments)
+    return run_stack(shots, out, **{"scheduler": "synchronous", **choices})
 
 
 def test_one_field_at_three_energies_is_one_field_in_si(pack: Path, out: Path) -> None:
@@ -101,7 +102,7 @@ def test_one_field_at_three_energies_is_one_field_in_si(pack: Path, out: Path) -
     # In px they are as different as the momenta.
     peaks = np.hypot(*store["displacement"].values.swapaxes(0, 1)).max(axis=(1, 2))
     assert peaks[0] / peaks[2] == pytest.approx(at(30.0).momentum / at(5.0).momentum, rel=0.03)
-    lazy = invert_stack(pack, Recipe(setup=SETUP, options=OPTIONS), source="beam.npy")
+    lazy = invert_stack(Shot(pack, source="beam.npy"), Recipe(setup=SETUP, options=OPTIONS))
     np.testing.assert_allclose(lazy["path_integrated_b"], field, rtol=1e-9, atol=1e-12 * strongest)
     for stack in (store, lazy):
         assert [setup_from_dataset(stack.isel(shot=k)) for k in range(3)] == list(map(at, ENERGIES))
@@ -117,7 +118,7 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
     free = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
     recipe = Recipe(steps=(Bin(factor=2),), setup=SETUP, options=free)
     pack = table(*rows, header=header)
-    store = run_stack(pack, out, recipe, source=beam(), run=RunOptions(dtype="float64"))
+    store = run_stack(Shot(pack, source=beam()), out, recipe, run=RunOptions(dtype="float64"))
     alone = run(
         recipe.model_copy(update={"setup": at(5.0)}),
         Shot(np.load("film0.npy") / 1.25, source=beam(), mask=usable),
@@ -344,17 +345,9 @@ def test_films_at_their_own_distance_have_pixels_of_their_own(pack: Path, out: P
 def test_a_row_is_repeated_from_its_provenance(pack: Path) -> None:
     options = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
     pack = table("film0.npy,5,1.25,beam.npy", header="file,energy,brightness,source")
-    stack = describe_stack(
-        pack,
-        Recipe(setup=SETUP, options=options),
-        variables=None,
-        source=None,
-        mask=None,
-        source_mask=None,
-        reader=read_shot,
-    )
+    stack = describe_stack(pack, Recipe(setup=SETUP, options=options), read_shot, None)
     images, _ = stack.shots.items[0].load()
-    inversion = stack.task.run(images, stack.beam, workers=1)
+    inversion = stack.task.run(images, workers=1)
     write("film0.shadowinv", inversion)
     assert rerun("film0.shadowinv").is_identical
     assert "brightness 1.25 (the image was divided by it)" in flat(
@@ -371,11 +364,9 @@ def test_rows_may_be_given_in_python(pack: Path, out: Path) -> None:
 def test_worker_processes_receive_all_of_a_row(pack: Path, out: Path) -> None:
     np.save("mask.npy", np.ones(SHAPE))
     pack = table("film0.npy,5,mask.npy", "film2.npy,30,", header="file,energy,mask")
-    arguments = {"setup": SETUP, "options": OPTIONS, "source": beam(), "dtype": "float64"}
-    in_process = run_stack(pack, out, scheduler="synchronous", **grouped(arguments))
+    in_process = inverted(pack, out, source=beam())
     other_store = out.with_name("other.shadowinv.zarr")
-    arguments["workers"] = 1
-    in_worker = run_stack(pack, other_store, scheduler="processes", **grouped(arguments))
+    in_worker = inverted(pack, other_store, source=beam(), scheduler="processes", workers=1)
     assert in_worker["status"].values.tolist() == [DONE, DONE]
     np.testing.assert_array_equal(in_worker["displacement"], in_process["displacement"])
     np.testing.assert_array_equal(in_worker["path_integrated_b"], in_process["path_integrated_b"])
@@ -390,10 +381,11 @@ def test_masks_of_a_shot_and_of_all_hold_both_but_for_a_file(fits: bool) -> None
         options=OPTIONS, source=PolynomialEstimate(), fit=FitChoices() if fits else None
     )
     images = np.ones((3, *SHAPE))
-    stack = describe_stack(images, recipe, None, common[0], common[1], read_shot, None)
-    joined = stack.task.with_masks(Shot(images[0], mask=own[0], source_mask=own[1]))
+    shots = Shot(images, mask=common[0], source_mask=common[1])
+    task = describe_stack(shots, recipe, read_shot, None).task
+    joined = task.completed(Shot(images[0], mask=own[0], source_mask=own[1]), None)
     np.testing.assert_array_equal(joined.mask, common[0] & own[0])
     np.testing.assert_array_equal(joined.source_mask, common[1] & own[1])
-    of_file = stack.task.with_masks(Shot(images[0], mask=Path("mask.png")))
+    of_file = task.completed(Shot(images[0], mask=Path("mask.png")), None)
     assert of_file.mask == Path("mask.png")
     np.testing.assert_array_equal(of_file.source_mask, common[1])

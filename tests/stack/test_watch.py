@@ -17,7 +17,15 @@ from helpers.command_line import flat, shadowinv
 from helpers.night import OPTIONS
 from helpers.store_content import content
 from helpers.watched import IMAGES, SETTLE, SOURCE, Watched, put, watched_once, whole
-from napari_shadowinv import FileFormatError, InputError, InversionOptions, Recipe, invert, read
+from napari_shadowinv import (
+    FileFormatError,
+    InputError,
+    InversionOptions,
+    Recipe,
+    Shot,
+    invert,
+    read,
+)
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.cli import _batch
 from napari_shadowinv.inversion import plan_sites
@@ -54,7 +62,9 @@ def test_watch_equals_a_run(folder, out, tmp_path):
     from napari_shadowinv import run_stack
 
     files = [folder / f"shot_{index}.npy" for index in range(6)]
-    run = run_stack(files, tmp_path / "run.shadowinv.zarr", Recipe(options=OPTIONS), source=SOURCE)
+    run = run_stack(
+        Shot(files, source=SOURCE), tmp_path / "run.shadowinv.zarr", Recipe(options=OPTIONS)
+    )
     np.testing.assert_array_equal(watched.displacement, run.displacement)
     for name in ("iterations", "image_residual", "seconds"):
         assert (watched[name] > 0).all()
@@ -254,7 +264,7 @@ def test_wrong_folder_or_pattern_is_refused_at_once(folder, out, tmp_path):
     refused("--source", tmp_path / "none.tif", names="none.tif")
     sources = np.stack([SOURCE, SOURCE])
     with pytest.raises(InputError, match="got 2 sources, and the shots are still to arrive"):
-        watch_stack(folder, out, source=sources)
+        watch_stack(Shot(folder, source=sources), out)
 
 
 def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkeypatch):
@@ -330,20 +340,6 @@ def test_removed_store_is_named_and_not_made_again(folder, out):
     assert "was removed or moved while it was being written" in str(watch.error)
     assert "disk space" not in str(watch.error)
     assert not out.exists()
-
-
-def test_done_shot_whose_file_turns_bad_is_failed_and_empty(folder, out):
-    names = ("potential", "displacement", "caustic", "weights")
-    put(folder, 0, 1)
-    with Watched(folder, out, variables=names) as watch:
-        watch.ended(2)
-        (folder / "shot_1.npy").write_bytes(b"no image")
-        watch.ended(3)
-    assert list(watch.result.status.values) == [DONE, FAILED]
-    for name in ("potential", "displacement", "weights"):
-        assert np.isnan(watch.result[name][1]).all(), name
-        assert np.isfinite(watch.result[name][0]).all(), name
-    assert not watch.result.caustic[1].any()
 
 
 @pytest.mark.parametrize("command", ["batch", "watch"])

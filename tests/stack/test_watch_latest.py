@@ -11,14 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zarr
 
 from helpers.command_line import flat, shadowinv
 from helpers.night import OPTIONS
 from helpers.watched import SETTLE, SOURCE, Watched, put, watched_once
-from napari_shadowinv import InputError, Instrument, read, run_stack
+from napari_shadowinv import InputError, Instrument, Shot, read, run_stack
 from napari_shadowinv.io.store import DONE, FAILED, SKIPPED, StackStore
-from napari_shadowinv.io.store_writing import GrowingStore
 from napari_shadowinv.pipeline import WatchOptions
 from napari_shadowinv.stack import watch_stack
 
@@ -90,7 +88,7 @@ def test_existing_files_are_skipped_but_the_newest_and_done_ones(folder, out, tm
     (folder / "shot_4.npy").unlink()
     put(folder, 4)
     files = [folder / f"shot_{number}.npy" for number in range(5)]
-    later = run_stack(files, out, recipe_of_watch(), source=SOURCE, run={"redo_failed": True})
+    later = run_stack(Shot(files, source=SOURCE), out, recipe_of_watch(), run={"redo_failed": True})
     assert numbers_of(later) == [(name, DONE) for name, _ in expected]
 
 
@@ -113,22 +111,6 @@ def test_shots_in_work_are_skipped_when_the_watch_ends(folder, out):
         gate.opened.set()
     assert (watch.events[-1].skipped, watch.events[-1].waiting) == (1, 0)
     assert numbers_of(watch.result) == [("0", DONE), ("1", SKIPPED)]
-
-
-def test_room_of_a_growing_store_is_not_seen_and_given_back(folder, out):
-    put(folder, 0, 1)
-    watched_once(folder, out)
-    growing = GrowingStore(StackStore(out))
-    growing.skip(["shot_8.npy", "shot_9.npy"])
-    assert zarr.open_array(out / "displacement").shape[0] > 4  # by its own description
-    store = StackStore(out, every_byte=True)  # as if the watch had been killed
-    assert store.statuses().tolist() == [DONE, DONE, SKIPPED, SKIPPED]
-    assert not store.damage.shots
-    assert not store.damage.files
-    assert read(out).sizes["shot"] == 4
-    growing.close()
-    lengths = {zarr.open_array(out / name).shape[0] for name in ("displacement", "status", "name")}
-    assert lengths == {4}
 
 
 def test_command_counts_skipped_shots_and_ends_well(folder, out):

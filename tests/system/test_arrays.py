@@ -65,7 +65,9 @@ INVERT: dict[str, Callable[..., Any]] = {
     "invert": lambda image, mask=None: invert(image, mask=mask, options=OPTIONS),
     "run": lambda image, mask=None: run(Recipe(options=OPTIONS), Shot(image, mask=mask)),
     "invert_stack": lambda image, mask=None: (
-        invert_stack(_stack_of(image), Recipe(options=OPTIONS), mask=mask).isel(shot=1).compute()
+        invert_stack(Shot(_stack_of(image), mask=mask), Recipe(options=OPTIONS))
+        .isel(shot=1)
+        .compute()
     ),
     "fit": lambda image, mask=None: _measured(image, mask),
     "fit a list": lambda image, mask=None: _measured([image], mask),

@@ -3,7 +3,6 @@
 - create a store with all shots pending: `create_store`, from its `Contents`
 - make room for more shots: `grow_store`
 - write a shot, or why it failed, also in a worker: `ShotWriter`; gather numbers: `summarise`
-- a store that grows by one shot at a time while its run goes on: `GrowingStore`
 
 The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
 by that copy. So a store changes its length in one moment: when that one file is replaced.
@@ -16,9 +15,9 @@ import os
 import secrets
 import shutil
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -34,10 +33,8 @@ from napari_shadowinv.errors import FileFormatError, RunInterruptedError
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.io.store import (
     DONE,
-    FAILED,
     FORMAT,
     PENDING,
-    SKIPPED,
     STATUS_NAMES,
     StackStore,
     columns_of_store,
@@ -75,7 +72,6 @@ class ShotWriter:
     path: Path
     store_id: str  # another store may have taken its place
     shots: int  # it may have had fewer when this process opened it before
-    opened: dict[str, Any] | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, store: StackStore) -> ShotWriter:
@@ -101,16 +97,11 @@ class ShotWriter:
             group["report"][index : index + 1] = np.array([json.dumps(report)], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
 
-    def skip(self, index: int) -> None:
-        """Mark a shot as skipped that has not ended."""
-        with _as_store_errors(self.path):
-            self.arrays()["status"][index : index + 1] = np.int8(SKIPPED)
-
-    def reopen(self, index: int) -> None:
+    def reopen(self, index: int, status: int = PENDING) -> None:
         """Mark a shot as pending that is to be done again, and forget its report and fields."""
         group = self.arrays()
         with _as_store_errors(self.path):
-            group["status"][index : index + 1] = np.int8(PENDING)
+            group["status"][index : index + 1] = np.int8(status)
             for name in ("report", *fields_of(group)):
                 chunk_file(self.path, group[name], index).unlink(missing_ok=True)
 
@@ -126,7 +117,7 @@ class ShotWriter:
                     arrays[column.key][shots] = values
 
     def arrays(self) -> dict[str, Any]:
-        return self.opened or _open_arrays(self.path, self.store_id, self.shots)
+        return _open_arrays(self.path, self.store_id, self.shots)
 
 
 def _open_to_write(path: Path) -> dict[str, Any]:
@@ -214,21 +205,14 @@ def remove_unfinished(path: Path) -> None:
                 Path(folder, name).unlink(missing_ok=True)
 
 
-def grow_store(
-    path: Path,
-    values: Mapping[str, AnyArray],
-    attributes: Mapping[str, Any],
-    arrays: Mapping[str, Any] | None = None,
-    room: int = 0,
-) -> None:
+def grow_store(path: Path, values: Mapping[str, AnyArray], attributes: Mapping[str, Any]) -> None:
     """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged.
 
-    The coordinates, `values`, are of the new shots. `arrays` are open already, or opened; they get
-    `room` for more shots than the store has then.
+    The coordinates, `values`, are of the new shots.
     """
     # The store is longer once its description is replaced.
     with _as_store_errors(path), _changing_description(path) as metadata:
-        arrays = _open_to_write(path) if arrays is None else arrays
+        arrays = _open_to_write(path)
         longer = [name for name, array in arrays.items() if is_along_shots(array)]
         before = metadata["consolidated_metadata"]["metadata"]["status"]["shape"][0]
         length = before + len(values["shot"])
@@ -237,7 +221,7 @@ def grow_store(
             together = array.chunks[0]
             # Beyond the end stated in the folder's own copy: nobody sees it yet.
             if array.shape[0] < length:
-                array.resize((length + room, *array.shape[1:]))
+                array.resize((length, *array.shape[1:]))
             if name in values:
                 array[before:length] = values[name]
             elif together > 1 and (before - 1) // together < (length - 1) // together:
@@ -321,79 +305,3 @@ def _create_array(
     )
     if variable.values is not None:
         array[...] = variable.values
-
-
-class GrowingStore:
-    """Store that this process alone writes; it remembers the name and status of each shot.
-
-    It is opened once: the cost of a shot does not depend on how many there are already.
-    """
-
-    def __init__(self, store: StackStore) -> None:
-        self.path = store.path
-        # Not the cached arrays, as these grow: other code in this process needs a fixed length.
-        self.writer = replace(ShotWriter.of(store), opened=_open_to_write(store.path))
-        self._columns = store.columns
-        self._numbers = {name: index for index, name in enumerate(store.names)}
-        self._statuses = bytearray(store.statuses().astype(np.uint8).tobytes())
-
-    def __len__(self) -> int:
-        return len(self._statuses)
-
-    def count(self, status: int) -> int:
-        """Return how many shots are pending, done or failed."""
-        return self._statuses.count(status)
-
-    def names_of(self, status: int) -> Iterator[str]:
-        """Return the names of the shots of a status, one by one."""
-        return (name for name, index in self._numbers.items() if self._statuses[index] == status)
-
-    def status(self, name: str) -> int | None:
-        """Return the status of a shot, None if it is not there yet."""
-        index = self._numbers.get(name)
-        return None if index is None else self._statuses[index]
-
-    def report(self, name: str) -> dict[str, Any]:
-        """Return the report of a shot that has ended."""
-        text = str(self.writer.arrays()["report"][self._numbers[name]])
-        return dict(json.loads(text or "{}"))
-
-    def skip(self, names: Collection[str], *following: str) -> None:
-        """Mark shots that have not ended as skipped; they and those following get their numbers."""
-        new = [name for name in dict.fromkeys([*names, *following]) if name not in self._numbers]
-        if new:
-            numbers = range(len(self), len(self) + len(new))
-            values = {"shot": np.array(numbers), "name": np.array(new, dtype=object)}
-            grow_store(self.path, values, {}, self.writer.arrays(), room=64)
-            self._numbers.update(zip(new, numbers, strict=True))
-            self._statuses.extend([PENDING] * len(new))
-        for name in names:
-            self.writer.skip(self._numbers[name])
-            self._statuses[self._numbers[name]] = SKIPPED
-
-    def reopen(self, name: str) -> int:
-        """Mark a shot as pending that is to be done again; return its number."""
-        index = self._numbers[name]
-        if self._statuses[index] != PENDING:
-            self.writer.reopen(index)
-            self._statuses[index] = PENDING
-        return index
-
-    def fail(self, name: str, report: Mapping[str, Any]) -> None:
-        """Write a shot that could not be read."""
-        self.writer.write(self._numbers[name], {}, report, FAILED)
-        self.end(self._numbers[name])
-
-    def end(self, index: int) -> None:
-        """Note the status of a shot that was written, and gather its columns."""
-        arrays = self.writer.arrays()
-        self._statuses[index] = int(arrays["status"][index])
-        report = dict(json.loads(str(arrays["report"][index]) or "{}"))
-        self.writer.write_columns(self._columns, [report], slice(index, index + 1))
-
-    def close(self) -> None:
-        """Give the arrays their final length, which programs may read that ignore the folder's."""
-        with _as_store_errors(self.path):
-            for array in self.writer.arrays().values():
-                if is_along_shots(array) and array.shape[0] != len(self):
-                    array.resize((len(self), *array.shape[1:]))

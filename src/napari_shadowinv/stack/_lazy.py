@@ -11,7 +11,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.validation import check_instance
 from napari_shadowinv._typing import AnyArray
@@ -29,7 +28,7 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
 )
 from napari_shadowinv.stack._shots import ArrayExposure, Exposure, Reader, read_shot
-from napari_shadowinv.stack._worker import AnyTask, Beam
+from napari_shadowinv.stack._worker import AnyTask
 
 if TYPE_CHECKING:
     import xarray
@@ -112,9 +111,6 @@ def invert_stack(
     shots: Any,
     recipe: Recipe | None = None,
     *,
-    source: Any = None,
-    mask: ArrayLike | None = None,
-    source_mask: ArrayLike | None = None,
     reader: Reader = read_shot,
     variables: Collection[str] | None = None,
 ) -> xarray.Dataset:
@@ -124,22 +120,17 @@ def invert_stack(
 
     Parameters
     ----------
-    shots : array (shot, y, x), xarray.DataArray or Dataset, str, Path or sequence of paths
+    shots : array (shot, y, x), xarray.DataArray or Dataset, path or paths, or Shot
         A dask or numpy array; an xarray object with one such variable; paths of one image each;
         a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; a TIFF with a page for
         each shot; or a table (CSV) with a row for each shot, which may have its own energy, setup,
-        brightness, mask and source. Files are read by the tasks that invert them.
+        brightness, mask and source. Files are read by the tasks that invert them. A `Shot` with
+        one of these as its image has the setup, the mask and the source mask of all shots, and
+        their source: one for all, or as many as shots.
     recipe : Recipe, optional
-        Steps of each shot and of a measured source, setup and options. Without `threads` in the
+        Steps of each shot and of a measured source, setup and options. Without a source,
+        intensities in the result are relative to each shot's mean. Without `threads` in the
         options, shots that are inverted simultaneously share the cores.
-    source : array (y, x), path, Estimate, or as `shots`, optional
-        The undisturbed beam, one for all shots or one for each, or an estimate of
-        `napari_shadowinv.preprocessing` from each shot. Default: uniform, with intensities in the
-        result relative to each shot's mean.
-    mask : array_like of bool, shape (H, W), optional
-        The pixels that can be used in all shots; see `napari_shadowinv.invert`.
-    source_mask : array_like of bool, shape (H, W), optional
-        Pixels without the object; an estimate of the source uses only these.
     variables : collection of str, optional
         Variables to compute. Default: all.
     reader : callable, optional
@@ -152,9 +143,9 @@ def invert_stack(
         The variables of `Inversion.to_dataset` with a first dimension ``shot``, each shot a
         chunk, and ``converged``, ``flux_residual``, ``image_residual``, ``noise_error``,
         ``discretisation_error`` and ``iterations``. Nothing is computed yet. Sites are omitted
-        where shots may differ in their number: without `InversionOptions.n_sites`, with masks of
-        their own, or with sources of their own and a free boundary. For a table, ``setup``
-        contains the setup of each shot as JSON.
+        where shots may differ in their number: without `InversionOptions.n_sites`, with a free
+        boundary, or with masks of their own. For a table, ``setup`` contains the setup of each
+        shot as JSON.
 
     Raises
     ------
@@ -181,22 +172,16 @@ def invert_stack(
             "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "
             "leave the section out"
         )
-    stack = describe_stack(shots, recipe, source, mask, source_mask, reader, variables)
+    stack = describe_stack(shots, recipe, reader, variables)
     return _lazy_dataset(stack)
 
 
-def _invert(
-    label: str,
-    shot: Exposure,
-    block: AnyArray | None,
-    beam: Beam | None,
-    task: AnyTask,
-) -> dict[str, Any]:
+def _invert(label: str, shot: Exposure, block: AnyArray | None, task: AnyTask) -> dict[str, Any]:
     """Invert one shot, and return its variables."""
     try:
         images, _ = (shot if block is None else ArrayExposure("", block)).load()
         source = None if shot.source is None else shot.source.read()[0]
-        inversion = task.run(images, beam, source)
+        inversion = task.run(images, source)
     except InputError as error:
         raise error.about(label) from error
     return {**task.arrays(inversion), **column_values(INVERSIONS, inversion)}
@@ -206,7 +191,7 @@ def _pick(record: dict[str, Any], name: str) -> AnyArray:
     return np.asarray(record[name])[np.newaxis]
 
 
-def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
+def _lazy_records(stack: Stack) -> tuple[Any, str]:
     """Return an array of each shot's variables as a dictionary, a task for each, and its token."""
     from dask.base import tokenize
     from dask.delayed import delayed
@@ -217,26 +202,24 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
     token = tokenize(
         shots.items,
         [shot.source for shot in shots.items],
-        None if stack.beam is None else stack.beam.key,
         stack.source_text(None),
         stack.task.inputs.shot.mask,
         stack.task.inputs.shot.source_mask,
-        stack.task.recipe.model_dump_json(),
+        stack.task.requested.model_dump_json(),
         stack.task.variables,
     )
     name = f"invert-shot-{token}"
     task = delayed(stack.task, name=f"task-{token}", traverse=False)
     lazy = [item for item in shots.items if isinstance(item, ArrayExposure) and item.is_lazy]
     arrays = {item.array.name: item.array for item in lazy}
-    dependencies = [*arrays.values(), task, *([] if beam is None else [beam])]
+    dependencies = [*arrays.values(), task]
     tasks: dict[Any, Any] = {}
     for index, item in enumerate(shots.items):
         shot, block = item, None
         if isinstance(item, ArrayExposure) and item.is_lazy:
             block = (item.array.name, item.index, 0, 0)
             shot = Exposure(item.name, source=item.source)
-        inputs = (shots.label(index), shot, block, None if beam is None else beam.key)
-        tasks[name, index] = (_invert, *inputs, task.key)
+        tasks[name, index] = (_invert, shots.label(index), shot, block, task.key)
     graph = HighLevelGraph.from_collections(name, tasks, dependencies=dependencies)
     return da.Array(graph, name, ((1,) * len(shots),), dtype=object), token
 
@@ -244,14 +227,9 @@ def _lazy_records(stack: Stack, beam: Any) -> tuple[Any, str]:
 def _lazy_dataset(stack: Stack) -> xarray.Dataset:
     """Return the dataset of a stack, with a task for each variable of each shot."""
     import xarray as xr
-    from dask.delayed import delayed
 
     da: Any = import_module("dask.array")
-    beam: Any = None
-    if stack.beam is not None:
-        # One node, so that a worker gets the source once and not with each shot.
-        beam = delayed(stack.beam, name=f"beam-{stack.beam.key}", traverse=False)
-    records, token = _lazy_records(stack, beam)
+    records, token = _lazy_records(stack)
 
     def of_each_shot(name: str, dims: tuple[str, ...], dtype: Any) -> Any:
         return records.map_blocks(

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import (
     check_mask,
@@ -22,9 +21,9 @@ from napari_shadowinv._system.arrays import (
     unpack_mask,
 )
 from napari_shadowinv._system.safety import check_memory
+from napari_shadowinv._system.validation import map_paths
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion import count_sites
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, split_address, text_of
@@ -34,11 +33,10 @@ from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
-from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, UniformEstimate
+from napari_shadowinv.preprocessing import MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.provenance import Origin, index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
-    ArrayExposure,
     Exposure,
     Reader,
     RowsExposure,
@@ -53,7 +51,6 @@ from napari_shadowinv.stack._shots import (
 )
 from napari_shadowinv.stack._worker import (
     AnyTask,
-    Beam,
     FitTask,
     InvertTask,
 )
@@ -65,15 +62,10 @@ FITTED = ("potential", "displacement", "displacement_uncertainty")
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Plan of a stack: its shots, the task of each, and everything that they share.
-
-    The beam of a table belongs to rows without source and mask, and is None if any has one.
-    """
+    """Plan of a stack: its shots, and the task of each with everything that they share."""
 
     shots: Shots
     task: AnyTask
-    beam: Beam | None  # to invert, after all steps; None if shots have their own
-    common: AnyArray | None = None  # measured source of rows to invert without one, as recorded
     reader: str = ""  # name of the reader of the files
     dtype: str = "float64"  # of fields in a store
 
@@ -83,36 +75,28 @@ class Stack:
         sizes = {"shot": len(self.shots), "y": height, "x": width, "component": 2}
         for dims, *_ in self.task.masks.values():
             sizes |= zip(dims[-2:], self.task.inputs.shot.shape, strict=True)
-        if isinstance(self.task, FitTask) or self.task.recipe.options.is_adaptive:
-            return sizes
-        # Sites of shots with their own beams are stored only if they do not depend on the beam.
-        beam = self.beam or Beam(self.task.shape, None, self.task.moved.mask)
-        return {**sizes, "site": count_sites(beam.image, self.task.recipe.options, mask=beam.mask)}
+        options = self.task.recipe.options
+        return sizes if options.n_sites is None else {**sizes, "site": options.n_sites}
 
     @property
     def setups(self) -> list[str] | None:
         """The setup of each shot after the steps, as JSON; None unless they have their own."""
         if not self.task.by_row or self.task.setup is None:
             return None
-        bare = replace(self.task.inputs.shot, mask=None, source_mask=None)
+        bare = Shot(self.task.inputs.shot.image)
         recorded = (replace(bare, setup=_row_of(shot).setup) for shot in self.shots.items)
         moved = (self.task.recipe.move(shot).setup for shot in recorded)
         return ["" if setup is None else setup.model_dump_json() for setup in moved]
 
     def source_text(self, shots: int | None) -> str:
         """Describe the source of the first shots."""
-        estimate = self.task.recipe.estimate
-        if isinstance(self.task, InvertTask) and self.task.by_row:
-            if self.common is not None:
-                return f"sha256 {checksum(self.common)}"
-            if self.task.estimate is None:
-                return "uniform"
         sources = [shot.source.name for shot in self.shots.items[:shots] if shot.source is not None]
+        estimate, source = self.task.requested.estimate, self.task.inputs.shot.source
         if sources:
             return f"one for each shot: {', '.join(sources)}"
-        if self.beam is not None and self.beam.source is not None:
-            return f"sha256 {checksum(self.beam.source)}"
-        if self.beam is None and estimate is not None:
+        if source is not None:
+            return f"sha256 {checksum(source)}"
+        if estimate not in (None, UniformEstimate()):
             return f"estimated from each shot: {estimate.model_dump_json()}"
         return "uniform"
 
@@ -124,9 +108,9 @@ class Stack:
         if not shot.unchanged(origin):
             return label
         # A common source is compared once, as a part of the store's identity.
-        if shot.source is None or self.common is not None:
+        if shot.source is None or shot.source.unchanged(origin["source"]):
             return ""
-        return "" if shot.source.unchanged(origin["source"]) else f"the source of {label}"
+        return f"the source of {label}"
 
 
 def _row_of(shot: Exposure) -> RowsExposure:
@@ -135,83 +119,58 @@ def _row_of(shot: Exposure) -> RowsExposure:
 
 
 def describe_stack(
-    shots: Any,
-    recipe: Recipe | None,
-    source: Any,
-    mask: ArrayLike | None,
-    source_mask: ArrayLike | None,
-    reader: Reader,
-    variables: Collection[str] | None,
+    shots: Any, recipe: Recipe | None, reader: Reader, variables: Collection[str] | None
 ) -> Stack:
     """Describe a stack, and check everything that can be checked before a shot is read."""
-    resolved = Recipe() if recipe is None else recipe
-    if isinstance(source, Estimate):
-        resolved = resolved.model_copy(update={"source": source})
-        source = None
-    stack_shots, inputs, sources = _describe_inputs(
-        shots, resolved, source, mask, source_mask, reader
-    )
-    shot_sources = sources if isinstance(sources, Shots) else None
-    if shot_sources is not None and isinstance(shots, Shots):
+    common = shots if isinstance(shots, Shot) else Shot(shots)
+    of_one = ("dark", "strength", "brightness", "psf", "noise", "fiducials", "start")
+    if given := [name for name in of_one if getattr(common, name) is not None]:
         raise InputError(
-            f"got {len(shot_sources)} sources, and the shots are still to arrive: expected one for "
-            "all"
+            f"the shot of a stack has {', '.join(given)}, expected its source, masks and setup: "
+            "describe the shots in a table"
         )
-    if shot_sources is not None and len(shot_sources) != len(stack_shots):
-        raise InputError(
-            f"got {len(shot_sources)} sources for {len(stack_shots)} shots: expected one, or one "
-            "for each shot"
-        )
-    image = None if sources is None or shot_sources is not None else np.asarray(sources, np.float64)
-    task: AnyTask
-    if resolved.fit is not None:
-        task, beam = _plan_fit(inputs, shot_sources, image, resolved, variables)
-    else:
-        task, beam = _plan_inversion(stack_shots, inputs, image, resolved, variables)
-    common = image if task.by_row else None
-    own_sources = None if shot_sources is None else shot_sources.items
-    if common is not None and beam is None:
-        own_sources = [ArrayExposure("", common[np.newaxis])] * len(stack_shots)
-    if own_sources is not None:
-        items = [
-            # A row may name its own.
-            shot if task.by_row and shot.rows[0].source else replace(shot, source=source_shot)
-            for shot, source_shot in zip(stack_shots.items, own_sources, strict=True)
-        ]
+    resolved = map_paths(recipe or Recipe(), Path.absolute)  # for workers elsewhere
+    if common.setup is not None:
+        resolved = resolved.model_copy(update={"setup": common.setup})
+    stack_shots, inputs, sources = _describe_inputs(common, resolved, reader)
+    if sources is not None:
+        if isinstance(common.image, Shots):
+            raise InputError(
+                f"got {len(sources)} sources, and the shots are still to arrive: expected one for "
+                "all"
+            )
+        if len(sources) != len(stack_shots):
+            raise InputError(
+                f"got {len(sources)} sources for {len(stack_shots)} shots: expected one, or one "
+                "for each shot"
+            )
+        pairs = zip(stack_shots.items, sources.items, strict=True)
+        items = [replace(shot, source=own) for shot, own in pairs]
         stack_shots = replace(stack_shots, items=items)
-    return Stack(stack_shots, task, beam, common, reader_text(reader))
+    plan = _plan_inversion if resolved.fit is None else _plan_fit
+    task = plan(stack_shots, inputs, resolved, variables)
+    return Stack(stack_shots, task, reader_text(reader))
 
 
 def _plan_inversion(
-    shots: Shots,
-    inputs: Inputs,
-    source: AnyArray | None,
-    recipe: Recipe,
-    variables: Collection[str] | None,
-) -> tuple[InvertTask, Beam | None]:
-    """Return the task of an inversion, and the beam that all shots share."""
+    shots: Shots, inputs: Inputs, recipe: Recipe, variables: Collection[str] | None
+) -> InvertTask:
+    if inputs.shot.source is not None:
+        ready = inputs.recipe.prepare(replace(inputs.shot, image=inputs.shot.source))
+        assert ready.source is not None
+        check_source(ready.source, ready.mask)
     rows = [row for shot in shots.items for row in shot.rows]
     own_masks = any(row.mask is not None for row in rows)
-    per_shot = own_masks or any(row.source is not None for row in rows)
-    beam = None if per_shot else _shared_beam(inputs, source)
-    options = inputs.recipe.options
-    ragged = own_masks or options.is_adaptive or (beam is None and options.boundary == "free")
-    chosen = _checked_variables(variables, inputs.recipe, ragged=ragged)
+    chosen = _checked_variables(variables, inputs.recipe, own_masks=own_masks)
     if rows:  # the common masks are among those of each shot
         unmasked = index_masks(inputs.provenance.images, [(None, None)])
         inputs = replace(inputs, provenance=inputs.provenance.model_copy(update=unmasked))
-    task = InvertTask(inputs=inputs, variables=chosen, by_row=bool(rows), estimate=recipe.estimate)
-    return task, beam
+    return InvertTask(inputs=inputs, variables=chosen, requested=recipe, by_row=bool(rows))
 
 
 def _plan_fit(
-    inputs: Inputs,
-    sources: Shots | None,
-    source: AnyArray | None,
-    recipe: Recipe,
-    variables: Collection[str] | None,
-) -> tuple[FitTask, Beam | None]:
-    """Return the task of a fit, and the beam as recorded, because a fit applies the steps."""
+    shots: Shots, inputs: Inputs, recipe: Recipe, variables: Collection[str] | None
+) -> FitTask:
     check_fit(recipe)
     task = FitTask(inputs=inputs, variables=(), requested=recipe)
     fields = task.choices.fields
@@ -220,9 +179,6 @@ def _plan_fit(
             f"the recipe fits the fields {', '.join(fields)}, and a store holds one: fit "
             "one field, or each shot alone with shadowinv fit"
         )
-    # An estimate or a list of sources gives each shot its own beam.
-    per_shot = sources is not None or inputs.recipe.estimate not in (None, UniformEstimate())
-    beam = None if per_shot else Beam(inputs.shot.shape, source, None)
     labels = task.labels
     if task.choices.options.samples < 2:
         labels.pop("displacement_uncertainty")
@@ -233,20 +189,16 @@ def _plan_fit(
                 f"{', '.join(labels)}"
             )
     defaults = tuple(name for name in FITTED if name in labels)
-    return replace(task, variables=tuple(variables or defaults)), beam
+    return replace(task, variables=tuple(variables or defaults))
 
 
 def _describe_inputs(
-    shots: Any,
-    recipe: Recipe,
-    source: Any,
-    mask: ArrayLike | None,
-    source_mask: ArrayLike | None,
-    reader: Reader,
-) -> tuple[Shots, Inputs, Any]:
-    """Return the shots, the recipe with its masks, and the common source or one for each."""
+    common: Shot, recipe: Recipe, reader: Reader
+) -> tuple[Shots, Inputs, Shots | None]:
+    """Return the shots, all that they share, and a source for each if they have their own."""
+    shots = common.image
     measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
-    source = measured.file if source is None else source
+    source = measured.file if common.source is None else common.source
     source_reader = _reader_of_source(source, measured, reader)
     lit = None
     if getattr(source, "ndim", None) == 2:
@@ -258,7 +210,8 @@ def _describe_inputs(
         raise InputError(
             "the recipe asks for a measured source, but names no file: name one, or give a source"
         )
-    mask, source_mask = unpack_mask(mask), unpack_mask(source_mask, "source mask")
+    mask = unpack_mask(common.mask)
+    source_mask = unpack_mask(common.source_mask, "source mask")
     # With a source, no shot needs to be read for its shape.
     shape = (() if mask is None else np.shape(mask)) if sources is None else sources.shape
     image_shape = (shape[0], shape[1]) if len(shape) == 2 else None
@@ -300,7 +253,9 @@ def _describe_inputs(
             shape=stack_shots.shape,
         )
         inputs = replace(inputs, provenance=inputs.provenance.with_image(source=origin))
-    return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
+    if isinstance(sources, Shots):
+        return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
+    return stack_shots, inputs, None
 
 
 def _checked_beam(sources: Any, blank: AnyArray) -> AnyArray:
@@ -343,25 +298,13 @@ def _describe_table(
     return Shots(items, shape or usual_shape(items)), _row_of(items[0]).setup
 
 
-def _shared_beam(inputs: Inputs, source: AnyArray | None) -> Beam | None:
-    """Return the common source after all steps, and mask; None if each shot has its own source."""
-    moved = inputs.recipe.move(inputs.shot)
-    if isinstance(inputs.recipe.source, UniformEstimate):
-        return Beam(moved.shape, None, moved.mask)
-    if source is None:
-        return None
-    ready = inputs.recipe.prepare(replace(inputs.shot, image=source, source=source))
-    assert ready.source is not None
-    check_source(ready.source, ready.mask)
-    return Beam(ready.shape, ready.source, ready.mask)
-
-
 def _checked_variables(
-    names: Collection[str] | None, recipe: Recipe, *, ragged: bool
+    names: Collection[str] | None, recipe: Recipe, *, own_masks: bool
 ) -> tuple[str, ...]:
-    """Return the variables of a stack; shots may differ in their number of sites if `ragged`."""
-    labels = variable_labels(recipe.setup)
+    """Return the variables of a stack; shots may differ in their number of sites."""
+    labels, options = variable_labels(recipe.setup), recipe.options
     # The number depends on the masked area, or on the flux of the source in the margin.
+    ragged = own_masks or options.n_sites is None or options.boundary == "free"
     available = tuple(name for name, (dims, _) in labels.items() if not (ragged and "site" in dims))
     for name in names or ():
         if name in available:
@@ -369,8 +312,8 @@ def _checked_variables(
         hint = " (it needs a setup)" if recipe.setup is None else ""
         if name in labels:
             hint = (
-                " (shots differ in their number of sites, unless options.n_sites states it, the "
-                "shots have no masks of their own and, with a free boundary, share their source)"
+                " (shots may differ in their number of sites, unless options.n_sites states it, "
+                "the boundary is closed and no shot has its own mask)"
             )
         raise InputError(
             f"there is no variable {name!r}{hint}: expected one or more of {', '.join(available)}"

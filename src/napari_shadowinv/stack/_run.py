@@ -1,6 +1,7 @@
 """A run: every shot of a stack into one store, robust against errors and interruptions.
 
 - the run: `run_stack`; its status: `RunStatus`
+- a store that is filled, also by a watch: `StoreRun`
 - the content of a new store: `contents_of`
 - checks and order of a store to be continued: `resume`, `match_store`, `append_shots`
 """
@@ -9,15 +10,15 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from napari_shadowinv import __version__
 from napari_shadowinv._system.arrays import checksum
@@ -25,7 +26,7 @@ from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model, check_instance
-from napari_shadowinv._typing import BoolArray
+from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError, RunInterruptedError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
@@ -61,8 +62,8 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
 )
 from napari_shadowinv.stack._schedulers import Scheduler, is_local, scheduler_for
-from napari_shadowinv.stack._shots import Reader, differences, read_shot
-from napari_shadowinv.stack._worker import ShotOutcome, TaskContext
+from napari_shadowinv.stack._shots import Exposure, Reader, differences, read_shot
+from napari_shadowinv.stack._worker import AnyTask, ShotOutcome, TaskContext
 
 if TYPE_CHECKING:
     import xarray
@@ -154,9 +155,6 @@ def run_stack(
     out: str | Path,
     recipe: Recipe | None = None,
     *,
-    source: Any = None,
-    mask: ArrayLike | None = None,
-    source_mask: ArrayLike | None = None,
     reader: Reader = read_shot,
     run: RunOptions | None = None,
     scheduler: Any = None,
@@ -172,7 +170,7 @@ def run_stack(
 
     Parameters
     ----------
-    shots, recipe, source, mask, source_mask, reader
+    shots, recipe, reader
         As for `invert_stack`. To resume a store, they and earlier shots must be the same. In
         a table of shots to fit, rows with the same ``shot`` are images of one object.
     out : str or Path
@@ -209,37 +207,55 @@ def run_stack(
     path = check_store_path(out)
     run = as_model(RunOptions, run, "run")
     variables = stored_variables(run.variables, recipe)
-    stack = describe_stack(shots, recipe, source, mask, source_mask, reader, variables)
+    stack = describe_stack(shots, recipe, reader, variables)
     stack = replace(stack, dtype=run.dtype)
     again = (PENDING, SKIPPED, *([FAILED] if run.redo_failed else []))
-
     on_progress = on_progress or (lambda _: None)
-
-    def prepare(stage: str) -> None:
-        on_progress(RunStatus(total=len(stack.shots), stage=stage))
-
     if is_local(scheduler):
         # Once, instead of in all workers during their first shot.
-        ensure_compiled(lambda news: prepare(f"compiling, {news.message}"), should_stop)
+        ensure_compiled(
+            lambda news: on_progress(
+                RunStatus(total=len(stack.shots), stage=f"compiling, {news.message}")
+            ),
+            should_stop,
+        )
     with clear_up_when_terminated(), locked(path):
-        store = StackStore(path) if path.exists() and not run.overwrite else None
-        arrived = False
-        if store is not None:
-            stack = resume(store, stack)
+        filled = None
+        if path.exists() and not run.overwrite:
+            stack = resume(StackStore(path), stack)
             remove_unfinished(path)
-            store = reopen_damaged(store)
-            arrived = len(stack.shots) > len(store.names)
-            if not arrived and not np.isin(store.statuses(), again).any():
-                summarise(store)  # the last run may have been killed before it did
-                _Run(stack, store, (), on_progress, should_stop).report("nothing to do")
+            reopen_damaged(path)
+            filled = StoreRun(StackStore(path), again)
+            if len(stack.shots) == len(filled.names) and PENDING not in filled.statuses:
+                summarise(StackStore(path))  # the last run may have been killed before it did
+                on_progress(replace(filled.status, scheduler="nothing to do"))
                 return read_stack(path)
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
         with _resumable(), scheduler_for(scheduler, run.workers) as chosen:
-            if store is None:
-                store = create_store(path, contents_of(stack), overwrite=run.overwrite)
-            elif arrived:
-                store = append_shots(store, stack)
-            _Run(stack, store, again, on_progress, should_stop).run_on(chosen)
+            if filled is None:
+                new = create_store(path, contents_of(stack), overwrite=run.overwrite)
+                filled = StoreRun(new)
+            else:
+                filled.append_from(stack)
+
+            def report(outcome: ShotOutcome | None = None, _: Any = None) -> None:
+                name = "" if outcome is None else stack.shots.items[outcome.index].name
+                status = replace(filled.status, scheduler=chosen.name, name=name, outcome=outcome)
+                on_progress(status)
+
+            report()
+            pending = {
+                index: shot
+                for index, shot in enumerate(stack.shots.items)
+                if filled.statuses[index] == PENDING
+            }
+            try:
+                filled.run(pending, stack.task, chosen, report, should_stop)
+            except BaseException:
+                with suppress(OSError):
+                    summarise(StackStore(path))
+                raise
+            summarise(StackStore(path))
     return read_stack(path)
 
 
@@ -262,72 +278,126 @@ def stored_variables(
     return STORED if variables is None and not is_fit else variables
 
 
-class _Run:
-    """A run: gives shots to a scheduler, and counts their outcomes."""
+class StoreRun:
+    """A store that is filled: the status of each shot, and what is reported of them.
 
-    def __init__(
+    Shots with a status of `again` are pending.
+    """
+
+    def __init__(self, store: StackStore, again: Collection[int] = ()) -> None:
+        self.names = list(store.names)
+        self.numbers = {name: index for index, name in enumerate(self.names)}
+        self._columns = store.columns
+        self._path, self._store_id = store.path, store.attributes.get("store_id", "")
+        self._failures: dict[int, str] = {}
+        self._doubtful: set[int] = set()
+        self._ended = 0
+        self._seconds = 0.0
+        self.refresh(store, again)
+
+    def refresh(self, store: StackStore, again: Collection[int] = ()) -> None:
+        """Note the status of each shot in the store."""
+        self.statuses = bytearray(len(self.names))
+        for index, (status, report) in enumerate(
+            zip(store.statuses(), store.reports(), strict=True)
+        ):
+            new, doubts = PENDING if status in again else status, len(report.get("warnings", ()))
+            self._note(index, new, report.get("reason", "unknown"), doubts)
+
+    @property
+    def writer(self) -> ShotWriter:
+        """The writer of a shot into the store as it is now."""
+        return ShotWriter(self._path, self._store_id, len(self.names))
+
+    @property
+    def status(self) -> RunStatus:
+        """The numbers of shots."""
+        return RunStatus(
+            total=len(self.statuses),
+            done=self.statuses.count(DONE),
+            failed=len(self._failures),
+            doubtful=len(self._doubtful),
+            skipped=self.statuses.count(SKIPPED),
+            waiting=self.statuses.count(PENDING),
+            ended=self._ended,
+            seconds=self._seconds,
+            failures=tuple((self.names[index], why) for index, why in self._failures.items()),
+        )
+
+    def _note(self, index: int, status: int, reason: str = "", doubts: int = 0) -> None:
+        """Note the status of a shot in place of its earlier one."""
+        self.statuses[index] = status
+        self._failures.pop(index, None)
+        self._doubtful.discard(index)
+        if status == FAILED:
+            self._failures[index] = reason
+        elif status == DONE and doubts:
+            self._doubtful.add(index)
+
+    def report(self, index: int) -> dict[str, Any]:
+        """Return the report of a shot that has ended."""
+        return dict(json.loads(str(self.writer.arrays()["report"][index]) or "{}"))
+
+    def status_of(self, name: str) -> int | None:
+        """Return the status of a shot by its name; None if it is not there."""
+        return self.statuses[self.numbers[name]] if name in self.numbers else None
+
+    def names_of(self, status: int) -> Iterator[str]:
+        """Return the names of the shots of a status."""
+        return (
+            name for name, each in zip(self.names, self.statuses, strict=True) if each == status
+        )
+
+    def append(self, names: Sequence[str], numbers: AnyArray, **attributes: str) -> None:
+        """Append pending shots; `numbers` are their values of the coordinate ``shot``."""
+        if not names:
+            return
+        values = {"shot": numbers, "name": np.array(names, dtype=object)}
+        grow_store(self._path, values, attributes)
+        self.numbers |= {name: index for index, name in enumerate(names, len(self.names))}
+        self.names += names
+        self.statuses.extend([PENDING] * len(names))
+
+    def append_from(self, stack: Stack) -> None:
+        """Append the shots of a stack that arrived since the last run."""
+        count, numbers = len(self.names), np.asarray(_coordinates(stack)["shot"].values)
+        text = stack.source_text(None)
+        self.append(stack.shots.names[count:], numbers[count:], source_image=text)
+
+    def write(self, index: int, status: int) -> None:
+        """Mark a shot as pending or skipped, and forget its report and fields."""
+        self.writer.reopen(index, status)
+        self._note(index, status)
+
+    def summarise(self, index: int) -> None:
+        """Gather the columns of one shot from its report."""
+        self.writer.write_columns(self._columns, [self.report(index)], slice(index, index + 1))
+
+    def run(
         self,
-        stack: Stack,
-        store: StackStore,
-        again: tuple[int, ...],
-        on_progress: OnStatus,
-        should_stop: ShouldStop | None,
+        shots: Mapping[int, Exposure],
+        task: AnyTask,
+        scheduler: Scheduler,
+        on_end: Callable[[ShotOutcome, Any], None],
+        should_stop: ShouldStop | None = None,
+        *,
+        keeps_results: bool = False,
+        portion: int = 1000,
     ) -> None:
-        self._stack = stack
-        self._store = store
-        self._on_progress, self._should_stop = on_progress, should_stop
-        statuses, reports = store.statuses(), store.reports()
-        self._todo = [int(index) for index in np.flatnonzero(np.isin(statuses, again))]
-        self._failures = [
-            (store.names[index], str(reports[int(index)].get("reason", "unknown")))
-            for index in np.flatnonzero(statuses == FAILED)
-            if FAILED not in again
-        ]
-        self._status = RunStatus(
-            total=len(statuses),
-            done=int((statuses == DONE).sum()),
-            doubtful=sum(
-                status == DONE and bool(report.get("warnings"))
-                for status, report in zip(statuses, reports, strict=True)
-            ),
-        )
-        self._began = time.monotonic()
-
-    def report(self, scheduler: str, outcome: ShotOutcome | None = None) -> None:
-        status, name = self._status, ""
-        if outcome is not None:
-            name = self._stack.shots.items[outcome.index].name
-            self._failures += [(name, outcome.reason)] if outcome.reason else []
-            status = self._status = replace(
-                status,
-                done=status.done + (outcome.status == DONE),
-                doubtful=status.doubtful + (outcome.warnings > 0),
-                ended=status.ended + 1,
-            )
-        failed, seconds = len(self._failures), time.monotonic() - self._began
-        waiting, failures = status.total - status.done - failed, tuple(self._failures)
-        status = replace(status, failed=failed, waiting=waiting, failures=failures)
-        self._on_progress(
-            replace(status, seconds=seconds, scheduler=scheduler, name=name, outcome=outcome)
-        )
-
-    def run_on(self, scheduler: Scheduler, portion: int = 1000) -> None:
-        """Run all pending shots, a portion at a time, and summarise their reports."""
-        stack, items = self._stack, self._stack.shots.items
-        context = TaskContext(ShotWriter.of(self._store), stack.task, scheduler.workers)
-        self.report(scheduler.name)
-        try:
-            for first in range(0, len(self._todo), portion):
-                shots = {index: items[index] for index in self._todo[first : first + portion]}
-                outcomes = scheduler.outcomes(shots, stack.beam, context, self._should_stop)
-                with closing(outcomes):  # at once, if a report raises an error
-                    for outcome in outcomes:
-                        self.report(scheduler.name, outcome)
-        except BaseException:
-            with suppress(OSError):
-                summarise(self._store)
-            raise
-        summarise(self._store)
+        """Run shots by their numbers; `on_end` takes each outcome, and its result if asked for."""
+        results: dict[int, Any] | None = {} if keeps_results else None
+        workers = scheduler.workers and max(1, min(len(shots), scheduler.workers))
+        context = TaskContext(self.writer, task, workers, results)
+        began = time.monotonic() - self._seconds
+        for first in range(0, len(shots), portion):
+            some = dict(islice(shots.items(), first, first + portion))
+            # Closed at once, if a report raises an error.
+            with closing(scheduler.outcomes(some, context, should_stop)) as outcomes:
+                for outcome in outcomes:
+                    self._ended += 1
+                    self._seconds = time.monotonic() - began
+                    self._note(outcome.index, outcome.status, outcome.reason, outcome.warnings)
+                    on_end(outcome, None if results is None else results.pop(outcome.index))
 
 
 def contents_of(stack: Stack) -> Contents:
@@ -369,22 +439,26 @@ def _variables(stack: Stack) -> dict[str, StoreArray]:
 
 def _identity(stack: Stack, shots: int | None = None) -> dict[str, str]:
     """Return the attributes that must agree for a store with `shots` shots to be continued."""
-    height, width = stack.task.shape
-    shot = stack.task.inputs.shot
-    steps = [step.model_dump(mode="json") for step in stack.task.recipe.steps]
-    setup = "" if stack.task.setup is None else stack.task.setup.model_dump_json()
-    setups = {OWN_SETUPS: "", "setup": setup}
-    if stack.task.by_row:
-        setups = {OWN_SETUPS: "a row for each shot"}
+    task, recipe, common = stack.task, stack.task.requested, stack.task.inputs.shot
+    height, width = task.shape
+    steps = [step.model_dump(mode="json") for step in task.recipe.steps]
+    setup = "" if task.setup is None else task.setup.model_dump_json()
+    fit, options = recipe.fit, recipe.options if recipe.fit is None else recipe.fit.options
+    instrument = recipe.instrument.stated
+    setups = (
+        {OWN_SETUPS: "a row for each shot"} if task.by_row else {OWN_SETUPS: "", "setup": setup}
+    )
     return {
-        **stack.task.identity,
         **setups,
+        "fit": "" if fit is None else fit.model_dump_json(exclude={"options"}, exclude_none=True),
+        "options": options.model_dump_json(exclude={"threads"}),
+        "instrument": json.dumps(instrument) if instrument else "",
         "source_image": stack.source_text(shots),
-        "mask_image": _mask_text(shot.mask) or "none",
+        "mask_image": _mask_text(common.mask) or "none",
         "steps": json.dumps(steps) if steps else "",
-        "source_mask_image": _mask_text(shot.source_mask),
+        "source_mask_image": _mask_text(common.source_mask),
         "image_size": f"{width} × {height} px",
-        "stored": f"{', '.join(stack.task.variables)} as {stack.dtype}",
+        "stored": f"{', '.join(task.variables)} as {stack.dtype}",
         "reader": stack.reader,
     }
 
@@ -408,21 +482,18 @@ def resume(store: StackStore, stack: Stack) -> Stack:
     return stack
 
 
-def reopen_damaged(store: StackStore) -> StackStore:
-    """Read the files of a store, mark damaged shots as pending, and return it as it is now.
+def reopen_damaged(path: Path) -> None:
+    """Read the files of a store, and mark damaged shots as pending.
 
     A `FileFormatError` if there is damage that cannot be repaired from the shots.
     """
-    damage = StackStore(store.path, every_byte=True).damage
+    store = StackStore(path, every_byte=True)
+    damage = store.damage
     for index in damage.shots:
         ShotWriter.of(store).reopen(index)
-    if not (damage.shots or damage.files):
-        return store
-    store = StackStore(store.path)
     if damage.files:
-        summarise(store)
-        check_files(store := StackStore(store.path, every_byte=True))
-    return store
+        summarise(StackStore(path))
+        check_files(StackStore(path, every_byte=True))
 
 
 def match_store(store: StackStore, stack: Stack) -> None:
@@ -461,12 +532,3 @@ def _difference(before: str, now: str) -> str:
         return differences(json.loads(before or "{}"), json.loads(now or "{}"), "default")
     except (ValueError, AttributeError, TypeError):
         return f"{shorten(before or 'none', 80)} there, {shorten(now or 'none', 80)} now"
-
-
-def append_shots(store: StackStore, stack: Stack) -> StackStore:
-    """Append shots that arrived since the last run, as pending, to the store."""
-    count, coordinates = len(store.names), _coordinates(stack).items()
-    along_shots = {name: variable for name, variable in coordinates if variable.along_shots}
-    values = {name: np.asarray(variable.values)[count:] for name, variable in along_shots.items()}
-    grow_store(store.path, values, {"source_image": stack.source_text(None)})
-    return StackStore(store.path)

@@ -33,7 +33,6 @@ from napari_shadowinv.errors import (
 )
 from napari_shadowinv.stack._shots import ArrayExposure, Exposure, failure_text
 from napari_shadowinv.stack._worker import (
-    Beam,
     ShotOutcome,
     TaskContext,
     run_shot,
@@ -63,7 +62,6 @@ class Scheduler:
     def outcomes(
         self,
         shots: Mapping[int, Exposure],
-        beam: Beam | None,
         context: TaskContext,
         should_stop: ShouldStop | None,
     ) -> Generator[ShotOutcome, None, None]:
@@ -80,7 +78,7 @@ class Scheduler:
         ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         # Tasks elsewhere cannot ask here.
         ways = {"threads": is_stopped, "synchronous": is_stopped, "processes": _is_worker_stopped}
-        tasks = _tasks(shots, beam, context, ways.get(self._get))
+        tasks = _tasks(shots, context, ways.get(self._get))
         dask: Any = import_module("dask")
         pending = set(shots)
         with ThreadPoolExecutor(1, "dask", _block_interrupts) as caller:
@@ -126,7 +124,6 @@ class _Cluster(Scheduler):
     def outcomes(
         self,
         shots: Mapping[int, Exposure],
-        beam: Beam | None,
         context: TaskContext,
         should_stop: ShouldStop | None,
     ) -> Generator[ShotOutcome, None, None]:
@@ -134,7 +131,7 @@ class _Cluster(Scheduler):
         with self._as_interruption(), warnings.catch_warnings():
             # What shots share has to be sent, however large it is.
             warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
-            tasks = _tasks(shots, beam, context, blocks=True)
+            tasks = _tasks(shots, context, blocks=True)
             running = dict(zip(self._client.compute(tasks), shots, strict=True))
         for future in running:
             future.add_done_callback(ended.put)
@@ -187,7 +184,6 @@ class _Cluster(Scheduler):
 
 def _tasks(
     shots: Mapping[int, Exposure],
-    beam: Beam | None,
     context: TaskContext,
     should_stop: ShouldStop | None = None,
     *,
@@ -198,11 +194,8 @@ def _tasks(
 
     # New in each run: dask would reuse the earlier values.
     name = f"{context.writer.store_id}-{time.time_ns()}"
-    # Each worker gets them once.
-    shared = [
-        delayed(value, name=f"{kind}-{name}", traverse=False)
-        for kind, value in (("beam", beam), ("context", context))
-    ]
+    # Each worker gets it once.
+    shared = delayed(context, name=f"context-{name}", traverse=False)
     tasks = []
     for index, shot in shots.items():
         block = []
@@ -212,7 +205,7 @@ def _tasks(
         key = f"{2 * 10**9 - index}-{name}"  # of ten digits each: dask begins with the last
         run = partial(run_shot, shot, index, should_stop)
         task = delayed(run, name=f"run-{key}", traverse=False)
-        tasks.append(task(*shared, *block, dask_key_name=f"shot-{key}"))
+        tasks.append(task(shared, *block, dask_key_name=f"shot-{key}"))
     return tasks
 
 

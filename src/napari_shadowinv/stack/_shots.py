@@ -54,9 +54,7 @@ _OF_FITS = ("strength", "psf", "noise")
 
 
 class NoShotError(FileFormatError):
-    """None of the shots can be read; `reason` says why the first cannot."""
-
-    reason = ""
+    """None of the shots can be read."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -456,9 +454,7 @@ def _read_first(
         if len(values) == count:
             break
     if not values:
-        refused = NoShotError(f"none of {len(items)} shots can be read, the first: {first_error}")
-        refused.reason = "" if first_error is None else failure_text(first_error)
-        raise refused
+        raise NoShotError(f"none of {len(items)} shots can be read, the first: {first_error}")
     return values
 
 

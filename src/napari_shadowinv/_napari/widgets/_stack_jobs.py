@@ -27,6 +27,7 @@ from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     from napari_shadowinv.stack import RunStatus
@@ -81,8 +82,8 @@ class StackJob(Job):
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
         beam = {"source": self.source, "mask": self.mask, "source_mask": self.source_mask}
-        callbacks = {"on_progress": update, "should_stop": should_stop}
-        self._start(self.shots, self.out, self.recipe, **beam, **callbacks)
+        shots = Shot(self.shots, **beam)
+        self._start(shots, self.out, self.recipe, on_progress=update, should_stop=should_stop)
         return self.status
 
     def _start(self, *args: Any, **keywords: Any) -> None:
