@@ -132,9 +132,14 @@ def _image_layers(
     for role, (planes, limits) in content.items():
         kind = _KINDS[role]
         data = planes[0] if len(planes) == 1 else planes
+        more = facts | {"main": role != "reprojection"}
+        if role == "image" and len(planes) == 1:
+            # With beam and mask, the image can be inverted again.
+            usable = None if fit.mask.all() else fit.mask[0]
+            more |= {"source": fit.source[0], "usable": usable}
         keywords = {
-            "name": layer_name(kind.title, name),
-            "metadata": metadata_for(role, kind.unit, setup, **facts, main=role != "reprojection"),
+            "name": layer_name(kind.title, name, fit.headline.level),
+            "metadata": metadata_for(role, kind.unit, setup, **more),
             "visible": False,
             **frame.keywords(stacked=data.ndim == 3, stack_axis="image"),
             "colormap": colour_map(kind.colormap),

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
-from napari_shadowinv._napari.layer_metadata import metadata_for
+from napari_shadowinv import FitOptions, fit, read, write
+from napari_shadowinv._napari.layer_metadata import metadata_for, role_of
+from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.result_files import layers_of_dataset
+from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
+from napari_shadowinv.shot import shots_of
 
 SHAPE = (64, 72)
 NOISE = np.random.default_rng(4).normal(1, 0.01, (3, *SHAPE))
@@ -116,3 +121,31 @@ def test_a_stack_is_taken_with_its_beam(viewer: ViewerModel, opened: Any) -> Non
     tool = opened(InvertStack)
     assert tool.shots.layer.name == "run"
     assert tool.source.layer.name == "reference"
+
+
+@pytest.mark.parametrize(("images", "kind"), [(1, InvertShot), (2, FitImages)])
+def test_a_fit_from_a_file_has_its_beam(
+    viewer: ViewerModel, opened: Any, tmp_path: Any, images: int, kind: Any
+) -> None:
+    options = FitOptions(max_iterations=2, samples=0)
+    strength = [1.0, 0.5][:images]
+    recorded = [OBJECT * BEAM * noise for noise in NOISE[:images]]
+    shots = shots_of(recorded, source=BEAM, noise=0.01, strength=strength)
+    found = fit(shots, options=options)
+    path = write(tmp_path / "fit.shadowinv", found.to_dataset())
+    add_layers(viewer, layers_of_dataset(read(path), "fit"))
+    tool = opened(kind)
+    source = tool.source
+    if images == 1:
+        assert source.is_supplied
+        np.testing.assert_array_equal(source.measured(image_of(viewer)).image, found.source[0])
+    else:
+        tool.images.stacks.layer = image_of(viewer)
+        assert role_of(source.layer) == "source"
+    marks = {layer.name[:2] for layer in viewer.layers if role_of(layer) in ("field", "residual")}
+    assert len(marks) == 1
+
+
+def image_of(viewer: ViewerModel) -> Any:
+    (image,) = [layer for layer in viewer.layers if role_of(layer) == "image"]
+    return image

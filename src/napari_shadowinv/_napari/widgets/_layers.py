@@ -332,9 +332,12 @@ _DARK_NAME = re.compile(r"(?<![a-z])darks?(?![a-z])")
 def likely_beam(image: Any, offered: Sequence[Any], *, estimates: bool = False) -> Any | None:
     """Return the only offered layer that may be an image's beam, by its size, name and structure.
 
-    Without a name, the beam is the smoother of two images, and much smoother if both are numbered
-    in one series.
+    An image of a result has the result's own. Without a name, the beam is the smoother of two
+    images, and much smoother if both are numbered in one series.
     """
+    if (result := about.result_of(image)) is not None:
+        own = [layer for layer in offered if about.result_of(layer) is result]
+        return next((layer for layer in own if about.role_of(layer) == about.SOURCE), None)
     fitting = [
         layer
         for layer in offered

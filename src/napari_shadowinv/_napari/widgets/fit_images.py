@@ -317,6 +317,7 @@ class FitImages(ToolPanel):
         """Show the setup of a new reference; without a setup it gets the last one."""
         row = self.images.reference
         old_setup = self.setup.complete_setup()
+        self.source.follow(None if row is None else row.layer)
         self.setup.follow(None if row is None else row.layer)
         if row is not None:
             self.masks.follow(row.layer)
