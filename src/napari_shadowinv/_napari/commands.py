@@ -209,8 +209,8 @@ def measure_products(
 def predict_image(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> None:
-    """Predict the image of the selected field or potential, in *Forward model*."""
-    _open_widget(viewer, "Forward model").start_from(without_proxy(layer))
+    """Predict the image of the selected field or potential, in *Simulate*."""
+    _open_widget(viewer, "Simulate").start_from(without_proxy(layer))
 
 
 @viewer_sync.notify_errors(otherwise=lambda: None)

@@ -12,9 +12,9 @@ from napari.components import ViewerModel
 
 from helpers.reports import texts_of
 from napari_shadowinv._napari.form import StepsSection
+from napari_shadowinv._napari.simulations import input_field
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets._products import ProductForm
-from napari_shadowinv._napari.widgets.forward_model import input_field
 from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image

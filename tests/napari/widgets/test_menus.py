@@ -14,8 +14,8 @@ from napari_shadowinv._napari.layer_metadata import role_of, setup_of, setup_ori
 from napari_shadowinv._napari.layers import add_layers, inversion_layers
 from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.run import Run
+from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets.analyse import Analyse
-from napari_shadowinv._napari.widgets.forward_model import ForwardModel
 from napari_shadowinv._napari.widgets.image_setup import ImageSetup
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv._system.machine import available_threads, set_default_threads
@@ -84,7 +84,7 @@ def test_an_image_is_predicted_from_the_selected_potential(
     potential, arrows = add_some(window, solved, "potential", "arrows")
     window.layers.selection.active = potential
     choose("predict_image")
-    forward = docked(window, ForwardModel)
+    forward = docked(window, Simulate)
     assert forward.object.kind == "layer"
     assert forward.potential.layer is potential
     window.layers.selection.active = arrows

@@ -134,9 +134,8 @@ def test_more_layers_adds_those_that_are_missing(tool: Any, window: Any, qtbot: 
 def test_forward_image_is_saved_with_its_pixels(
     window: Any, open_widget: Any, qtbot: Any, tmp_path: Path, choose: Any
 ) -> None:
-    tool = open_widget("Forward model")
-    tool.height_px.setValue(40)
-    tool.width_px.setValue(50)
+    tool = open_widget("Simulate")
+    tool.side.setText("40 x 50")
     tool.panel.button.click()
     qtbot.waitUntil(
         lambda: tool.results is not None and bool(tool.results.layers), timeout=PATIENCE

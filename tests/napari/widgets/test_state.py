@@ -25,13 +25,12 @@ from napari_shadowinv._napari.layer_metadata import (
     source_of,
 )
 from napari_shadowinv._napari.layers import add_to_viewer
+from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.fit_images import FitImages
-from napari_shadowinv._napari.widgets.forward_model import ForwardModel
 from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
-from napari_shadowinv._napari.widgets.plan_experiment import PlanExperiment
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
@@ -276,7 +275,7 @@ def test_results_are_not_offered_as_shots(
     assert all(role_of(layer) in (None, "source") for layer in tool.source.layers.offered)
     tool.source.set_kind("layer")
     assert tool.source.layers.layer is None
-    offered = opened(ForwardModel).potential.offered
+    offered = opened(Simulate).potential.offered
     assert {role_of(layer) for layer in offered} == {None, "field"}
     assert not {role_of(layer) for layer in offered} & {"reprojection", "residual", "caustic"}
     field = next(layer for layer in viewer.layers if role_of(layer) == "field")
@@ -528,7 +527,7 @@ def test_what_the_core_refuses_stays_in_the_widget(
 def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     viewer: ViewerModel, opened: Any, solved: Inversion, proton_setup: ProtonSetup, qtbot: Any
 ) -> None:
-    tool = opened(ForwardModel)
+    tool = opened(Simulate)
     assert tool.setup.setup() == paper_setup()
     assert tool.setup.note.text() == "Example from the paper."
     typed(tool, 7.0)
@@ -539,10 +538,9 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     tool.object.set_kind("toroid")
     assert tool.setup.setup() == entered
     tool._keeper.write()
-    later = opened(ForwardModel)
+    later = opened(Simulate)
     assert later.setup.setup() == entered
-    tool.height_px.setValue(20)
-    tool.width_px.setValue(20)
+    tool.side.setText("20 x 20")
     tool.panel.button.click()
     qtbot.waitUntil(lambda: role_of(viewer.layers[-1]) == "shot", timeout=PATIENCE)
     prediction = viewer.layers[-1]
@@ -553,9 +551,7 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     assert opened(InvertShot).setup.setup() == entered
 
 
-@pytest.mark.parametrize(
-    "kind", [EstimateSource, FitImages, ForwardModel, InvertShot, InvertStack, PlanExperiment]
-)
+@pytest.mark.parametrize("kind", [EstimateSource, FitImages, InvertShot, InvertStack, Simulate])
 @pytest.mark.parametrize("value", [7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}])
 def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
     viewer: ViewerModel, opened: Any, kind: Any, value: Any, monkeypatch: pytest.MonkeyPatch

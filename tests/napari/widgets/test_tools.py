@@ -13,25 +13,10 @@ from matplotlib.text import Text
 from qtpy.QtWidgets import QFileDialog, QLabel
 
 from helpers.forms import enter
-from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.form import PROBLEM_STYLE, ModelPicker
-from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
-from napari_shadowinv._napari.layers import add_to_viewer
+from napari_shadowinv._napari.layer_metadata import metadata_for, role_of
 from napari_shadowinv._napari.widgets._qt import Plot
 from napari_shadowinv.analysis.paths import measure_peak
-from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.physics.beam import displacement_from_potential
-from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import (
-    coaxial_line,
-    four_toroids,
-    gaussian_blob,
-    paper_setup,
-    wakefield,
-    wakefield_setup,
-)
-from napari_shadowinv.physics.projection import predict_image
-from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.preprocessing import polynomial_source
 
 Array = np.ndarray[Any, Any]
@@ -42,9 +27,8 @@ NAMES = (
     "Fit several images",
     "Film pack",
     "Estimate source",
-    "Forward model",
+    "Simulate",
     "Analyse",
-    "Plan an experiment",
 )
 
 
@@ -129,199 +113,6 @@ def test_an_estimate_becomes_a_layer_after_its_preview(
     assert role_of(source) == "source"
     assert not preview.visible
     assert messages == []
-
-
-def test_an_object_makes_its_image_and_caustics_are_warned_of(
-    window: Any, open_widget: Any, qtbot: Any, messages: list[str], solved: Inversion,
-    proton_setup: ProtonSetup,
-) -> None:  # fmt: skip
-    tool = open_widget("Forward model")
-
-    def made() -> Any:
-        before = [layer.data for layer in window.layers]
-
-        def new() -> list[Any]:
-            return [
-                layer for layer in window.layers if not any(layer.data is old for old in before)
-            ]
-
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda: bool(new()), timeout=PATIENCE)
-        return new()[-1]
-
-    tool.object.set_kind("four_toroids")
-    tool.height_px.setValue(60)
-    tool.width_px.setValue(80)
-    strength = tool.object.form.entries["strength"]
-    enter(strength, 0.2)
-    expected = four_toroids((60, 80), paper_setup(), 0.2)
-    layer = made()
-    np.testing.assert_allclose(layer.data, synthetic_image(expected.displacement))
-    assert tuple(layer.scale) == pytest.approx((1.5, 1.5))
-    assert not tool.warning.isVisible()
-    enter(strength, 2.0)
-    made()
-    assert tool.warning.isVisible()
-    assert "Caustics" in tool.warning.text()
-
-    add_to_viewer(window, solved, proton_setup, name="solved", all_layers=True)
-    potential = next(
-        result_layer for result_layer in window.layers if role_of(result_layer) == "potential"
-    )
-    assert unit_of(potential) != "px²"
-    tool.object.set_kind("layer")
-    tool.potential.layer = potential
-    tool.setup.show_setup(proton_setup.model_dump())
-    again = made().data
-    inner = (slice(3, -3), slice(3, -3))
-    relative = solved.reprojection / solved.source.mean()
-    assert abs(again - relative)[inner].max() < 0.02 * relative.max()
-
-    # It knows its experiment.
-    tool.setup.picker.set_kind("none")
-    np.testing.assert_allclose(made().data, again)
-    assert messages == []
-    lost = window.add_image(potential.data, name="lost", metadata=metadata_for("potential", "µm"))
-    tool.potential.layer = lost
-    messages.clear()  # napari's own word on the units
-    tool.panel.button.click()
-    assert len(messages) == 1
-    assert "select the setup" in messages[0]
-    assert "select the setup" in tool.panel.status.text()
-
-
-def test_only_what_may_be_a_field_is_offered_and_it_says_what_it_is_taken_for(
-    window: Any, open_widget: Any, qtbot: Any, messages: list[str], solved: Inversion,
-    proton_setup: ProtonSetup, shot: Array,
-) -> None:  # fmt: skip
-    tool = open_widget("Forward model")
-    tool.object.set_kind("layer")
-    assert "open a .shadowinv file" in tool.interpretation.text()
-    tool.panel.button.click()
-    assert len(messages) == 1
-    assert "there is no potential or result" in messages[0].lower()
-    assert tool.panel.status.text() == messages[0]
-    messages.clear()
-
-    window.add_image(shot, name="counts")
-    window.add_image(shot, name="beam", metadata=metadata_for("source", "intensity"))
-    add_to_viewer(window, solved, proton_setup, name="solved", all_layers=True)
-    offered = [tool.potential.itemText(n) for n in range(tool.potential.count())]
-    assert len(offered) == 5  # potential, three of the field, and the image of unknown origin
-    assert "counts" in offered
-    assert "beam" not in offered
-    tool.potential.layer = window.layers["counts"]
-    assert "treated as a potential in px²" in tool.interpretation.text()
-    tool.object.set_kind("toroid")
-    tool.object.set_kind("layer")
-    assert role_of(tool.potential.layer) == "field"
-    assert tool.interpretation.text() == "The displacement of this result."
-    assert tool.setup.setup() == proton_setup
-
-
-def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
-    window: Any, open_widget: Any, qtbot: Any, messages: list[str], solved: Inversion,
-    proton_setup: ProtonSetup,
-) -> None:  # fmt: skip
-    add_to_viewer(window, solved, proton_setup, name="solved", all_layers=True)
-    tool = open_widget("Forward model")
-    choices = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
-    assert choices[1:] == list(deflector_titles().values())
-    tool.object.set_kind("layer")
-    slow = proton_setup.model_copy(update={"energy": 3.0})
-    tool.setup.show_setup(slow.model_dump())
-
-    def image() -> Any:
-        before = tool.results
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda: tool.results is not before, timeout=PATIENCE)
-        qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-        (layer,) = tool.results.layers
-        assert layer.name.startswith("solved image")
-        return layer.data
-
-    expected = predict_image(solved.displacement, proton_setup, slow)
-    np.testing.assert_allclose(image(), expected)
-    assert "only a magnetic field deflects the beam" in tool.warning.text()
-    tool.deflector.setCurrentText("electric field")
-    expected = predict_image(solved.displacement, proton_setup, slow, deflector="electric field")
-    np.testing.assert_allclose(image(), expected)
-    tool.setup.show_setup(proton_setup.model_dump())
-    np.testing.assert_allclose(image(), synthetic_image(solved.displacement))
-    # A potential in µm goes the same way.
-    potential = next(layer for layer in window.layers if role_of(layer) == "potential")
-    tool.potential.layer = potential
-    tool.deflector.setCurrentIndex(0)
-    tool.setup.show_setup(slow.model_dump())
-    expected = predict_image(displacement_from_potential(solved.potential), proton_setup, slow)
-    np.testing.assert_allclose(image(), expected, atol=1e-9)
-    assert messages == []
-
-
-def test_a_potential_from_a_file_and_the_shot_in_view_of_a_stack_make_their_images(
-    window: Any, open_widget: Any, qtbot: Any, messages: list[str], tmp_path: Path
-) -> None:
-    potentials = [gaussian_blob((40, 50), size, 6.0).potential for size in (10.0, 20.0)]
-    np.save(tmp_path / "phi.npy", potentials[0])
-    window.open(str(tmp_path / "phi.npy"), plugin="napari")
-    window.add_image(np.stack(potentials), name="run", metadata=metadata_for("potential", "px²"))
-    tool = open_widget("Forward model")
-    tool.setup.picker.set_kind("none")
-    tool.object.set_kind("layer")
-    for name, expected in (("phi", potentials[0]), ("run", potentials[1])):
-        window.dims.set_current_step(0, 1)
-        tool.potential.layer = window.layers[name]
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda name=name: f"{name} image" in window.layers, timeout=PATIENCE)
-        np.testing.assert_allclose(
-            window.layers[f"{name} image"].data,
-            synthetic_image(displacement_from_potential(expected)),
-        )
-    assert messages == []
-
-
-def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
-    window: Any, open_widget: Any, qtbot: Any, messages: list[str]
-) -> None:
-    tool = open_widget("Forward model")
-    tool.object.set_kind("coaxial")
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: len(window.layers) == 1, timeout=PATIENCE)
-    (layer,) = window.layers
-    phantom, obstructed = coaxial_line((200, 200), paper_setup())
-    dark = np.where(obstructed, 0.0, 1.0)
-    np.testing.assert_allclose(layer.data, synthetic_image(phantom.displacement, dark))
-    np.testing.assert_array_equal(source_of(layer), dark)
-    shot = open_widget("Invert shot")
-    np.testing.assert_array_equal(shot.source.measured(shot.image.layer).image, dark)
-    assert messages == []
-
-
-def test_an_object_brings_the_beam_that_it_needs(
-    window: Any, open_widget: Any, qtbot: Any, messages: list[str]
-) -> None:
-    tool = open_widget("Forward model")
-    tool.object.set_kind("wakefield")
-    assert tool.setup.setup() == wakefield_setup()
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: len(window.layers) == 1, timeout=PATIENCE)
-    wave = wakefield((200, 200), wakefield_setup())
-    np.testing.assert_allclose(window.layers[0].data, synthetic_image(wave.displacement))
-    enter(tool.object.form.entries["density"], "2e19 cm⁻³")
-    assert tool.object.model().density == pytest.approx(2e25)
-
-    # What somebody has typed is not replaced.
-    entered = wakefield_setup().model_copy(update={"wavelength": 532e-9})
-    tool.setup.show_setup(entered.model_dump())
-    tool.object.set_kind("toroid")
-    assert tool.setup.setup() == paper_setup()
-    tool.object.set_kind("wakefield")
-    assert tool.setup.setup() == entered
-    tool.setup.picker.set_kind("none")
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
-    assert len(messages) == 1
-    assert "select the setup 'light'" in messages[0]
 
 
 @pytest.fixture

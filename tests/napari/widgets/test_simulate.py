@@ -1,0 +1,416 @@
+"""*Simulate*: the image of an object, and the plan of an experiment with it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from napari.components import ViewerModel
+
+from helpers.forms import enter
+from helpers.jobs import run_job
+from helpers.reports import texts_of
+from napari_shadowinv import InputError, Instrument, ProtonSetup
+from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
+from napari_shadowinv._napari.layers import add_to_viewer
+from napari_shadowinv._napari.simulate import Simulate
+from napari_shadowinv._napari.simulations import ForwardJob, GridFile, InputField
+from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.io import read_field_grid
+from napari_shadowinv.physics.beam import displacement_from_potential
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantom_models import BlobRecipe, ToroidRecipe
+from napari_shadowinv.physics.phantoms import (
+    coaxial_line,
+    four_toroids,
+    gaussian_blob,
+    paper_setup,
+    wakefield,
+    wakefield_setup,
+)
+from napari_shadowinv.physics.projection import predict_image
+from napari_shadowinv.physics.setup import deflector_titles
+from napari_shadowinv.physics.trace_options import GridView
+from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
+from napari_shadowinv.pipeline.experiment_object import object_of_field
+
+Array = np.ndarray[Any, Any]
+PATIENCE = 60_000  # ms
+
+
+def test_an_object_makes_its_image_and_caustics_are_warned_of(
+    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str], solved: Inversion,
+    proton_setup: ProtonSetup,
+) -> None:  # fmt: skip
+    tool = opened(Simulate)
+
+    def made() -> Any:
+        before = [layer.data for layer in viewer.layers]
+
+        def new() -> list[Any]:
+            return [
+                layer for layer in viewer.layers if not any(layer.data is old for old in before)
+            ]
+
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: bool(new()), timeout=PATIENCE)
+        return new()[-1]
+
+    tool.object.set_kind("four_toroids")
+    tool.side.setText("60 x 80")
+    strength = tool.object.form.entries["strength"]
+    enter(strength, 0.2)
+    expected = four_toroids((60, 80), paper_setup(), 0.2)
+    layer = made()
+    np.testing.assert_allclose(layer.data, synthetic_image(expected.displacement))
+    assert tuple(layer.scale) == pytest.approx((1.5, 1.5))
+    assert not tool.warning.isVisibleTo(tool)
+    enter(strength, 2.0)
+    made()
+    assert tool.warning.isVisibleTo(tool)
+    assert "Caustics" in tool.warning.text()
+
+    add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True)
+    potential = next(
+        result_layer for result_layer in viewer.layers if role_of(result_layer) == "potential"
+    )
+    assert unit_of(potential) != "px²"
+    tool.object.set_kind("layer")
+    tool.potential.layer = potential
+    tool.setup.show_setup(proton_setup.model_dump())
+    again = made().data
+    inner = (slice(3, -3), slice(3, -3))
+    relative = solved.reprojection / solved.source.mean()
+    assert abs(again - relative)[inner].max() < 0.02 * relative.max()
+
+    # It knows its experiment.
+    tool.setup.picker.set_kind("none")
+    np.testing.assert_allclose(made().data, again)
+    assert messages == []
+    lost = viewer.add_image(potential.data, name="lost", metadata=metadata_for("potential", "µm"))
+    tool.potential.layer = lost
+    messages.clear()  # napari's own word on the units
+    tool.panel.button.click()
+    assert len(messages) == 1
+    assert "select the setup" in messages[0]
+    assert "select the setup" in tool.panel.status.text()
+
+
+def test_only_what_may_be_a_field_is_offered_and_it_says_what_it_is_taken_for(
+    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str], solved: Inversion,
+    proton_setup: ProtonSetup, shot: Array,
+) -> None:  # fmt: skip
+    tool = opened(Simulate)
+    tool.object.set_kind("layer")
+    assert "open a .shadowinv file" in tool.interpretation.text()
+    tool.panel.button.click()
+    assert len(messages) == 1
+    assert "there is no potential or result" in messages[0].lower()
+    assert tool.panel.status.text() == messages[0]
+    messages.clear()
+
+    viewer.add_image(shot, name="counts")
+    viewer.add_image(shot, name="beam", metadata=metadata_for("source", "intensity"))
+    add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True)
+    offered = [tool.potential.itemText(n) for n in range(tool.potential.count())]
+    assert len(offered) == 5  # potential, three of the field, and the image of unknown origin
+    assert "counts" in offered
+    assert "beam" not in offered
+    tool.potential.layer = viewer.layers["counts"]
+    assert "treated as a potential in px²" in tool.interpretation.text()
+    tool.object.set_kind("toroid")
+    tool.object.set_kind("layer")
+    assert role_of(tool.potential.layer) == "field"
+    assert tool.interpretation.text() == "The displacement of this result."
+    assert tool.setup.setup() == proton_setup
+
+
+def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
+    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str], solved: Inversion,
+    proton_setup: ProtonSetup,
+) -> None:  # fmt: skip
+    add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True)
+    tool = opened(Simulate)
+    choices = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
+    assert choices[1:] == list(deflector_titles().values())
+    tool.object.set_kind("layer")
+    slow = proton_setup.model_copy(update={"energy": 3.0})
+    tool.setup.show_setup(slow.model_dump())
+
+    def image() -> Any:
+        before = tool.results
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: tool.results is not before, timeout=PATIENCE)
+        qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
+        (layer,) = tool.results.layers
+        assert layer.name.startswith("solved image")
+        return layer.data
+
+    expected = predict_image(solved.displacement, proton_setup, slow)
+    np.testing.assert_allclose(image(), expected)
+    assert "only a magnetic field deflects the beam" in tool.warning.text()
+    tool.deflector.setCurrentText("electric field")
+    expected = predict_image(solved.displacement, proton_setup, slow, deflector="electric field")
+    np.testing.assert_allclose(image(), expected)
+    tool.setup.show_setup(proton_setup.model_dump())
+    np.testing.assert_allclose(image(), synthetic_image(solved.displacement))
+    # A potential in µm goes the same way.
+    potential = next(layer for layer in viewer.layers if role_of(layer) == "potential")
+    tool.potential.layer = potential
+    tool.deflector.setCurrentIndex(0)
+    tool.setup.show_setup(slow.model_dump())
+    expected = predict_image(displacement_from_potential(solved.potential), proton_setup, slow)
+    np.testing.assert_allclose(image(), expected, atol=1e-9)
+    assert messages == []
+
+
+def test_a_potential_from_a_file_and_the_shot_in_view_of_a_stack_make_their_images(
+    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str]
+) -> None:
+    potentials = [gaussian_blob((40, 50), size, 6.0).potential for size in (10.0, 20.0)]
+    viewer.add_image(potentials[0], name="phi")
+    viewer.add_image(np.stack(potentials), name="run", metadata=metadata_for("potential", "px²"))
+    tool = opened(Simulate)
+    tool.setup.picker.set_kind("none")
+    tool.object.set_kind("layer")
+    for name, expected in (("phi", potentials[0]), ("run", potentials[1])):
+        viewer.dims.set_current_step(0, 1)
+        tool.potential.layer = viewer.layers[name]
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda name=name: f"{name} image" in viewer.layers, timeout=PATIENCE)
+        np.testing.assert_allclose(
+            viewer.layers[f"{name} image"].data,
+            synthetic_image(displacement_from_potential(expected)),
+        )
+    assert messages == []
+
+
+def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
+    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str]
+) -> None:
+    tool = opened(Simulate)
+    tool.object.set_kind("coaxial")
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
+    (layer,) = viewer.layers
+    phantom, obstructed = coaxial_line((200, 200), paper_setup())
+    dark = np.where(obstructed, 0.0, 1.0)
+    np.testing.assert_allclose(layer.data, synthetic_image(phantom.displacement, dark))
+    np.testing.assert_array_equal(source_of(layer), dark)
+    shot = opened(InvertShot)
+    np.testing.assert_array_equal(shot.source.measured(shot.image.layer).image, dark)
+    assert messages == []
+
+
+def test_an_object_brings_the_beam_that_it_needs(
+    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str]
+) -> None:
+    tool = opened(Simulate)
+    tool.object.set_kind("wakefield")
+    assert tool.setup.setup() == wakefield_setup()
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
+    wave = wakefield((200, 200), wakefield_setup())
+    np.testing.assert_allclose(viewer.layers[0].data, synthetic_image(wave.displacement))
+    enter(tool.object.form.entries["density"], "2e19 cm⁻³")
+    assert tool.object.model().density == pytest.approx(2e25)
+
+    # What somebody has typed is not replaced.
+    entered = wakefield_setup().model_copy(update={"wavelength": 532e-9})
+    tool.setup.show_setup(entered.model_dump())
+    tool.object.set_kind("toroid")
+    assert tool.setup.setup() == paper_setup()
+    tool.object.set_kind("wakefield")
+    assert tool.setup.setup() == entered
+    tool.setup.picker.set_kind("none")
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
+    assert len(messages) == 1
+    assert "select the setup 'light'" in messages[0]
+
+
+def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
+    weak = run_job(ForwardJob(BlobRecipe(amplitude=5, sigma=8), shape=(40, 50)))
+    strong = run_job(ForwardJob(BlobRecipe(amplitude=-200, sigma=8), shape=(40, 50)))
+    assert weak.warning == ""
+    assert "Caustics" in strong.warning
+    assert strong.caustic_share > 0
+
+
+def test_a_potential_and_its_object_make_the_same_image() -> None:
+    blob = BlobRecipe(amplitude=20, sigma=8)
+    phantom = blob.phantom((40, 50), None)
+    by_object = run_job(ForwardJob(blob, shape=(40, 50)))
+    by_potential = run_job(ForwardJob(InputField(1e9 * phantom.potential, to_px2=1e-9)))
+    assert abs(by_object.image - by_potential.image).max() < 0.02
+
+
+def test_a_magnetic_object_asks_for_particles() -> None:
+    with pytest.raises(InputError, match="select the setup"):
+        run_job(ForwardJob(ToroidRecipe()))
+
+
+def test_a_3d_field_of_a_file_is_traced(tmp_path: Path) -> None:
+    """The field is uniform: the displacement is that of its line integral."""
+    places = np.linspace(-2e-4, 2e-4, 9)
+    zeros = np.zeros((9, 9, 9))
+    components = {"Bx": zeros, "By": zeros + 0.5, "Bz": zeros}
+    dataset = xr.Dataset(
+        {name: (("z", "y", "x"), values, {"units": "T"}) for name, values in components.items()},
+        {axis: (axis, places, {"units": "m"}) for axis in "zyx"},
+    )
+    path = tmp_path / "field.nc"
+    dataset.to_netcdf(path, engine="h5netcdf")
+    setup = paper_setup()
+    with pytest.raises(InputError, match="there is no setup"):
+        run_job(ForwardJob(GridFile(str(path), GridView()), shape=(20, 30)))
+    job = ForwardJob(GridFile(str(path), GridView(right="-x")), shape=(20, 30), setup=setup)
+    prediction = run_job(job)
+    # Seen with x to the left, y points up.
+    expected = setup.displacement_from_path_integrated_b([-0.5 * 4e-4, 0.0])[1]
+    np.testing.assert_allclose(prediction.displacement[1], expected, rtol=1e-2)
+    assert "faces reaches 100 %" in prediction.warning
+
+
+@pytest.fixture
+def tool(opened: Any) -> Any:
+    """The widget with a small toroid and three draws."""
+    tool = opened(Simulate)
+    tool.task.setCurrentIndex(tool.task.findData("plan"))
+    tool.object.set_kind("toroid")
+    tool.object.form.restore({"peak": 20.0, "radius": 9e-6})
+    tool.side.setText("64 x 64")
+    tool.instrument.restore({"beam_rms": 0.0})
+    tool.options.restore({"draws": 3, "counts": 3000.0})
+    return tool
+
+
+def finished(tool: Any, qtbot: Any) -> None:
+    tool.panel.button.click()
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
+
+
+def test_a_plan_shows_its_verdict_and_the_first_image(
+    tool: Any, viewer: ViewerModel, qtbot: Any
+) -> None:
+    assert tool.setup.setup() == paper_setup()
+    finished(tool, qtbot)
+    assert "would be determined: 3 of 3" in tool.verdict.text()
+    assert "Error made" in texts_of(tool.report)
+    qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
+    (layer,) = viewer.layers
+    assert role_of(layer) == "shot"
+    assert layer.data.mean() == pytest.approx(3000, rel=0.01)
+    assert not tool.plot.isHidden()
+
+
+def test_a_sweep_draws_the_error_at_each_value(tool: Any, qtbot: Any) -> None:
+    tool.quantity.setCurrentIndex(tool.quantity.findData("counts"))
+    tool.values.setText("100, 1600")
+    finished(tool, qtbot)
+    line = tool.plot.figure.axes[0].lines[0]
+    np.testing.assert_array_equal(line.get_xdata(), [100, 1600])
+    few, many = line.get_ydata()
+    assert few > 2 * many
+
+
+@pytest.mark.parametrize(
+    ("energies", "size", "message"),
+    [("3; 15", "64 x 64", "separated by commas"), ("", "64", "expected height and width")],
+)
+def test_wrong_entries_are_a_sentence_below_the_button(
+    tool: Any, messages: list[str], energies: str, size: str, message: str
+) -> None:
+    tool.energies.setText(energies)
+    tool.side.setText(size)
+    tool.panel.button.click()
+    assert message in tool.panel.status.text()
+    assert len(messages) == 1
+
+
+@pytest.fixture
+def cube(tmp_path: Path) -> Path:
+    """A ring of B about the axis x, away from the middle of its frame."""
+    z, y, x = np.meshgrid(*[np.linspace(-4e-5, 4e-5, 20)] * 3, indexing="ij")
+    bell = 8e6 * np.exp(-(x**2 + y**2 + z**2) / (2 * 1.2e-5**2))
+    values = {"Bx": bell * 0, "By": -z * bell, "Bz": y * bell}
+    magnetic = {name: (("z", "y", "x"), value, {"units": "T"}) for name, value in values.items()}
+    places = {"z": 1e-3 + z[:, 0, 0], "y": y[0, :, 0], "x": x[0, 0]}
+    axes = {name: (name, line, {"units": "m"}) for name, line in places.items()}
+    path = tmp_path / "cube.nc"
+    xr.Dataset(magnetic, axes).to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+@pytest.fixture
+def traced(tool: Any, cube: Path) -> Any:
+    """The widget with the field of the file, seen along x."""
+    tool.object.set_kind("grid")
+    tool.file.edit.setText(str(cube))
+    tool.file.changed.emit()
+    tool.object.form.restore({"beam": "x", "right": "y", "centre": True})
+    tool.side.setText("")
+    return tool
+
+
+def test_a_3d_field_is_planned_as_in_python(
+    traced: Any, viewer: ViewerModel, cube: Path, qtbot: Any
+) -> None:
+    assert traced.file.isVisibleTo(traced)
+    finished(traced, qtbot)
+    qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
+    grid = read_field_grid(cube).turned("x", "y").centred()
+    expected = plan_experiment(
+        object_of_field(grid, paper_setup()),
+        paper_setup(),
+        instrument=Instrument(beam_rms=0.0),
+        options=ExperimentOptions(draws=3, counts=3000.0),
+    )
+    (layer,) = viewer.layers
+    np.testing.assert_array_equal(layer.data, expected.images[0])
+    assert layer.name == "cube.nc, planned"
+    texts = texts_of(traced.report)
+    assert texts["Error made"] == next(f.text for f in expected.facts if f.title == "Error made")
+    traced.object.set_kind("toroid")
+    assert not traced.file.isVisibleTo(traced)
+
+
+def test_file_and_view_are_remembered(traced: Any, cube: Path) -> None:
+    state = traced.state()
+    traced.object.set_kind("toroid")
+    traced.file.edit.setText("")
+    traced.restore(state)
+    file = traced._object(None)
+    assert file.path == str(cube)
+    assert file.view.model_dump() == {"beam": "x", "right": "y", "centre": True}
+
+
+def test_wrong_file_is_a_sentence(
+    traced: Any, qtbot: Any, messages: list[str], tmp_path: Path
+) -> None:
+    np.save(tmp_path / "plane.npy", np.ones((4, 4)))
+    xr.Dataset({"rho": ("x", np.ones(3))}).to_netcdf(tmp_path / "rho.nc", engine="h5netcdf")
+    for text, message in (
+        ("", "There is no file with a 3-D field: choose one"),
+        (str(tmp_path / "none.h5"), "none.h5"),
+        (str(tmp_path / "plane.npy"), "is no HDF5 file: expected an openPMD file or a NetCDF 4"),
+        (str(tmp_path / "rho.nc"), "rho.nc"),
+    ):
+        traced.file.edit.setText(text)
+        finished(traced, qtbot)
+        assert message in traced.panel.status.text()
+        assert message in messages[-1]
+    assert len(messages) == 4
+    traced.file.edit.setText(str(tmp_path / "cube.nc"))
+    traced.object.form.restore({"beam": "x", "right": "x"})
+    finished(traced, qtbot)
+    assert len(messages) == 5
+    assert "right" in messages[-1]
+    traced.object.form.restore({"beam": "x", "right": "y"})
+    traced.setup.picker.set_kind("none")
+    finished(traced, qtbot)
+    assert "There is no setup: expected one of charged particles" in messages[-1]
