@@ -217,12 +217,13 @@ def source_windows() -> None:
     """Tutorial: an estimated beam, and the field that it gives."""
     viewer = new_window("no reference image", height=880)
     viewer.open_sample(PLUGIN, "four_toroids")
-    estimate = open_widget(viewer, "Estimate source")
-    press_run(estimate)
-    photograph(viewer, "tutorial-source-estimate.png", close=False)
     invert_shot = open_widget(viewer, "Invert shot")
-    invert_shot.image.layer = viewer.layers["four toroids"]
     invert_shot.source.set_kind("polynomial")
+    invert_shot.show_source.click()
+    while invert_shot.panel.running:
+        settle(0.2)
+    settle()
+    photograph(viewer, "tutorial-source-estimate.png", close=False)
     press_run(invert_shot)
     for title, text in invert_shot.report.rows:
         print(f"{title}: {text}")

@@ -15,7 +15,7 @@ from napari_shadowinv._napari.form import StepsSection
 from napari_shadowinv._napari.simulations import input_field
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets._products import ProductForm
-from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
+from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
@@ -84,10 +84,9 @@ def test_the_component_of_an_axisymmetric_field_is_offered(viewer: ViewerModel, 
 
 
 def estimated(tool: Any, method: str, qtbot: Any) -> str:
-    before = tool.results
-    tool.method.set_kind(method)
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: tool.results is not before, timeout=PATIENCE)
+    tool.source.set_kind(method)
+    tool.show_source.click()
+    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     return str(tool.panel.status.text())
 
 
@@ -96,13 +95,12 @@ def test_an_estimate_that_contains_the_object_says_so(
 ) -> None:
     image = synthetic_image(1.5 * ellipse_pair((96, 120)).displacement)
     viewer.add_image(image * np.random.default_rng(5).normal(1, 0.01, image.shape), name="shot")
-    tool = opened(EstimateSource)
-    assert tool.method.kind == "polynomial"
+    tool = opened(InvertShot)
     assert estimated(tool, "polynomial", qtbot) == ""
     assert "of the pattern in the image" in estimated(tool, "total-variation", qtbot)
     mask = np.zeros(image.shape, int)
     mask[20:76, 20:100] = 1
-    tool.masks.layer = viewer.add_labels(mask)
+    tool.source_masks.layer = viewer.add_labels(mask)
     assert estimated(tool, "total-variation", qtbot) == ""
 
 

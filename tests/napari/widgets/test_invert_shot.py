@@ -680,14 +680,14 @@ def test_a_recipe_keeps_detector_and_beam_source(tool: Any, tmp_path: Path) -> N
 
 
 def test_a_layer_of_an_estimated_source_was_not_measured(
-    tool: Any, window: Any, open_widget: Any, run: Any
+    tool: Any, window: Any, qtbot: Any
 ) -> None:
     """An estimate has the error of an unmeasured beam; a layer that was opened has not."""
-    estimate = open_widget("Estimate source")
-    estimate.method.set_kind("polynomial")
-    estimate.image.layer = window.layers["shot"]
-    run(estimate)
-    (source,) = (layer for layer in window.layers if "source" in layer.name)
+    tool.source.set_kind("polynomial")
+    tool.show_source.click()
+    name = "shot source: fitted polynomial"
+    qtbot.waitUntil(lambda: name in window.layers, timeout=PATIENCE)
+    source = window.layers[name]
     tool.source.set_kind("layer")
     tool.source.layers.layer = source
     assert tool.recipe().instrument == Instrument(beam_rms=0.05)

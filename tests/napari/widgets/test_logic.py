@@ -70,7 +70,7 @@ def running(recipe: Recipe) -> Any:
 @pytest.mark.parametrize(
     "job",
     [
-        lambda tmp_path: SourceJob(SLOW, Shot(LARGE), None, {}, preview=False).run,
+        lambda tmp_path: SourceJob(SLOW, Shot(LARGE), None, {}).run,
         lambda tmp_path: running(Recipe(source=SLOW)),
         lambda tmp_path: running(Recipe(steps=(BackgroundFilter(degree=10),))),
         lambda tmp_path: (

@@ -9,14 +9,15 @@ import pytest
 from napari.components import ViewerModel
 
 from napari_shadowinv import FitOptions, fit, read, write
-from napari_shadowinv._napari.layer_metadata import metadata_for, role_of
+from napari_shadowinv._napari.layer_metadata import is_estimate, metadata_for, role_of
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import layers_of_dataset
 from napari_shadowinv._napari.widgets.fit_images import FitImages
-from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
+from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
+from napari_shadowinv.preprocessing import polynomial_source
 from napari_shadowinv.shot import shots_of
 
 SHAPE = (64, 72)
@@ -56,7 +57,6 @@ def test_a_name_counts_more_than_structure(viewer: ViewerModel, opened: Any) -> 
     for name, image in {"shot": BEAM, "ref": mesh, "dark": 0.01 * OBJECT}.items():
         viewer.add_image(image, name=name)
     assert boxes(opened(InvertShot)) == ("shot", "ref")
-    assert opened(EstimateSource).image.layer.name == "shot"
 
 
 @pytest.mark.parametrize(
@@ -149,3 +149,20 @@ def test_a_fit_from_a_file_has_its_beam(
 def image_of(viewer: ViewerModel) -> Any:
     (image,) = [layer for layer in viewer.layers if role_of(layer) == "image"]
     return image
+
+
+def test_an_estimate_becomes_a_layer(viewer: ViewerModel, opened: Any, qtbot: Any) -> None:
+    shot = viewer.add_image(OBJECT, name="shot", scale=(2, 2), translate=(5, 7))
+    tool = opened(InvertShot)
+    assert tool.show_source.parentWidget().isHidden()
+    tool.source.set_kind("polynomial")
+    assert not tool.show_source.parentWidget().isHidden()
+    tool.source_masks.paint()
+    tool.source_masks.layer.data[10:20, 20:30] = 1
+    tool.show_source.click()
+    name = "shot source: fitted polynomial"
+    qtbot.waitUntil(lambda: name in viewer.layers, timeout=60_000)
+    source, usable = viewer.layers[name], tool.source_masks.usable(shot)
+    np.testing.assert_allclose(source.data, polynomial_source(OBJECT, degree=2, mask=usable))
+    assert (tuple(source.scale), tuple(source.translate)) == ((2, 2), (5, 7))
+    assert (role_of(source), is_estimate(source)) == ("source", True)

@@ -29,7 +29,7 @@ from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.fit_images import FitImages
-from napari_shadowinv._napari.widgets.invert_shot import EstimateSource, InvertShot
+from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
@@ -229,7 +229,7 @@ def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) ->
 def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(
     viewer: ViewerModel, opened: Any
 ) -> None:
-    tools = [opened(kind) for kind in (InvertShot, EstimateSource, InvertStack)]
+    tools = [opened(kind) for kind in (InvertShot, InvertStack)]
     viewer.open_sample(PLUGIN, "toroid")
     shot, source = (
         next(layer for layer in viewer.layers if role_of(layer) == role)
@@ -397,10 +397,7 @@ def test_a_mask_over_the_object_is_refused(
     assert words in tool.panel.status.text()
 
     # As well if the estimate was made before, in a layer of its own.
-    estimating = opened(EstimateSource)
-    estimating.method.set_kind("polynomial")
-    estimating.masks.layer = labels
-    estimating.panel.button.click()
+    tool.show_source.click()
     qtbot.waitUntil(lambda: "shot source: fitted polynomial" in viewer.layers, timeout=PATIENCE)
     for kind, data in ((InvertShot, None), (InvertStack, np.stack([shot, shot]))):
         later = opened(kind)
@@ -551,7 +548,7 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     assert opened(InvertShot).setup.setup() == entered
 
 
-@pytest.mark.parametrize("kind", [EstimateSource, FitImages, InvertShot, InvertStack, Simulate])
+@pytest.mark.parametrize("kind", [FitImages, InvertShot, InvertStack, Simulate])
 @pytest.mark.parametrize("value", [7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}])
 def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
     viewer: ViewerModel, opened: Any, kind: Any, value: Any, monkeypatch: pytest.MonkeyPatch

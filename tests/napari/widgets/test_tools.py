@@ -14,10 +14,9 @@ from qtpy.QtWidgets import QFileDialog, QLabel
 
 from helpers.forms import enter
 from napari_shadowinv._napari.form import PROBLEM_STYLE, ModelPicker
-from napari_shadowinv._napari.layer_metadata import metadata_for, role_of
+from napari_shadowinv._napari.layer_metadata import metadata_for
 from napari_shadowinv._napari.widgets._qt import Plot
 from napari_shadowinv.analysis.paths import measure_peak
-from napari_shadowinv.preprocessing import polynomial_source
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
@@ -26,7 +25,6 @@ NAMES = (
     "Invert stack",
     "Fit several images",
     "Film pack",
-    "Estimate source",
     "Simulate",
     "Analyse",
 )
@@ -83,36 +81,6 @@ def test_nothing_is_orange_before_something_is_typed(
     setup.set_kind("proton")
     enter(setup.form.entries["energy"], 14.7)
     assert any("Source" in text for text in orange_texts(tools["Invert shot"]))
-
-
-def test_an_estimate_becomes_a_layer_after_its_preview(
-    window: Any, open_widget: Any, shot: Array, qtbot: Any, messages: list[str]
-) -> None:
-    window.add_image(shot, name="shot", scale=(2, 2), translate=(5, 7))
-    tool = open_widget("Estimate source")
-    tool.method.set_kind("polynomial")
-    tool.live.setChecked(True)
-    qtbot.waitUntil(lambda: bool(tool.previewed.layers), timeout=PATIENCE)
-    (preview,) = tool.previewed.layers
-    old = preview.data
-    enter(tool.method.form.entries["degree"], 0)
-    qtbot.waitUntil(lambda: preview.data is not old, timeout=PATIENCE)
-    assert np.ptp(preview.data) == pytest.approx(0, abs=1e-9)
-    tool.masks.paint()
-    tool.masks.layer.data[10:20, 20:30] = 1
-    enter(tool.method.form.entries["degree"], 2)
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: "shot source: fitted polynomial" in window.layers, timeout=PATIENCE)
-    source = window.layers["shot source: fitted polynomial"]
-    usable = np.ones(shot.shape, bool)
-    usable[10:20, 20:30] = False
-    expected = polynomial_source(shot, degree=2, mask=usable)
-    np.testing.assert_allclose(source.data, expected)
-    assert tuple(source.scale) == (2, 2)
-    assert tuple(source.translate) == (5, 7)
-    assert role_of(source) == "source"
-    assert not preview.visible
-    assert messages == []
 
 
 @pytest.fixture

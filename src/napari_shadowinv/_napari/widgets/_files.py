@@ -265,8 +265,8 @@ def _refuse_estimates(recipe: Recipe, path: Path) -> None:
     if recipe.estimate is not None and not isinstance(recipe.estimate, UniformEstimate):
         raise InputError(
             f"{path} estimates the source ({recipe.estimate.summary}), which a fit here does not "
-            "do: create a source layer with the widget 'Estimate source', select it, and remove "
-            "the estimate from the recipe"
+            "do: add it as a layer with 'Show source' in Invert shot, select it, and remove the "
+            "estimate from the recipe"
         )
 
 

@@ -315,6 +315,11 @@ class SourcePicker(forms.ModelPicker):
         return self.layers.layer if self.kind == LAYER else None
 
     @property
+    def is_made(self) -> bool:
+        """Whether it is made by an estimate that is not uniform."""
+        return self.kind in preprocessing.ESTIMATES and self.kind != UNIFORM
+
+    @property
     def is_estimated(self) -> bool:
         """Whether it is estimated from the shot, where a mask can exclude the object."""
         estimate = preprocessing.ESTIMATES.get(self.kind)

@@ -12,10 +12,7 @@ from qtpy import QtWidgets
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.layer_metadata import main_layers
-from napari_shadowinv._napari.layers import FullLayerData
 from napari_shadowinv._napari.run import Outcome, Run
-from napari_shadowinv._napari.viewer_sync import USER_ERRORS
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
 from napari_shadowinv.cautions import CAUTION_CODES
@@ -199,51 +196,3 @@ class ToolPanel(qt.Docked):
     def _on_end(self, outcome: Outcome) -> None:
         if outcome.value is not None:
             self.show_result(outcome.value, outcome.tag)
-
-
-class LivePanel(ToolPanel):
-    """A panel that can also show a preview after each change; the button's run has priority."""
-
-    def __init__(self, viewer: Any, name: str, panel: Run) -> None:
-        super().__init__(viewer, name, panel)
-        self.live = QtWidgets.QCheckBox("Live preview")
-        self.previewed = ResultLayers(viewer, self)
-        self._preview_timer = qt.timer(self, _SETTLE_MS, self._preview, once=True)
-        self.live.toggled.connect(self.on_change)
-
-    def request(self, preview: bool = False) -> Job:
-        raise NotImplementedError
-
-    def show_layers(
-        self, shot: Any, layer_data: Sequence[FullLayerData], preview: bool, fit: bool = False
-    ) -> None:
-        """Show the layers of a preview, or hide them and show the layers of a run."""
-        if preview:
-            self.previewed.show(layer_data, select=False, fit=fit)
-            return
-        self.previewed.hide()
-        self.results = self._last.layers_for_next(shot)
-        self.results.show(main_layers(layer_data, also=self.results.layer_keys), fit=fit)
-
-    def on_change(self) -> None:
-        """Save the state and update the preview after a change of the inputs."""
-        self.keep()
-        if self._ready and self.live.isChecked():
-            self._preview_timer.start()
-
-    def showEvent(self, event: Any) -> None:
-        super().showEvent(event)
-        if self._ready and self.live.isChecked():
-            self._preview_timer.start()
-
-    def _preview(self) -> None:
-        is_busy = self.panel.running and not self._running_preview
-        if is_busy or not self.isVisible():
-            return
-        try:
-            job = self.request(preview=True)
-        except USER_ERRORS as error:
-            # An unfinished rectangle or number is no reason for a notification.
-            self.panel.say(str(error), problem=True)
-            return
-        self.start(job, preview=True)

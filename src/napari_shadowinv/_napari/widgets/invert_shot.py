@@ -1,27 +1,28 @@
-"""The widgets for a single shot: `InvertShot`, and `EstimateSource` for its beam."""
+"""The window for a single shot and its beam: `InvertShot`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
+from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
-from napari_shadowinv._napari.viewer_sync import show_caution
+from napari_shadowinv._napari.viewer_sync import USER_ERRORS, show_caution
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import field_of, result_buttons
 from napari_shadowinv._napari.widgets._fitting import FitView, RefineSection
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
-from napari_shadowinv._napari.widgets._results import place_inputs, result_frame
+from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -31,8 +32,8 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache
-from napari_shadowinv.pipeline.inversion_run import PREVIEW_PIXELS, PREVIEW_SITES
-from napari_shadowinv.preprocessing import ESTIMATES, Estimate, Recipe, estimate_source
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
+from napari_shadowinv.preprocessing import Estimate, Recipe, estimate_source
 from napari_shadowinv.preprocessing.estimates import LowPassEstimate, TotalVariationEstimate
 from napari_shadowinv.shot import Shot
 
@@ -42,6 +43,7 @@ _SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
 _BYTES, _BYTES_PER_PIXEL, _BYTES_PER_SITE = 200e6, 280.0, 1700.0
 _MIN_PIXELS_FOR_ESTIMATE = 1_000_000
 _NOTABLE_PATTERN = 0.25
+_PREVIEW_DELAY_MS = 10  # merges simultaneous changes
 
 
 @dataclass(frozen=True)
@@ -86,13 +88,15 @@ def estimate_cost(
     return CostEstimate(pixels, sites, seconds, memory)
 
 
-class InvertShot(InversionInputs, panels.LivePanel):
+class InvertShot(InversionInputs, panels.ToolPanel):
     """Choose an image, then press Run; everything else has a default."""
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Invert the image and show the result as layers."
         super().__init__(napari_viewer, "invert-shot", Run("Invert shot", "Run", tip))
         self._cache = Cache()
+        self.previewed = ResultLayers(self.viewer, self)
+        self._preview_timer = qt.timer(self, _PREVIEW_DELAY_MS, self._preview, once=True)
         self._build()
         self._connect()
         self.restore_last()
@@ -112,9 +116,8 @@ class InvertShot(InversionInputs, panels.LivePanel):
         )
         tip = "<qt>Shapes layer with a rectangle; only the image inside is inverted.</qt>"
         self.crop = layers.LayerPicker(self.viewer, tip, "none", kinds=("shapes",))
-        self.live.setToolTip(
-            f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
-        )
+        tip = f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
+        self.live = QCheckBox("Live preview", toolTip=tip)
         self.cost, self._pace = forms.WrappingLabel(), 1.0
         self.refine_section = RefineSection(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
@@ -126,8 +129,13 @@ class InvertShot(InversionInputs, panels.LivePanel):
             "Save the selected or last result: complete with its layers (.shadowinv), for other "
             "programs (.h5), or its sites (.csv).",
         )
+        self.show_source = qt.push_button(
+            "Show source", "Add the estimated beam as an image layer.", self._show_source
+        )
         crop = qt.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
-        self.add(forms.labelled("Image", self.image), *self.beam, forms.labelled("Crop", crop))
+        source, *masks = self.beam
+        self.add(forms.labelled("Image", self.image), source, forms.labelled("", self.show_source))
+        self.add(*masks, forms.labelled("Crop", crop))
         self.add(*self.settings, self.live, self.keep_earlier, self.cost, self.panel)
         self.add(self.verdict, qt.side_by_side((self.save_result, 1), (self.more_layers, 1)))
         self.add(self.report, self.refine_section, self.fit_view)
@@ -142,7 +150,7 @@ class InvertShot(InversionInputs, panels.LivePanel):
         changes = [control.changed for control in self.parts().values()]
         masks = self.masks.layers, self.source_masks.layers
         edits = [each.edited for each in (self.image, *masks, self.crop, self.source.layers)]
-        for signal in (*changes, self.crop.picked, *edits):
+        for signal in (*changes, self.live.toggled, self.crop.picked, *edits):
             signal.connect(self.on_change)
 
     def request(self, preview: bool = False) -> jobs.InversionJob:
@@ -201,9 +209,29 @@ class InvertShot(InversionInputs, panels.LivePanel):
             )
         self.start(job)
 
-    def show_result(self, finished: jobs.Finished, job: jobs.InversionJob | jobs.FitJob) -> None:
+    @qt.notify_errors
+    def _show_source(self) -> None:
+        """Estimate the beam of the image, which the steps have not changed."""
+        if self.panel.running and not self._running_preview:
+            return
+        layer: Any = self.image.layer
+        image, source = layers.image_of(layer), self.source.chosen()
+        assert isinstance(source, Estimate)  # without one the button is hidden
+        estimate = source.adapt_to(self.setup.setup(), image.shape)
+        hidden = self.hidden_from_source(layer)
+        made_from = {"image": layer.name, "estimate": estimate.summary}
+        if hidden is not None:
+            made_from["source_mask"] = self.source_masks.summary(layer)
+        self.start(SourceJob(estimate, Shot(image, source_mask=hidden), layer, made_from))
+
+    def show_result(
+        self, finished: jobs.Finished, job: jobs.InversionJob | jobs.FitJob | SourceJob
+    ) -> None:
         if isinstance(job, jobs.InversionJob):
             self._show_inversion(finished, job)
+            return
+        if isinstance(job, SourceJob):
+            self._show_estimate(finished, job)
             return
         self.previewed.hide()
         self.fit_view.show_result(job, finished, self._last)
@@ -259,11 +287,50 @@ class InvertShot(InversionInputs, panels.LivePanel):
             self._learn_pace(inversion)
             # They refine an earlier result and would cover the new one.
             self.fit_view.results.hide()
-        self.show_layers(job.image, finished.layer_data, job.preview, fit=moved)
+        if job.preview:
+            self.previewed.show(finished.layer_data, select=False, fit=moved)
+            return
+        self.previewed.hide()
+        self.results = self._last.layers_for_next(job.image)
+        layer_data = main_layers(finished.layer_data, also=self.results.layer_keys)
+        self.results.show(layer_data, fit=moved)
+
+    def _show_estimate(self, finished: jobs.Finished, job: SourceJob) -> None:
+        self._last.layers_for_next((job.image, about.SOURCE)).show(finished.layer_data)
+        share = _pattern_share(finished.content, job)
+        if share >= _NOTABLE_PATTERN:
+            self.panel.say(
+                f"The estimate contains {percent(share)} of the pattern in the image: what of it "
+                "is the object's is missing in the field. Choose a smoother estimate, or mask "
+                "the object.",
+                problem=True,
+            )
 
     def on_change(self) -> None:
-        super().on_change()
+        """Save the state, update the preview and the estimated cost."""
+        self.keep()
+        if self._ready and self.live.isChecked():
+            self._preview_timer.start()
+        self.show_source.parentWidget().setVisible(self.source.is_made)
         self._show_cost()
+
+    def showEvent(self, event: Any) -> None:
+        super().showEvent(event)
+        if self._ready and self.live.isChecked():
+            self._preview_timer.start()
+
+    def _preview(self) -> None:
+        """Show a preview; the button's run has priority."""
+        is_busy = self.panel.running and not self._running_preview
+        if is_busy or not self.isVisible():
+            return
+        try:
+            job = self.request(preview=True)
+        except USER_ERRORS as error:
+            # An unfinished rectangle or number is no reason for a notification.
+            self.panel.say(str(error), problem=True)
+            return
+        self.start(job, preview=True)
 
     def _show_cost(self) -> None:
         """Show the estimated time and memory for large images."""
@@ -312,15 +379,12 @@ class SourceJob(jobs.Job):
     shot: Shot  # its image may be lazy
     image: Any
     made_from: dict[str, str]
-    preview: bool
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FloatArray:
         report = Reporter(on_progress, should_stop)
         report("source", 0, None, self.estimate.title)
         shot = load_radiograph(self.shot, "the image")
-        max_pixels = PREVIEW_PIXELS if self.preview else None
-        by = partial(Cache().source, self.estimate, most_pixels=max_pixels)
-        source = estimate_source(self.estimate, shot, should_stop, by=by)
+        source = estimate_source(self.estimate, shot, should_stop)
         report("source", 1, 1)
         return source
 
@@ -335,60 +399,13 @@ class SourceJob(jobs.Job):
             source_mask=self.shot.source_mask,
         )
         keywords = {
-            "name": f"{layer.name} source: {'preview' if self.preview else self.estimate.title}",
+            "name": f"{layer.name} source: {self.estimate.title}",
             "metadata": metadata,
             "colormap": layer.colormap.name,
             "contrast_limits": tuple(layer.contrast_limits),
             **about.frame_of(layer).keywords(),
         }
         return [(content, keywords, "image")]
-
-
-class EstimateSource(panels.LivePanel):
-    """Choose a shot and a method, and add the estimated source as an image layer."""
-
-    def __init__(self, napari_viewer: Any) -> None:
-        tip = "Estimate the beam and add it as an image layer."
-        panel = Run("Estimate source", "Estimate", tip)
-        super().__init__(napari_viewer, "estimate-source", panel)
-        self.image = layers.ShotPicker(self.viewer)
-        tip = "Labels or shapes on pixels that the estimate ignores."
-        self.masks = layers.MaskPicker(self.viewer, lambda: self.image.layer, tip)
-        self.method = forms.ModelPicker("Method", forms.kinds_of(ESTIMATES))
-        self.method.set_kind("polynomial")
-        self.live.setToolTip("Update the estimate after each change.")
-        self.add(forms.labelled("Image", self.image), self.masks, self.method)
-        self.add(self.live, self.keep_earlier, self.panel)
-        edits = self.image.edited, self.masks.layers.edited
-        for signal in (self.image.picked, self.masks.changed, self.method.changed, *edits):
-            signal.connect(self.on_change)
-        self.restore_last()
-        self._ready = True
-
-    def parts(self) -> dict[str, Any]:
-        return {"method": self.method, "painted_is_unusable": self.masks}
-
-    def request(self, preview: bool = False) -> SourceJob:
-        layer: Any = self.image.layer
-        image = layers.image_of(layer)
-        mask = self.masks.usable(layer)
-        model: Any = self.method.model()
-        estimate = model.adapt_to(about.setup_of(layer), image.shape)
-        made_from = {"image": layer.name, "estimate": estimate.summary}
-        if mask is not None:
-            made_from["source_mask"] = self.masks.summary(layer)
-        return SourceJob(estimate, Shot(image, source_mask=mask), layer, made_from, preview)
-
-    def show_result(self, finished: jobs.Finished, job: SourceJob) -> None:
-        self.show_layers(job.image, finished.layer_data, job.preview)
-        share = _pattern_share(finished.content, job)
-        if share >= _NOTABLE_PATTERN:
-            self.panel.say(
-                f"The estimate contains {percent(share)} of the pattern in the image: what of it "
-                "is the object's is missing in the field. Choose a smoother estimate, or mask "
-                "the object.",
-                problem=True,
-            )
 
 
 def _pattern_share(source: FloatArray, job: SourceJob) -> float:
