@@ -3,9 +3,8 @@ from .experiment import plan_experiment, sweep_experiment
 from .experiment_options import ExperimentOptions
 from .files import read_recipe, write_recipe
 from .film_files import read_pack, write_layers
-from .fit_run import run_comparison, run_fit, run_refinement
+from .fit_run import run_comparison, run_fit, run_leave_one_out, run_refinement
 from .inversion_run import Cache, Inputs, collect_inputs, run, run_prepared
-from .left_out import run_leave_one_out
 from .rerun import Rerun, rerun
 from .run_options import RunOptions, WatchOptions
 

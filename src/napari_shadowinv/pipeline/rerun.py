@@ -28,9 +28,8 @@ from napari_shadowinv.io import read_dataset
 from napari_shadowinv.io.files import join_address, split_address
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.files import read_part
-from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_refinement
+from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_leave_one_out, run_refinement
 from napari_shadowinv.pipeline.inversion_run import AnyShot, load_shot, run
-from napari_shadowinv.pipeline.left_out import run_leave_one_out
 from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 from napari_shadowinv.provenance import Origin, Provenance
 from napari_shadowinv.results import result_from_dataset
