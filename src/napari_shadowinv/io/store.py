@@ -47,7 +47,8 @@ if TYPE_CHECKING:
 
 FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
-DONE: int  # mypy does not infer it for the default of a parameter
+PENDING: int  # mypy does not infer these for defaults of parameters
+DONE: int
 PENDING, DONE, FAILED, DAMAGED, SKIPPED = map(int, Status)
 STATUS_NAMES = tuple(status.name.lower() for status in Status)
 # Attribute of a store whose shots are rows of a table, each with its own setup in its report.

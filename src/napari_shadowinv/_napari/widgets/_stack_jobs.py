@@ -81,8 +81,7 @@ class StackJob(Job):
             on_progress(self._progress(status))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
-        beam = {"source": self.source, "mask": self.mask, "source_mask": self.source_mask}
-        shots = Shot(self.shots, **beam)
+        shots = Shot(self.shots, source=self.source, mask=self.mask, source_mask=self.source_mask)
         self._start(shots, self.out, self.recipe, on_progress=update, should_stop=should_stop)
         return self.status
 
