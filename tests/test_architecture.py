@@ -179,7 +179,7 @@ def classes_by_field() -> dict[str, list[str]]:
 
 # Names for the same thing in a fit, where values and defaults differ.
 OPTIONS_OF_FITS = {"boundary", "decay_length", "margin", "max_iterations", "seed", "threads"}
-OPTIONS_OF_PLANS = {"seed", "threads"}  # of the draws, not of an inversion
+OPTIONS_OF_DRAWS = {"seed", "threads"}  # of plans and traces, not of an inversion
 # One annotation for inversions and fits, in a module of its own.
 SHARED_OPTIONS = {"max_error"}
 
@@ -191,8 +191,8 @@ def test_an_option_is_declared_once(option):
     }
     assert option not in step_parameters  # its flag would be that of a step
     of_fits = ["FitOptions"] if option in OPTIONS_OF_FITS else []
-    of_plans = ["ExperimentOptions"] if option in OPTIONS_OF_PLANS else []
-    expected = [] if option in SHARED_OPTIONS else [*of_fits, *of_plans, "InversionOptions"]
+    of_draws = ["ExperimentOptions", "TraceOptions"] if option in OPTIONS_OF_DRAWS else []
+    expected = [] if option in SHARED_OPTIONS else [*of_fits, *of_draws, "InversionOptions"]
     assert sorted(classes_by_field().get(option, [])) == sorted(expected)
 
 

@@ -38,8 +38,8 @@ def grouped(
     of_all = ("source", "mask", "source_mask")
     shots = Shot(images, **{k: choices[k] for k in of_all if k in choices and k not in fields})
     names = set() if model is None else set(model.model_fields)
-    others = {k: v for k, v in choices.items() if k not in {*names, *fields, *of_all}}
-    arguments = {"recipe": Recipe(**filled), **others}
+    callbacks = {k: v for k, v in choices.items() if k not in {*names, *fields, *of_all}}
+    arguments = {"recipe": Recipe(**filled), **callbacks}
     if model is not None:
         options = model(**{name: choices[name] for name in names & choices.keys()})
         arguments["run" if model is RunOptions else "watch"] = options

@@ -76,8 +76,8 @@ def test_text_without_a_number_in_the_unit_is_refused(text: str, unit: str) -> N
 
 
 def test_lengths_and_energies_get_the_prefix_of_their_size() -> None:
-    shown = [text_in_unit(size, "m") for size in (145e-6, 0.28, 8.1e-7, 25.0, math.inf, 0.0)]
-    assert shown == ["145 µm", "280 mm", "810 nm", "25 m", "inf", "0 m"]
+    texts = [text_in_unit(size, "m") for size in (145e-6, 0.28, 8.1e-7, 25.0, math.inf, 0.0)]
+    assert texts == ["145 µm", "280 mm", "810 nm", "25 m", "inf", "0 m"]
     assert text_in_unit(14.7, "MeV") == "14.7 MeV"
     assert text_in_unit(3000, "MeV") == "3 GeV"
     assert text_in_unit(1.65e25, "m⁻³") == "1.65e+25 m⁻³"

@@ -415,7 +415,7 @@ def _checked_planes(
 ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
     """Return images, sources if there are any, and usable pixels, each of shape (L, H, W).
 
-    A fit takes so many bytes of memory for a pixel, and for a pixel of each image.
+    A fit takes a number of bytes of memory for a pixel, and for a pixel of each image.
     """
     common_values(names, [shot.beam_unknown or None for shot in shots], "unknown source")
     sources = common_values(names, [None if s.beam_unknown else s.source for s in shots], "source")

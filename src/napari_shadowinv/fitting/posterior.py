@@ -382,8 +382,8 @@ class Posterior:
     ) -> float:
         """Return half the log-determinant of the Hessian relative to the prior of potentials.
 
-        By stochastic Lanczos quadrature in the space of so many powers of the Hessian, with the
-        same probes for both, and for each field those of its own generator: a field that the data
+        By stochastic Lanczos quadrature in the space of a number of powers of the Hessian, with the
+        same probes for both, and for each field probes of its own generator: a field that the data
         do not show adds nothing to others.
         """
         # What is fixed has no scale, and no part in the volume; nor what nothing holds.
@@ -552,7 +552,7 @@ def errors_by_part(
 ) -> dict[str, FloatArray]:
     """Return standard deviations of each field's displacement by noise and by imperfections.
 
-    From at most so many samples, of which each costs a solution for an imperfection.
+    From at most `most` samples, of which each costs a solution for an imperfection.
     """
     if not scene.imperfect.parts:
         return {}
@@ -600,7 +600,7 @@ def shifts_by_beam(
 ) -> BeamShifts | None:
     """Return the effect of beams that differ from their sources; None if beams are fitted.
 
-    Half as many beams are drawn as there are `samples` of the posterior, but at `least` so many.
+    Half as many beams are drawn as there are `samples` of the posterior, but at least `least`.
     """
     if not samples or scene.imperfect.parts:
         return None

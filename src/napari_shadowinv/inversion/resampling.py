@@ -221,7 +221,7 @@ class Sampler:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """What samples hold: the noise, what is drawn of the instrument, and the edge."""
+        """The noise, the parts of the instrument that are drawn, and the edge."""
         draws = self.resampling.instrument
         return (
             "noise",

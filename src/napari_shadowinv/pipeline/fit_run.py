@@ -242,7 +242,7 @@ def run_leave_one_out(
     """Predict each of three or more images of one object from a fit of the others, as `run_fit`.
 
     The images are in the order of `shots`; they are processed in order of energy, so that results
-    do not depend on that order. `fields` are those of the object. Default: those of the recipe.
+    do not depend on that order. `fields` are the object's; by default the recipe's.
     """
     check_count(len(shots))
     inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)

@@ -148,11 +148,11 @@ def register_source(
 def _is_white(
     plane: FloatArray, usable: BoolArray, *, deviations: float = 5.0, least: int = 50
 ) -> bool:
-    """Return whether means over blocks, of a least number, scatter as those of white noise."""
+    """Return whether means over blocks, of a least number, scatter as for white noise."""
     variance, side = float(plane[usable].var()), 2
-    while (whole := complete_blocks(usable, side)).sum() > least:
-        share = float(complete_block_means(plane, side)[whole].var()) * side**2 / variance
-        if abs(share - 1) > deviations * np.sqrt(2 / whole.sum()):
+    while (full := complete_blocks(usable, side)).sum() > least:
+        share = float(complete_block_means(plane, side)[full].var()) * side**2 / variance
+        if abs(share - 1) > deviations * np.sqrt(2 / full.sum()):
             return False
         side *= 2
     return side > 2

@@ -312,7 +312,7 @@ def _checked_variables(
         hint = " (it needs a setup)" if recipe.setup is None else ""
         if name in labels:
             hint = (
-                " (shots may differ in their number of sites, unless options.n_sites states it, "
+                " (shots may differ in their number of sites, unless it is stated, "
                 "the boundary is closed and no shot has its own mask)"
             )
         raise InputError(

@@ -306,10 +306,10 @@ class ShotPicker(LayerPicker):
         self.is_chosen = True
 
     def _default(self) -> Any:
-        own = [layer for layer in self.offered if not about.belongs_to_result(layer)]
-        *earlier, best = own or self.offered
+        recorded = [layer for layer in self.offered if not about.belongs_to_result(layer)]
+        *earlier, best = recorded or self.offered
         for layer in reversed(earlier):
-            if _is_rather_shot(layer, best, is_pair=len(own) == 2):
+            if _is_rather_shot(layer, best, is_pair=len(recorded) == 2):
                 best = layer
         return best
 
@@ -317,8 +317,8 @@ class ShotPicker(LayerPicker):
         current = self.layer
         if self.is_chosen or current is None or new is current or new not in self.offered:
             return
-        own = [layer for layer in self.offered if not about.belongs_to_result(layer)]
-        if _is_rather_shot(new, current, is_pair=len(own) == 2):
+        recorded = [layer for layer in self.offered if not about.belongs_to_result(layer)]
+        if _is_rather_shot(new, current, is_pair=len(recorded) == 2):
             self._select(new)
 
 
@@ -336,8 +336,8 @@ def likely_beam(image: Any, offered: Sequence[Any], *, estimates: bool = False) 
     images, and much smoother if both are numbered in one series.
     """
     if (result := about.result_of(image)) is not None:
-        own = [layer for layer in offered if about.result_of(layer) is result]
-        return next((layer for layer in own if about.role_of(layer) == about.SOURCE), None)
+        recorded = [layer for layer in offered if about.result_of(layer) is result]
+        return next((layer for layer in recorded if about.role_of(layer) == about.SOURCE), None)
     fitting = [
         layer
         for layer in offered
