@@ -27,9 +27,6 @@ from napari_shadowinv.errors import FileFormatError, InputError, InversionCancel
 # Gigabytes that a file may unfold to and work may take.
 LIMIT_VARIABLE = "SHADOWINV_MAX_GB"
 
-# Reading needs a few copies of the image, and other programs some memory too.
-_ALWAYS_FITS = 1_000_000
-
 P = ParamSpec("P")
 Content = TypeVar("Content")
 
@@ -137,7 +134,10 @@ def resolved_path(path: str | Path) -> Path:
 
 
 def size_limit(*, share: float = 1 / 8, memory_if_unknown: int = 8_000_000_000) -> int:
-    """Return the most bytes of a file in memory, by `LIMIT_VARIABLE` or a share of the memory."""
+    """Return the most bytes of a file in memory, by `LIMIT_VARIABLE` or a share of the memory.
+
+    Reading needs a few copies of the image, and other programs some memory too.
+    """
     text = os.environ.get(LIMIT_VARIABLE)
     if text is None:
         return int(share * (physical_memory() or memory_if_unknown))
@@ -152,8 +152,6 @@ def size_limit(*, share: float = 1 / 8, memory_if_unknown: int = 8_000_000_000) 
 
 def check_size(path: str | Path, promised: int) -> None:
     """Refuse a file that would unfold to more bytes in memory than fit well, before it does."""
-    if promised <= _ALWAYS_FITS and LIMIT_VARIABLE not in os.environ:
-        return  # to ask for the machine's memory takes longer than to read the file
     limit = size_limit()
     if promised > limit:
         raise FileFormatError(
@@ -166,10 +164,7 @@ def check_size(path: str | Path, promised: int) -> None:
 def check_memory(shape: Sequence[int], bytes_per_pixel: float, work: str) -> None:
     """Refuse an image of `shape` for which `work` needs more memory than there is."""
     needed = bytes_per_pixel * math.prod(shape)
-    is_limited = LIMIT_VARIABLE in os.environ
-    if needed <= _ALWAYS_FITS and not is_limited:
-        return
-    limit = size_limit() if is_limited else physical_memory()
+    limit = size_limit() if LIMIT_VARIABLE in os.environ else physical_memory()
     if limit is not None and needed > limit:
         raise InputError(
             f"{work} of {' × '.join(map(str, shape))} pixels needs about {needed / 1e9:.3g} GB of "
