@@ -63,18 +63,16 @@ class Format:
         return function(self.lister)(path) if self.lister else []
 
     def read(self, path: Path, variable: str | None = None, number: int | None = None) -> Any:
-        """Return the content of a file, one of its arrays, or one of the frames; see `reader`."""
+        """Return the content of a file, one of its arrays, or one of the frames; see `reader`.
+
+        Many frames are refused where one is read without its number.
+        """
         variable = self.array_name(path, variable)
         names = () if variable is None else (variable,)
         numbers = {} if number is None else {"number": number}
-        return function(self.named_reader if names else self.reader)(path, *names, **numbers)
-
-    def read_one(self, path: Path, variable: str | None = None) -> Any:
-        """Return the content of a file that has no more than one frame."""
-        variable = self.array_name(path, variable)
-        axes = self.count_frames(path, variable)
+        axes = self.count_frames(path, variable) if number is None else ()
         if prod(axes) == 1:
-            return self.read(path, variable)
+            return function(self.named_reader if names else self.reader)(path, *names, **numbers)
         first = f"{variable}[{','.join('0' * len(axes))}]"
         advice = "" if variable is None else f"choose one, such as {first!r}, or "
         raise FileFormatError(

@@ -113,25 +113,22 @@ def image_names(path: Path) -> list[str]:
 
 
 def _stored(path: Path, dataset: Any, number: int | None) -> AnyArray:
-    """Return all values of an array or one frame, rows first: MATLAB stores columns first."""
-    values = load_dataset(path, dataset) if number is None else _frame(path, dataset, number)
+    """Return all values of an array or one frame, rows first: MATLAB stores columns first.
+
+    Refuses a frame that is not written, which HDF5 would replace by zeros.
+    """
+    if number is None or dataset.ndim == 2:
+        values = load_dataset(path, dataset)
+    else:
+        check_array(path, dataset, math.prod(dataset.shape[-2:]))
+        index = tuple(map(int, np.unravel_index(number, dataset.shape[:-2])))
+        if not _is_written(dataset, index):
+            raise FileFormatError(
+                f"{path} does not hold frame {number} of {dataset.name!r} yet: wait until it is "
+                "written, or copy the file again"
+            )
+        values = np.asarray(dataset[index])
     return values.swapaxes(-1, -2) if is_of_matlab(dataset) else values
-
-
-def _frame(path: Path, dataset: Any, number: int) -> AnyArray:
-    """Read one frame, refusing one that is not written, which HDF5 would replace by zeros."""
-    index = (
-        tuple(map(int, np.unravel_index(number, dataset.shape[:-2]))) if dataset.ndim > 2 else ()
-    )
-    check_array(path, dataset, math.prod(dataset.shape[-2:]))
-    if not index:
-        return load_dataset(path, dataset)
-    if not _is_written(dataset, index):
-        raise FileFormatError(
-            f"{path} does not hold frame {number} of {dataset.name!r} yet: wait until it is "
-            "written, or copy the file again"
-        )
-    return np.asarray(dataset[index])
 
 
 def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:

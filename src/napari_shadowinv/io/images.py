@@ -96,7 +96,7 @@ def read_scan(path: Path) -> Scan:
         If it has no colours.
     """
     file_format = format_of(path)
-    content = file_format.read_one(path) if file_format.is_scan else None
+    content = file_format.read(path) if file_format.is_scan else None
     if not isinstance(content, tuple) or content[0].ndim != 3 or content[0].shape[-1] != 3:
         raise InputError(f"{path} is no picture in colour: expected a scan in red, green and blue")
     pixels, metadata = content

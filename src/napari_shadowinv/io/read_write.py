@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import re
 import tomllib
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -123,10 +122,8 @@ def _read_file(
             f"{path} is neither a MATLAB nor an HDF5 file nor a CR-39 scan (its kind is "
             f"{file_format.name!r}): variable {variable!r} does not apply; leave it out"
         )
-    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = (
-        file_format.read_one(path, variable)
-        if number is None
-        else file_format.read(path, variable, number)
+    content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = file_format.read(
+        path, variable, number
     )
     if not isinstance(content, tuple):
         return content
@@ -143,39 +140,27 @@ def _read_file(
         raise FileFormatError(
             f"{path} holds {array.dtype} pixels: expected whole or real numbers; convert them"
         )
-    shot = _as_radiograph(path, array, facts, channel)
-    warnings = film_warnings(array, channel) if file_format.is_scan else ()
-    setup = _complete_setup(path, metadata.get("geometry", {}))
-    return replace(
-        shot,
-        setup=setup,
-        in_file={**shot.in_file, "setup": setup},
-        path=path,
-        warnings=(*warnings, *shot.warnings),
-    )
-
-
-def _as_radiograph(
-    name: str | Path, array: AnyArray, facts: dict[str, Any], channel: str | int | None
-) -> Shot:
-    """Return what a reader gave as a radiograph, with one of its channels."""
-    image = to_grey(array, channel, name)
+    image = to_grey(array, channel, path)
     if not np.isfinite(image).any():
         raise FileFormatError(
-            f"{name} holds no finite pixel: expected an image; check how the file was saved"
+            f"{path} holds no finite pixel: expected an image; check how the file was saved"
         )
     if array.ndim == 3 and channel is not None:
         facts["channel"] = channel
     source, mask = facts.pop("source", None), facts.pop("mask", None)
     if source is not None:
         source = np.ascontiguousarray(source, dtype=np.float64)
+    setup = _complete_setup(path, metadata.get("geometry", {}))
+    doubts = film_warnings(array, channel) if file_format.is_scan else ()
     return Shot(
         image=image,
         metadata=facts,
         source=source,
-        in_file={"source": source},
         mask=mask,
-        warnings=tuple(facts.pop("warnings", ())),
+        setup=setup,
+        in_file={"source": source, "setup": setup},
+        path=path,
+        warnings=(*doubts, *facts.pop("warnings", ())),
     )
 
 
