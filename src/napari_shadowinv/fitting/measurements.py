@@ -167,10 +167,7 @@ def collect_data(
         weights=np.pad(np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0), fill),
         strengths=matrix,
         beams=np.pad(in_units, ((0, 0), *around), mode="edge"),
-        psf=[
-            _checked_point_spread(name, shot.psf, shape)
-            for name, shot in zip(names, shots, strict=True)
-        ],
+        psf=[_checked_point_spread(names[k], shot.psf, shape) for k, shot in enumerate(shots)],
         smoothness=np.tile(smoothness, (matrix.shape[1], 1)),
         **strip,
         free_brightness=free_brightness or unknown or is_dimmed,
@@ -603,9 +600,7 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray, names: Sequence[s
     for name, each in zip(names, noise, strict=True):
         sigma = as_numbers(f"noise of {name}", each)
         if not sigma.size or not np.isfinite(sigma).all() or sigma.min() <= 0:
-            raise InputError(
-                f"noise of {name} is not positive everywhere: expected standard deviations"
-            )
+            raise InputError(f"noise of {name} is not positive: expected standard deviations")
         if sigma.shape not in ((), data.shape[1:]):
             raise InputError(
                 f"noise of {name} has shape {sigma.shape}: expected one number, or an array like "
