@@ -156,10 +156,17 @@ def test_bad_files_fail_alone(folder, out):
     assert np.isnan(result.displacement[4]).all()
 
 
-def test_without_a_good_shot_there_is_no_store(folder, out):
+def test_store_waits_for_the_first_shot_that_can_be_read(folder, out):
     (folder / "shot_0.npy").write_bytes(b"")
     assert watched_once(folder, out, source=None) is None
     assert not out.exists()
+    with Watched(folder, out, source=None) as watch:
+        watch.until(lambda: any(event.note for event in watch.events))
+        put(folder, 1)
+        watch.ended(2)
+    (note,) = {event.note for event in watch.events if event.note}
+    assert "none of 1 shots can be read" in note
+    assert list(watch.result.status.values) == [FAILED, DONE]
 
 
 def test_it_goes_on_with_its_store_and_does_nothing_twice(folder, out):

@@ -490,5 +490,5 @@ def run_watch(
         say(text)
     if done:
         exit_unless_reliable(StackStore(out))
-    elif failed:
+    elif failed or waiting:
         raise typer.Exit(EXIT_FAILED_SHOTS)

@@ -33,7 +33,7 @@ from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
-from napari_shadowinv.preprocessing import MeasuredSource, Recipe, UniformEstimate
+from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.provenance import Origin, index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
@@ -128,6 +128,11 @@ def describe_stack(
         raise InputError(
             f"the shot of a stack has {', '.join(given)}, expected its source, masks and setup: "
             "describe the shots in a table"
+        )
+    if isinstance(common.source, (Estimate, Shot)) or common.beam_unknown:
+        raise InputError(
+            f"the source of the shots is {common.source!r:.60}: expected an image, a file, or one "
+            "for each shot; choose an estimate in the recipe"
         )
     resolved = map_paths(recipe or Recipe(), Path.absolute)  # for workers elsewhere
     if common.setup is not None:

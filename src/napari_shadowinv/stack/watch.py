@@ -197,7 +197,7 @@ class Watch:
 
     def _can_describe(self, waiting: list[str], most: int = 10) -> bool:
         """Describe the stack by its first shots, if one of them can be read."""
-        if waiting == self._unreadable:
+        if not waiting or waiting == self._unreadable:
             return False
         known: Iterable[str] = ()
         if self.filled is not None:
