@@ -204,6 +204,8 @@ class Entry:
         shown = self.line.value
         if shown == self._shown:
             return self._stated
+        if isinstance(self.line, magic.FloatSlider):
+            shown = round(shown, 5)  # it cuts off the sixth decimal
         if not self._is_text:
             return None if shown == self._default else shown
         return self._number_in(shown.strip()) if shown.strip() else None
@@ -211,7 +213,10 @@ class Entry:
     @value.setter
     def value(self, value: Any) -> None:
         value = self._plain(value)
-        self._stated = value = None if value == self._default else value
+        self._show(None if value == self._default else value)
+
+    def _show(self, value: Any) -> None:
+        self._stated = value
         shown = self._default if value is None else value
         if self._is_text:
             self.line.value = "" if value is None else _text_of(value, self._unit)
@@ -303,7 +308,7 @@ class Entry:
     def _read(self) -> None:
         """Read what the user has entered, and show a number with its unit."""
         if self.line.value != self._shown:
-            self.value = self.value
+            self._show(self.value)
             self._on_change()
 
 

@@ -103,7 +103,7 @@ class Simulate(panels.ToolPanel):
         self._build_object()
         self._build_plan()
         self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
-        self.verdict, self.report, self.plot = panels.VerdictLine(), panels.Report(), PlanPlot()
+        self.verdict, self.report, self.plot = panels.VerdictLine(), panels.ReportView(), PlanPlot()
         self.save_result = SaveButton(
             self,
             self._image_to_save,

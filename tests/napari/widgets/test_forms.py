@@ -97,6 +97,9 @@ def test_numbers_are_typed_with_units_and_shown_with_prefixes(qtbot: Any) -> Non
     assert form.state()["energy"] == 3.0
     enter(energy, "")
     assert "energy" not in form.state()
+    options = the_form(qtbot, InversionOptions)
+    enter(options.entries["floor"], "0.001")  # the default, stated
+    assert options.state() == {"floor": 0.001}
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from napari_shadowinv import Instrument
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, unit_of
 from napari_shadowinv._napari.viewer_sync import _text_overlay
 from napari_shadowinv._napari.widgets import _fitting
-from napari_shadowinv._napari.widgets._panels import Report
+from napari_shadowinv._napari.widgets._panels import ReportView
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE
 from simulated_pack import Truth
@@ -165,7 +165,7 @@ def overlay_text(window: Any) -> str:
 
 
 def report_of(tool: Any) -> str:
-    reports = tool.findChildren(Report)
+    reports = tool.findChildren(ReportView)
     return "\n".join(f"{title} {text}" for report in reports for title, text in report.rows)
 
 

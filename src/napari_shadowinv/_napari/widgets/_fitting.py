@@ -66,7 +66,7 @@ class FitView(QWidget):
             "the best."
         )
         self._solutions_row = forms.labelled("Solution", self.solutions)
-        self.report = panels.Report()
+        self.report = panels.ReportView()
         column(self, self.verdict, self._solutions_row, self.curve, self.report)
         self._redraw_timer = timer(self, _REDRAW_MS, self._draw)
         self.solutions.currentIndexChanged.connect(self._show_alternative)

@@ -48,7 +48,7 @@ def warning_rows(facts: Iterable[Fact]) -> list[tuple[str, str]]:
     return [(fact.title, fact.text) for fact in facts if fact.key in codes]
 
 
-class Report(QtWidgets.QWidget):
+class ReportView(QtWidgets.QWidget):
     """Titles and texts in a column, to be read and copied; details are folded below."""
 
     def __init__(self) -> None:

@@ -19,7 +19,7 @@ from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.run import Outcome, Run
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes
-from napari_shadowinv._napari.widgets._panels import Report
+from napari_shadowinv._napari.widgets._panels import ReportView
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
@@ -152,7 +152,7 @@ class ProductForm(QtWidgets.QWidget):
         self.panel = Run("analysis", "Measure", "Measure the product with its bands.")
         self.panel.button.clicked.connect(lambda: self._run_or_cancel())
         self.panel.ended.connect(self._on_end)
-        self.plot, self.report = ProductPlot(), Report()
+        self.plot, self.report = ProductPlot(), ReportView()
         self.export = qt.push_button("Export CSV…", "Save all measured products.", self._export)
         self.save = qt.push_button(
             "Save with result…", "Save the result with all measured products.", self._save

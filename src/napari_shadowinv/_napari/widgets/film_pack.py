@@ -306,7 +306,7 @@ class FilmPack(panels.ToolPanel):
             "TOML file with films, filters, scans and calibrations, as for the command "
             "<code>shadowinv film</code>.",
         )
-        self.report = panels.Report()
+        self.report = panels.ReportView()
         self.packs = LayerPicker(
             self.viewer,
             "<qt>Fluence of a pack, from a run or from a .shadowinv file.</qt>",

@@ -121,7 +121,7 @@ class InvertShot(InversionInputs, panels.ToolPanel):
         self.cost, self._pace = forms.WrappingLabel(), 1.0
         self.refine_section = RefineSection(self.refine)
         self.fit_view = FitView(self.viewer, self.panel)
-        self.verdict, self.report = panels.VerdictLine(), panels.Report()
+        self.verdict, self.report = panels.VerdictLine(), panels.ReportView()
         self._reported: about.Result[Any] | None = None
         self.save_result, self.more_layers = result_buttons(
             self,

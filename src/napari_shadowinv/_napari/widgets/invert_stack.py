@@ -21,7 +21,7 @@ from napari_shadowinv._napari.widgets import _stack_jobs as stack_jobs
 from napari_shadowinv._napari.widgets._files import result_buttons, shot_to_save
 from napari_shadowinv._napari.widgets._inputs import InversionInputs
 from napari_shadowinv._napari.widgets._layers import LayerPicker, stack_of
-from napari_shadowinv._napari.widgets._panels import Report, ToolPanel
+from napari_shadowinv._napari.widgets._panels import ReportView, ToolPanel
 from napari_shadowinv._napari.widgets._qt import notify_errors, side_by_side, timer, while_alive
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together
 from napari_shadowinv._napari.widgets._tables import ShotTable
@@ -217,7 +217,7 @@ class InvertStack(InversionInputs, ToolPanel):
         tip = "<qt>Retry the shots that failed in an earlier run.</qt>"
         self.redo_failed = QCheckBox("retry failed shots", toolTip=tip)
         self.engine = EnginePicker()
-        self.report = Report()
+        self.report = ReportView()
         self.save_result, self.more_layers = result_buttons(
             self,
             lambda: self.results,
@@ -226,7 +226,7 @@ class InvertStack(InversionInputs, ToolPanel):
         )
         self.failures_title = QLabel("Failed shots")
         self.failures_title.setVisible(False)
-        self.failures = Report()
+        self.failures = ReportView()
         self.add(self.shots, *self.beam, *self.settings, labelled("Store", self.store))
         self.add(labelled("", self.overwrite), labelled("", self.redo_failed), self.engine)
         self.add(self.panel, side_by_side((self.save_result, 1), (self.more_layers, 1)))
