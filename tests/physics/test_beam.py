@@ -54,6 +54,7 @@ def test_setup_with_units_equals_the_one_in_si() -> None:
         ("25 m", "m", 25.0),
         ("0.28", "m", 0.28),
         ("inf", "m", math.inf),
+        ("Infinity", "m", math.inf),  # of JSON
         ("2e19 cm^-3", "m⁻³", 2e25),
         ("97 MG µm", "MG µm", 97.0),
         ("1.5 px", "px", 1.5),
@@ -237,3 +238,8 @@ def test_deflection_warnings_doubt_fields_of_kilotesla_metres():
     )
     pixels = setup.displacement(np.array([[[0.2]], [[0.0]]]))
     assert "T m, far more" in deflection_warnings(setup, pixels)[0].text
+
+
+def test_a_collimated_beam_comes_back_from_json() -> None:
+    setup = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=1.2e-5)
+    assert OpticalSetup.model_validate_json(setup.model_dump_json()) == setup

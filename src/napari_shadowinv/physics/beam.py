@@ -64,7 +64,7 @@ def number_in_unit(text: str, unit: str) -> float:
         If the text is no number, or its unit does not measure the same.
     """
     text = text.strip()
-    if text.lower() in ("inf", "infinite", "∞"):
+    if text.lower() in ("inf", "infinity", "infinite", "∞"):
         return math.inf
     example = _EXAMPLES.get(unit, f"8 {unit}")
     expected = f"expected a number in {unit}, or one with a unit such as '{example}'"
