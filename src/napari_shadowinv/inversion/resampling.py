@@ -221,7 +221,7 @@ class Sampler:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """The noise, the parts of the instrument that are drawn, and the edge."""
+        """Causes of the scatter: the noise, what is drawn of the instrument, and the edge."""
         draws = self.resampling.instrument
         return (
             "noise",
