@@ -454,45 +454,6 @@ def test_rerun_takes_moved_images_in_their_order(
     assert "nothing" not in output
 
 
-def test_rerun_reports_an_older_version() -> None:
-    assert shadowinv("fit", "a.tif", "--bin", 1, *QUICK).exit_code in (0, 3)
-    fit, _ = fit_in("a_fit.shadowinv")
-    assert fit.provenance is not None
-    older = fit.provenance.model_copy(update={"version": "0.0.1"})
-    write(Path("old.shadowinv"), dataclasses.replace(fit, provenance=older))
-    output = flat(shadowinv("rerun", "old.shadowinv").stdout)
-    assert "changed made by version 0.0.1, now" in output
-    assert "the same result, bit for bit" in output
-
-
-def test_rerun_uses_the_fiducials_and_masks() -> None:
-    rng = np.random.default_rng(3)
-    for name in ("one", "two"):
-        tifffile.imwrite(f"{name}.tif", (rng.random((480, 640)) > 0.15).astype(np.uint8))
-        tifffile.imwrite(f"image_{name}.tif", rng.normal(100, 1, (480, 640)).astype(np.float32))
-    lines = ["file,strength,mask", "image_one.tif,1,one.tif", "image_two.tif,2,two.tif"]
-    Path("shots.csv").write_text("\n".join(lines))
-    rows = ["y,x,dy,dx,sigma", *(f"{k % 30}.25,{k % 40}.5,0,0,10" for k in range(1000))]
-    Path("mesh.csv").write_text("\n".join(rows))
-    part = ("--step", "crop y=9:49 x=8:56")
-    result = shadowinv("fit", "shots.csv", "--fiducials", "mesh.csv", *part, *QUICK)
-    assert result.exit_code in (0, 3), result.output
-    provenance = provenance_in("image_one_fit.shadowinv")
-    assert [origin.file for origin in provenance.masks] == ["one.tif", "two.tif"]
-    assert provenance.fiducials is not None
-    assert provenance.fiducials.file == "mesh.csv"
-    for name in ("one.tif", "two.tif", "mesh.csv"):  # all of them are in the result
-        Path(name).unlink()
-    assert "bit for bit" in shadowinv("rerun", "image_one_fit.shadowinv").stdout
-
-
-def test_rerun_refuses_a_fit_without_provenance(
-    refused: Callable[..., None], make_fit: Callable[..., Fit]
-) -> None:
-    write(Path("fit.shadowinv"), make_fit())
-    refused("rerun", "fit.shadowinv", names=("fit.shadowinv has no provenance",))
-
-
 # Recipes
 
 

@@ -80,8 +80,11 @@ def test_particles_are_traced_through_a_field_on_a_grid(folder):
     assert "would be determined: 2 of 2" in flat(answer.output)
     for arguments, message in (
         (("cube.nc",), "particles through it need --setup"),
-        (("cube.nc", *view, "--deflector", "magnetic field"), "which needs only --setup"),
-        (("toroid", *view), "received view.beam, view.right, but toroid is no 3-D field"),
+        (
+            ("cube.nc", *view, "--deflector", "magnetic field"),
+            "--deflector, which does not apply to cube.nc",
+        ),
+        (("toroid", *view), "received view.beam, view.right, which does not apply to toroid"),
     ):
         refused = shadowinv("plan", *arguments, "--out", "other.csv")
         assert refused.exit_code == 2
@@ -118,7 +121,7 @@ def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):
         (("plan", "blob", "--sweep", "count=1,2"), "did you mean 'counts'"),
         (("plan", "blob", "--counts", "-1"), "--counts is -1"),
         (("plan", "blob", "--set=instrument.background=2"), "instrument.background is '2'"),
-        (("plan", "blob", "--deflector", "plasma"), "not a phantom"),
+        (("plan", "blob", "--deflector", "plasma"), "does not apply to blob, a phantom"),
         (("plan", "missing.shadowinv"), "missing.shadowinv"),
         (("plan", "blob", "--out", "plan.txt"), "plan.txt cannot be written"),
     ],

@@ -45,7 +45,6 @@ from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
     Bin,
-    ButterworthFilter,
     Crop,
     HotPixelFilter,
     LowPassFilter,
@@ -578,7 +577,7 @@ def test_forward_to_another_energy(folder: Path, shot: Path) -> None:
     arguments = ["forward", "shot.shadowinv", "--setup", "low.toml", "--out"]
     result = shadowinv(*arguments, "low.npy")
     assert result.exit_code == 0, result.output
-    assert "assuming that only a magnetic field deflects the beam" in result.stdout
+    assert "only a magnetic field deflects the beam" in flat(result.stdout)
     assert "3 MeV proton" in result.stdout
     # Momenta in MeV/c, from T (T + 2 m c²).
     ratio = (14.7 * (14.7 + 2 * 938.27209) / (3.0 * (3.0 + 2 * 938.27209))) ** 0.5
@@ -700,56 +699,16 @@ def test_reference_in_a_text_image_is_the_source(folder: Path) -> None:
     assert "would flatten the image but not the source" in flat(refused.output)
 
 
-def test_sources_are_estimated_as_the_library_does(folder: Path) -> None:
-    y, x = np.mgrid[:24, :32]
-    beam = 100 * np.exp(-((y - 10) ** 2 + (x - 18) ** 2) / 500)
-    image = synthetic_image(BLOB.displacement, beam)
-    np.save("shot.npy", image)
-    bare = np.hypot(y - 10, x - 18) > 9
-    iio.imwrite("bare.png", bare.astype(np.uint8))
-    usable = np.ones((24, 32), np.uint8)
-    usable[:4, :5] = 0
-    iio.imwrite("usable.png", usable)
-    mask = usable > 0
-    bare_file, mask_file = ["--set=source_mask=bare.png"], ["--mask", "usable.png"]
-    choices: tuple[tuple[str, list[str], np.ndarray], ...] = (
-        ("uniform", [], sources.uniform_source(image)),
-        ("gaussian", bare_file, sources.gaussian_source(image, mask=bare)),
-        ("polynomial", ["degree=3"], sources.polynomial_source(image, degree=3)),
-        ("low-pass", ["width=4"], sources.low_pass_source(image, 4.0)),
-        (
-            "total-variation",
-            ["weight=0.5", *mask_file],
-            sources.total_variation_source(image, weight=0.5, mask=mask),
-        ),
-        (
-            "interpolated",
-            ["width=2", *bare_file, *mask_file],
-            sources.interpolated_source(image, bare & mask, width=2.0),
-        ),
-        (
-            "kriged",
-            bare_file,
-            sources.kriged_source(image, bare, on_caution=lambda caution: None),
-        ),
+def test_an_estimated_source_is_described(shot: Path) -> None:
+    result = shadowinv("invert", shot, "--source-from", "polynomial degree=3")
+    assert result.exit_code in (0, 3), result.output
+    saved = dataset("shot.shadowinv")
+    np.testing.assert_array_equal(
+        saved["source"], sources.polynomial_source(np.load(shot), degree=3)
     )
-    for name, flags, expected in choices:
-        words = [flag for flag in flags if "=" in flag and not flag.startswith("--")]
-        flags = [flag for flag in flags if flag not in words]
-        source = " ".join([name, *words])
-        result = shadowinv("invert", "shot.npy", "--source-from", source, *flags, "--overwrite")
-        assert result.exit_code in (0, 3), result.output
-        used = mask if "usable.png" in flags else True
-        saved = dataset("shot.shadowinv")
-        np.testing.assert_array_equal(saved["source"], np.where(used, expected, 0))
-        provenance = Inversion.from_dataset(saved).provenance
-        assert provenance is not None
-        assert provenance.recipe.estimate is not None
-        assert provenance.recipe.estimate.name() == name
-        text = flat(shadowinv("info", "shot.shadowinv").stdout)
-        assert f"source {provenance.recipe.estimate.summary}" in text
-        basis = "measured outside the object" if name == "kriged" else "assumed"
-        assert f"beam {basis}" in text
+    text = flat(shadowinv("info", "shot.shadowinv").stdout)
+    assert "source polynomial" in text
+    assert "beam assumed" in text
 
 
 def test_filters_match_the_library(folder: Path) -> None:
@@ -792,50 +751,6 @@ def test_filters_match_the_library(folder: Path) -> None:
     # A measured source is blurred as its shot is.
     beam = prepared("shot.npy", source="beam.npy", steps=["low-pass 2"]).source
     np.testing.assert_array_equal(beam, filters.low_pass(ramp, 2.0))
-
-
-def test_butterworth_filter_matches_the_library(folder: Path, shot: Path) -> None:
-    image = np.load(shot)
-    flags = ["--step=butterworth 12 order=3"]
-    result = shadowinv("invert", shot, "--set=options.n_sites=300", *flags)
-    assert result.exit_code == 0, result.output
-    saved = dataset("shot.shadowinv")
-    expected = filters.butterworth(image, 12.0, 3)
-    np.testing.assert_allclose(
-        saved["image"], expected * saved["source"].mean().item() / expected.mean()
-    )
-    steps = Inversion.from_dataset(saved).provenance.recipe.steps
-    assert steps == (ButterworthFilter(cutoff=12, order=3),)
-    # What keeps the large structures keeps the beam: a measured source is filtered alike.
-    np.save("beam.npy", image)
-    beam = prepared("shot.npy", source="beam.npy", steps=["butterworth 9 kind=low"]).source
-    np.testing.assert_array_equal(beam, filters.butterworth(image, 9.0, kind="low"))
-
-
-def test_filters_do_not_see_masked_pixels(folder: Path, shot: Path) -> None:
-    usable = np.ones((24, 32), np.uint8)
-    usable[:5, :6] = 0
-    iio.imwrite("usable.png", usable)
-    steps = ["low-pass 2", "hot-pixels 6", "background degree=1"]
-    images = []
-    for junk in (0.0, 1e5, np.nan):
-        image = np.load(shot)
-        image[:5, :6] = junk
-        np.save(shot, image)
-        images.append(prepared(shot.name, mask="usable.png", steps=steps).image)
-    np.testing.assert_array_equal(images[0], images[1])
-    np.testing.assert_array_equal(images[0], images[2])
-    flags = ["--mask", "usable.png", "--step=low-pass 2", "--step=hot-pixels 6"]
-    assert shadowinv("invert", shot, *flags).exit_code == 0
-    # Nor in a source that was recorded with the same detector.
-    beam = np.full((24, 32), 100.0)
-    for junk, name in ((1e5, "one.shadowinv"), (np.nan, "two.shadowinv")):
-        beam[:5, :6] = junk
-        np.save("beam.npy", beam)
-        result = shadowinv("invert", shot, "--source", "beam.npy", *flags, "--out", name)
-        assert result.exit_code == 0, result.output
-    first, second = dataset("one.shadowinv"), dataset("two.shadowinv")
-    np.testing.assert_array_equal(first["displacement"], second["displacement"])
 
 
 @pytest.mark.parametrize(
@@ -1434,19 +1349,3 @@ def test_the_package_runs_as_the_command() -> None:
     command = [sys.executable, "-m", "napari_shadowinv", "--version"]
     ended = subprocess.run(command, capture_output=True, text=True, check=True)
     assert ended.stdout == f"shadowinv {__version__}\n"
-
-
-def test_a_doubt_of_the_setup_is_printed_once(shot: Path) -> None:
-    Path("swapped.toml").write_text(PROTON_TOML.replace("= 0.01", "= 1").replace("0.3", "0.01"))
-    result = shadowinv("invert", shot, "--set=options.n_sites=300", "--setup", "swapped.toml")
-    printed = flat(result.stdout) + flat(result.stderr)
-    assert printed.count("the magnification is 1.01") == 1
-    # The result keeps it.
-    assert "the magnification is 1.01" in flat(shadowinv("info", "shot.shadowinv").stdout)
-
-
-def test_info_lists_options_that_have_a_value(shot: Path) -> None:
-    shadowinv("invert", shot)
-    text = flat(shadowinv("info", "shot.shadowinv").stdout)
-    assert "= None" not in text
-    assert "boundary = closed" in text

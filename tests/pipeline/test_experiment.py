@@ -19,7 +19,6 @@ from napari_shadowinv.pipeline.experiment_object import (
     object_of_displacement,
     object_of_field,
     object_of_phantom,
-    object_of_potential,
     object_of_result,
     phantom_of_text,
 )
@@ -27,7 +26,6 @@ from napari_shadowinv.pipeline.experiment_result import (
     ExperimentPlan,
     PlannedShot,
     Spread,
-    table_text,
 )
 from napari_shadowinv.pipeline.experiment_shots import ExperimentInputs, ShotSimulator
 
@@ -59,20 +57,6 @@ def image_of(instrument: Instrument = EXACT, number: int = 0, **choices) -> NDAr
 
 
 # Objects
-
-
-def test_the_object_of_a_potential_displaces_by_minus_its_gradient() -> None:
-    sigma, peak = 9.0, 40.0
-    y, x = np.indices((64, 72)) - np.reshape((30.0, 37.0), (2, 1, 1))
-    potential = peak * np.exp(-(y**2 + x**2) / 2 / sigma**2)
-    truth = np.stack([y, x]) / sigma**2 * potential
-    in_px = object_of_potential(potential)
-    in_metres = object_of_potential(SETUP.potential(potential), SETUP)
-    for target in (in_px, in_metres):
-        np.testing.assert_allclose(target.samples, truth, atol=0.005 * np.abs(truth).max())
-    assert in_metres.setup == SETUP
-    with pytest.raises(InputError, match="potential"):
-        object_of_potential(np.stack([potential, potential]))
 
 
 def test_a_phantom_displaces_by_its_formula():
@@ -463,13 +447,6 @@ def test_a_determined_field_that_is_wrong_is_reported():
 
 def test_tables_have_a_row_for_each_draw():
     plan = plan_of([shot(0, 0.01, noise=0.02), shot(1, 0.2, noise=0.02)])
-    header, *rows = table_text(plan.rows()).splitlines()
-    assert header == "draw,verdict,error,peak_error,reported_error,searched,part_noise"
-    assert rows[1].startswith("1,determined,0.2,")
-
-
-def test_a_dataset_has_units_and_all_draws():
-    dataset = plan_of([shot(0, 0.01, noise=0.02), shot(1, 0.2, noise=0.02)]).to_dataset()
-    assert dataset["error"].values.tolist() == [0.01, 0.2]
-    assert dataset["parts"].sel(cause="noise").values.tolist() == [0.02, 0.02]
-    assert dataset["displacement"].attrs["units"] == "pixel"
+    first, second = plan.rows()
+    assert ",".join(first) == "draw,verdict,error,peak_error,reported_error,searched,part_noise"
+    assert (second["draw"], second["verdict"], second["error"]) == (1, "determined", 0.2)

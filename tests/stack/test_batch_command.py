@@ -20,18 +20,18 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
-from rich import progress
-from rich.console import Console
 from typer.testing import Result
 
 from helpers.command_line import flat, interrupted, shadowinv
 from napari_shadowinv import InversionOptions, invert, read, synthetic_image
-from napari_shadowinv.cli._batch import progress_columns
+from napari_shadowinv.cli._batch import _Printer
+from napari_shadowinv.cli._terminal import progress_bars
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.facts import Level, Verdict
 from napari_shadowinv.io import store_writing
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.stack import RunStatus
 
 HERE = Path(__file__).parent
 SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
@@ -312,18 +312,20 @@ def test_status_of_all_shots_fits_80_columns(night, folder, monkeypatch):
     )
 
 
-def test_progress_of_a_batch_fits_80_columns():
+def test_progress_of_a_batch_fits_80_columns(folder, monkeypatch):
     text = io.StringIO()
-    console = Console(file=text, width=80, force_terminal=True, color_system=None)
-    bars = progress.Progress(*progress_columns(), console=console, expand=True)
-    words = {"rate": "12.3 shots/min", "remaining": "3 min left", "failed": "2 failed"}
-    last = "a_long_name_of_a_shot_of_the_night_0123.tif, 3.2 s"
-    bars.add_task("4 threads", total=500, completed=123, last=last, **words)
-    console.print(bars.get_renderable())
-    (line,) = text.getvalue().splitlines()
-    assert len(line) <= 80
-    for word in ("4 threads", "123/500", *words.values()):
-        assert word in line
+    monkeypatch.setattr(sys, "stderr", text)
+    for name, value in {"COLUMNS": "80", "FORCE_COLOR": "1"}.items():
+        monkeypatch.setenv(name, value)
+    status = RunStatus(
+        total=500, done=121, failed=2, waiting=377, ended=60, seconds=300.0, scheduler="4 threads",
+        name="a_long_name_of_a_shot_of_the_night_0123.tif",
+    )  # fmt: skip
+    with progress_bars() as show:
+        _Printer(quiet=True, show=show).update(status)
+    lines = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", text.getvalue()).split("\n")
+    assert max(map(len, lines)) <= 80
+    assert any("4 threads" in line and "121 of 500 done" in line for line in lines)
 
 
 @pytest.mark.parametrize("text", ["6", "a", "1:2:3:4", ""])

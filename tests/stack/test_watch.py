@@ -317,22 +317,22 @@ def test_ctrl_c_is_the_normal_end_unless_files_wait(
 ):
     np.save(tmp_path / "reference.npy", SOURCE)
     put(folder, *range(files))
-    update = _batch._WatchPrinter.update
+    update = _batch._Printer.update
 
     def update_and_interrupt(printer: Any, progress: RunStatus) -> None:
         update(printer, progress)
         if progress.outcome is not None:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(_batch._WatchPrinter, "update", update_and_interrupt)
+    monkeypatch.setattr(_batch._Printer, "update", update_and_interrupt)
     result = shadowinv(
         "watch", folder, "--pattern", "*.npy", "--source", tmp_path / "reference.npy",
         "--set=options.n_sites=100", "--out", out,
     )  # fmt: skip
     assert result.exit_code == code
-    remainder = ", 2 not yet inverted" if files > 1 else ""
+    remainder = ", 2 waiting" if files > 1 else ""
     (end,) = [line for line in result.output.splitlines() if line.startswith("Stopped")]
-    assert end == f"Stopped: 1 done, 0 failed{remainder}; repeat the command to continue {out}."
+    assert end == f"Stopped: 1 done{remainder}; repeat the command to continue {out}."
     assert list(read(out).status.values) == [DONE]
     assert not list(tmp_path.glob(".*.lock"))
 

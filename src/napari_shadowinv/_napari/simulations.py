@@ -22,23 +22,26 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level, percent
+from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential, number_in_unit
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
+from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.physics.trace_options import GridView, SizedView
+from napari_shadowinv.physics.trace_options import GridView
+from napari_shadowinv.physics.tracing import trace
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.experiment import plan_experiment, sweep_experiment
 from napari_shadowinv.pipeline.experiment_object import (
     PlannedObject,
     object_of_displacement,
+    object_of_field,
 )
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
 from napari_shadowinv.pipeline.inversion_run import plane_of
-from napari_shadowinv.pipeline.traced_file import object_of_file, trace_file
 
 _FIELDS = ("field", "field y", "field x")
 
@@ -185,10 +188,9 @@ class ForwardJob(Job):
         keywords: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
         if isinstance(self.object, GridFile):
             source, shadow = self._source(self.shape)
-            height, width = self.shape
-            view = SizedView(**dict(self.object.view), height=height, width=width)
-            keywords |= {"view": view, "source": source}
-            traced = trace_file(Path(self.object.path), self.setup, **keywords)
+            grid = self.object.view.apply(read_field_grid(Path(self.object.path)))
+            shape: Any = self.shape if source is None else np.shape(source)
+            traced = trace(grid, check_particles(self.setup), shape, profile=source, **keywords)
             image, displacement = traced.image, np.nan_to_num(traced.displacement)
             flux = traced.source.sum()
             doubts = [fact.text for fact in traced.facts if fact.level is not Level.SOUND]
@@ -285,8 +287,9 @@ class PlanJob(Job):
             return self.object
         Reporter(*callbacks)("field", 0, None)
         if isinstance(self.object, GridFile):
-            setup = next(iter(self.setups), None)
-            return object_of_file(Path(self.object.path), setup, self.object.view)
+            path, setup = Path(self.object.path), next(iter(self.setups), None)
+            grid = self.object.view.apply(read_field_grid(path))
+            return object_of_field(grid, setup, title=path.name)
         field = self.object
         return object_of_displacement(field.displacement(), field.setup, title=field.title)
 

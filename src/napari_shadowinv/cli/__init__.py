@@ -18,6 +18,7 @@ from napari_shadowinv.cli import (
     _analyse_command,
     _film_command,
     _fit_command,
+    _forward_command,
     _plan_command,
     _shot_commands,
     _stack_commands,
@@ -81,7 +82,7 @@ app.command(epilog=_shot_commands.INVERT_EPILOG)(_shot_commands.invert)
 app.command()(_shot_commands.rerun)
 app.command(epilog=_fit_command.EPILOG)(_fit_command.fit)
 app.command(epilog=_film_command.EPILOG)(_film_command.film)
-app.command(epilog=_shot_commands.FORWARD_EPILOG)(_shot_commands.forward)
+app.command(epilog=_forward_command.EPILOG)(_forward_command.forward)
 app.command(epilog=_analyse_command.EPILOG)(_analyse_command.analyse)
 app.command(epilog=_plan_command.EPILOG)(_plan_command.plan)
 app.command()(_shot_commands.info)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,8 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Option
 
-from napari_shadowinv.cli import _flags, _inputs
-from napari_shadowinv.cli._summary import Rows, fact_rows, two_columns, written_rows
+from napari_shadowinv.cli import _flags
+from napari_shadowinv.cli._inputs import read_setup
+from napari_shadowinv.cli._outputs import Outputs
+from napari_shadowinv.cli._settings import numbers_of
+from napari_shadowinv.cli._summary import Rows, fact_rows, two_columns
 from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
 
@@ -71,16 +73,17 @@ def analyse(
     """
     from napari_shadowinv.analysis import add_products, analyse_shots, products_table
     from napari_shadowinv.analysis import analyse as measure
+    from napari_shadowinv.analysis.series import shot_times
     from napari_shadowinv.io import read_dataset, replacing, write
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
     from napari_shadowinv.io.store import is_stack
     from napari_shadowinv.io.store_shots import open_shots
-    from napari_shadowinv.pipeline.files import setup_from
 
-    chosen = _products(product or [], flags.products)
-    files = (csv, SITES.suffixes), (figure, FIGURE_SUFFIXES), (out, RESULT.suffixes)
-    outputs = _inputs.check_outputs(files, overwrite)
-    _inputs.protect(outputs, [result, flags.setup, flags.products])
+    chosen, outputs = _products(product or [], flags.products), Outputs(overwrite, quiet)
+    outputs.check(
+        [(csv, SITES.suffixes), (figure, FIGURE_SUFFIXES), (out, RESULT.suffixes)],
+        [result, flags.setup, flags.products],
+    )
     if is_stack(result):
         if out is not None:
             raise InputError(
@@ -96,11 +99,14 @@ def analyse(
         common: dict[str, Any] = {
             "unit": flags.unit,
             "deflector": flags.deflector,
-            "setup": None if flags.setup is None else setup_from(flags.setup),
+            "setup": read_setup(flags.setup),
             **callbacks,
         }
         if "shot" in dataset.dims:
-            seconds = _times(flags.times, dataset["index"].values.tolist())
+            seconds = None
+            if flags.times is not None:
+                numbers, shots = numbers_of("--times", flags.times), dataset["index"].values
+                seconds = shot_times(numbers, shots.tolist(), f"--times is {flags.times!r}")
             series = analyse_shots(dataset, chosen, seconds, **common)
             results = [each.result for each in series]
         else:
@@ -111,30 +117,16 @@ def analyse(
             temporary.write_text(products_table(results), encoding="utf-8")
         if out is not None:
             write(out, add_products(dataset, results), overwrite=overwrite)
-    failed: list[Path] = []
     if figure is not None:
         from napari_shadowinv.plotting import products_figure
 
-        failed = _inputs.write_figures({figure: lambda: products_figure(results)}, overwrite)
+        outputs.write_figures({figure: lambda: products_figure(results)})
     if not quiet:
         for table in _tables(results):
             say(table)
-        if outputs:
-            say(two_columns("Files", written_rows(outputs, failed)))
-    _inputs.exit_unless_drawn(failed)
-
-
-def _times(text: str | None, shots: Sequence[int]) -> list[float] | None:
-    """Return the times of numbered shots from the time between two, or from a list of all."""
-    from napari_shadowinv.analysis.series import shot_times
-
-    if text is None:
-        return None
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    return shot_times(numbers, shots, f"--times is {text!r}")
+    if outputs.files:
+        outputs.show("Files", [])
+    outputs.exit_unless_drawn()
 
 
 def _products(texts: list[str], file: Path | None) -> list[Product]:

@@ -9,29 +9,31 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
-from rich import box, progress
-from rich.console import Console
-from rich.table import Column, Table
+from rich import box
+from rich.table import Table
 
+from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.cli._summary import Rows, options_text, two_columns
+from napari_shadowinv.cli._summary import Rows, options_text, provenance_rows, two_columns
 from napari_shadowinv.cli._terminal import (
+    EXIT_FAILED_SHOTS,
     EXIT_NOT_CONVERGED,
     cancel_exit_code,
     is_interrupted,
     plain,
     say,
     say_on_stderr,
+    work_callbacks,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.facts import Verdict, percent
@@ -45,27 +47,99 @@ from napari_shadowinv.io.store import (
     check_store_path,
 )
 from napari_shadowinv.physics.setup import beam_quantities
+from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from napari_shadowinv._system.progress import OnProgress
     from napari_shadowinv.io.store_columns import ShotColumn
     from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunStatus
 
-EXIT_FAILED_SHOTS = 1
-_BAR_COLUMNS = 16
-_MAX_LISTED = 10  # shots that a row lists
+_MAX_LISTED = 10  # shots, or reasons, that a row lists
 _LINE_COLUMNS = 100
 _MIN_NAME_COLUMNS = 12
 
 
 def _rate_text(status: RunStatus) -> str:
-    if not status.ended:
-        return "no shot finished"
     rate = status.rate
     return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
+
+
+@dataclass
+class _Printer:
+    """Printer of a run, by a bar or a line for each shot, with its latest status.
+
+    Attributes
+    ----------
+    quiet : bool
+        Whether to print nothing.
+    watched : str
+        The folder of a watch and its files in words, empty for another run.
+    show : callable, optional
+        Shows the progress of all shots.
+    """
+
+    quiet: bool
+    watched: str = ""
+    show: OnProgress | None = None
+    status: RunStatus | None = None
+    warned: set[str] = field(default_factory=set)
+
+    def update(self, status: RunStatus) -> None:
+        is_first = self.status is None
+        if not (status.note or status.stage):
+            self.status = status
+        if self.show is not None:
+            self.show(self._progress(status))
+        if self.quiet:
+            return
+        if status.outcome is not None and status.outcome.reason:
+            name = f"{status.name}{' (again)' * status.again}"
+            say_on_stderr(f"failed: {name}: {status.outcome.reason}", "red")
+        elif not self.watched:
+            return
+        elif status.note or status.stage:
+            text = status.note or f"{status.stage[:1].upper()}{status.stage[1:]}"
+            say_on_stderr(text, "dim")
+        elif status.outcome is not None:
+            self._print_shot(status, status.outcome.seconds)
+        elif is_first:
+            counts = f"{status.text}; " if status.total else ""
+            say(f"Watching {self.watched}; {counts}press Ctrl-C to stop.")
+
+    def _progress(self, status: RunStatus) -> Progress:
+        """Return the shots that have ended, the rate, the time that remains, the last shot."""
+        if status.stage:
+            return Progress(status.stage, 0)
+        texts = [status.text]
+        if status.remaining is not None:
+            time_left = timedelta(seconds=round(status.remaining))
+            texts += [_rate_text(status), f"{time_left} left" if status.waiting else "finishing"]
+        message = "; ".join(filter(None, [", ".join(texts), status.name]))
+        return Progress(status.scheduler, status.done + status.failed, status.total, message)
+
+    def _print_shot(self, status: RunStatus, seconds: float) -> None:
+        result = status.result
+        assert result is not None
+        name = f"{status.name} (again, as the file has changed)" if status.again else status.name
+        texts = [*(fact.short for fact in result.facts if fact.short), f"{seconds:.2f} s"]
+        texts += [f"{status.waiting} waiting"] if status.waiting else []
+        texts += [f"{status.skipped} skipped"] if status.skipped else []
+        # A verdict that is no success implies its warnings.
+        if result.verdict.level.is_success and (count := len(result.cautions)):
+            texts.append(f"{count} warning{'s' if count > 1 else ''}")
+        summary = "".join(f"  {text}" for text in texts)
+        columns = max(_LINE_COLUMNS - len(summary), _MIN_NAME_COLUMNS)
+        if len(name) > columns:  # its end identifies the file
+            name = f"…{name[1 - columns :]}"
+        say(f"{name}{summary}", "" if result.headline.level.is_success else "yellow")
+        for warning in result.cautions:
+            if warning.code not in self.warned:
+                self.warned.add(warning.code)
+                say_on_stderr(f"warning: {status.name}: {warning.text}", "yellow")
 
 
 def run_batch(
@@ -90,9 +164,10 @@ def run_batch(
             f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
             "--overwrite to start again, or another name"
         )
+    printer = _Printer(quiet)
     try:
-        bar = _ProgressBar(quiet)
-        with bar.bars:
+        with work_callbacks(quiet) as callbacks:
+            printer.show = callbacks["on_progress"]
             run_stack(
                 shots[0] if len(shots) == 1 else shots,
                 out,
@@ -100,7 +175,7 @@ def run_batch(
                 reader=reader,
                 run=run,
                 scheduler=scheduler,
-                on_progress=bar.update,
+                on_progress=printer.update,
                 should_stop=is_interrupted,
             )
     except (KeyboardInterrupt, InversionCancelled):
@@ -108,16 +183,18 @@ def run_batch(
         say_on_stderr(f"Cancelled: {counts}. Repeat the command with --resume to continue.")
         raise typer.Exit(cancel_exit_code()) from None
     folders = [Path(path) for path in shots if os.path.isdir(path)]
-    left_out = filter(None, map(left_out_of, folders))
-    store, status = StackStore(out), bar.status
-    text = "nothing to do"
+    store, status, text = StackStore(out), printer.status, "nothing to do"
     if status is not None and status.ended:
         text = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
     if not quiet:
         rows = [
             ("shots", _counts_text(store)),
             ("this run", text),
-            *(("left out", f"{text}; name others as a pattern in quotes") for text in left_out),
+            *(
+                ("left out", f"{counts}; name others as a pattern in quotes")
+                for counts in map(left_out_of, folders)
+                if counts
+            ),
             *_site_rows(store),
             *_trouble_rows(store),
             ("written", str(store.path)),
@@ -147,63 +224,6 @@ def _is_success(verdict: str) -> bool:
     return verdict in list(Verdict) and Verdict(verdict).level.is_success
 
 
-def progress_columns() -> tuple[progress.ProgressColumn, ...]:
-    """Return the columns of the progress line; a narrow terminal cuts the last shot's name."""
-    flexible = Column(ratio=1, no_wrap=True, overflow="ellipsis")
-    rigid = Column(no_wrap=True)
-    return (
-        progress.SpinnerColumn(),
-        progress.TextColumn("{task.description}", markup=False, table_column=rigid),
-        progress.BarColumn(bar_width=_BAR_COLUMNS),
-        progress.MofNCompleteColumn(table_column=rigid),
-        progress.TextColumn("{task.fields[rate]}", table_column=rigid),
-        progress.TextColumn("{task.fields[remaining]}", table_column=rigid),
-        progress.TextColumn("{task.fields[failed]}", style="red", table_column=rigid),
-        progress.TextColumn(
-            "{task.fields[last]}", style="dim", markup=False, table_column=flexible
-        ),
-    )
-
-
-class _ProgressBar:
-    """Bar with the rate and the time that remains; failures are printed above it."""
-
-    def __init__(self, quiet: bool) -> None:
-        self._console = Console(stderr=True)
-        self._quiet = quiet
-        hidden = quiet or not self._console.is_terminal
-        self.bars = progress.Progress(
-            *progress_columns(), console=self._console, disable=hidden, expand=True
-        )
-        fields: dict[str, Any] = {"rate": "", "remaining": "", "failed": "", "last": ""}
-        self._task = self.bars.add_task("starting", total=None, **fields)
-        self.status: RunStatus | None = None
-
-    def update(self, status: RunStatus) -> None:
-        if status.stage:
-            self.bars.update(self._task, description=status.stage)
-            return
-        self.status, outcome = status, status.outcome
-        last = "" if outcome is None else f"{status.name}, {outcome.seconds:.1f} s"
-        remaining = ""
-        if status.remaining is not None:
-            time_left = timedelta(seconds=round(status.remaining))
-            remaining = f"{time_left} left" if status.waiting else "finishing"
-        self.bars.update(
-            self._task,
-            description=status.scheduler,
-            total=status.total,
-            completed=status.done + status.failed,
-            rate=_rate_text(status),
-            remaining=remaining,
-            failed=f"{status.failed} failed" if status.failed else "",
-            last=plain(last).plain,
-        )
-        if outcome is not None and outcome.reason and not self._quiet:
-            line = plain(f"failed: {status.name}: {outcome.reason}", "red")
-            self._console.print(line, soft_wrap=True)
-
-
 def _counts_text(store: StackStore) -> str:
     statuses = store.statuses()
     counts = {name: np.sum(statuses == status) for status, name in enumerate(STATUS_NAMES)}
@@ -212,29 +232,21 @@ def _counts_text(store: StackStore) -> str:
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
-def _recipe_rows(store: StackStore) -> Rows:
-    """Return the origin of the source and the steps before the inversion."""
-    from napari_shadowinv.provenance import Provenance
-
-    provenance = Provenance.of(store.attributes)
-    common = None if provenance is None else provenance.image.source
-    source = common.file if common is not None else ""
-    # Each row of a table may name another source.
-    origins = map(Provenance.of, store.reports())
-    sources = [origin.image.source for origin in origins if origin is not None]
-    files = list(dict.fromkeys(source.file for source in sources if source and source.file))
-    rows: Rows = [("source", _list_text(files) or source or str(store.attributes["source_image"]))]
-    steps = () if provenance is None else provenance.recipe.steps
-    return [*rows, *(("step", step.summary) for step in steps)]
-
-
-def _beam_rows(store: StackStore) -> Rows:
-    """Return energies or wavelengths of the finished shots, if they come from rows of a table."""
+def _report_rows(store: StackStore) -> Rows:
+    """Return the beams and sources of shots that have their own, their sites and their time."""
     rows: Rows = []
+    reports = store.reports()
+    provenances = [each for each in map(Provenance.of, reports) if each is not None]
+    sources = [each.image.source for each in provenances]
+    files = dict.fromkeys(source.file for source in sources if source and source.file)
+    rows += [("sources", _list_text(list(files)))] if files else []
     for name, quantity in beam_quantities().items():
-        values = sorted({report[name] for report in store.reports() if name in report})
+        values = sorted({report[name] for report in reports if name in report})
         rows += [(quantity.plural, quantity.text(*values, digits=6))] if values else []
-    return rows
+    if seconds := [report["seconds"] for report in reports if "stages" in report]:
+        text = f"{sum(seconds) / len(seconds):.2f} s on one worker, on average"
+        rows.append(("time per shot", text))
+    return [*rows, *_site_rows(store)]
 
 
 def _site_rows(store: StackStore) -> Rows:
@@ -253,65 +265,54 @@ def _site_rows(store: StackStore) -> Rows:
     return rows
 
 
+def _troubles(store: StackStore) -> Iterator[tuple[int, str, str, str]]:
+    """Yield number, label, code and text of each reason to look at a shot."""
+    for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
+        if status in (FAILED, DAMAGED):
+            reason = report.get("reason", "its report is missing")
+            yield index, STATUS_NAMES[status], reason, reason
+        elif status == SKIPPED:
+            yield index, STATUS_NAMES[SKIPPED], "", "a watch without --latest inverts them"
+        for caution in map(Caution.from_json, report.get("warnings", ())):
+            code = caution.text if caution.code == "other" else caution.code
+            yield index, "warning", code, caution.text
+        if status == DONE and not report.get("converged"):
+            yield index, "warning", "not-converged", "the solver did not converge"
+
+
 def _trouble_rows(store: StackStore) -> Rows:
-    """List the shots that failed, are damaged or have doubtful results."""
-    statuses = store.statuses()
-    rows = []
-    for status in (FAILED, DAMAGED):
-        label, indices = STATUS_NAMES[status], np.flatnonzero(statuses == status).tolist()
-        rows += [
-            (label, f"{store.names[i]}: {store.report(i).get('reason', 'its report is missing')}")
-            for i in indices[:_MAX_LISTED]
+    """Count the verdicts, and list the shots that failed, are damaged or doubtful, by reason."""
+    found: dict[tuple[str, str], tuple[str, dict[str, None]]] = {}
+    for index, label, code, text in _troubles(store):
+        if code != "verdict":  # it is counted below
+            found.setdefault((label, code), (text, {}))[1][store.names[index]] = None
+    verdicts: dict[str, list[str]] = {Verdict.DETERMINED.value: []}
+    for name, report in zip(store.names, store.reports(), strict=True):
+        if "verdict" in report:
+            verdicts.setdefault(str(report["verdict"]), []).append(name)
+    counts = [f"{len(verdicts[each])} {each}" for each in verdicts if _is_success(each)]
+    rows: Rows = [("verdicts", ", ".join(counts))] if any(verdicts.values()) else []
+    for each, names in verdicts.items():
+        if not _is_success(each):
+            rows.append(("warning", f"{len(names)} {each}: {_list_text(names)}"))
+    for label in (STATUS_NAMES[FAILED], STATUS_NAMES[DAMAGED], STATUS_NAMES[SKIPPED], "warning"):
+        listed = [
+            f"{_list_text([*names])}: {text}"
+            for (each, _), (text, names) in found.items()
+            if each == label
         ]
-        if len(indices) > _MAX_LISTED:
-            hidden = len(indices) - _MAX_LISTED
-            rows.append((label, f"and {hidden} more: shadowinv info {store.path} --all"))
-    skipped = [store.names[index] for index in np.flatnonzero(statuses == SKIPPED)]
-    if skipped:
-        rows.append(("skipped", f"{_list_text(skipped)}; a watch without --latest inverts them"))
+        rows += [(label, text) for text in listed[:_MAX_LISTED]]
+        if len(listed) > _MAX_LISTED:
+            more = f"and {len(listed) - _MAX_LISTED} more: shadowinv info {store.path} --all"
+            rows.append((label, more))
     rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_MAX_LISTED]]
     if store.damage.shots or store.damage.files:
         rows.append(("warning", "repeat the run with --resume to repair the damage"))
-    unconverged = [
-        store.names[index]
-        for index, report in enumerate(store.reports())
-        if statuses[index] == DONE and not report.get("converged")
-    ]
-    if unconverged:
-        text = f"{len(unconverged)} shots did not converge: {_list_text(unconverged)}"
-        rows.append(("warning", text))
-    return [*rows, *_verdict_rows(store), *_warning_rows(store)]
-
-
-def _warning_rows(store: StackStore) -> Rows:
-    """List each kind of warning with its shots, but for the verdicts of fits."""
-    warned: dict[str, tuple[str, list[str]]] = {}
-    for name, report in zip(store.names, store.reports(), strict=True):
-        for caution in map(Caution.from_json, report.get("warnings", ())):
-            if caution.code == "verdict":
-                continue
-            key = caution.text if caution.code == "other" else caution.code
-            warned.setdefault(key, (caution.text, []))[1].append(name)
-    return [("warning", f"{_list_text(names)}: {warning}") for warning, names in warned.values()]
+    return rows
 
 
 def _list_text(names: Sequence[str]) -> str:
     return ", ".join(names[:_MAX_LISTED]) + (", …" if len(names) > _MAX_LISTED else "")
-
-
-def _verdict_rows(store: StackStore) -> Rows:
-    """Count the shots whose verdict is a success, and list the others by their verdict."""
-    shots: dict[str, list[str]] = {}
-    for name, report in zip(store.names, store.reports(), strict=True):
-        if "verdict" in report:
-            shots.setdefault(str(report["verdict"]), []).append(name)
-    if not shots:
-        return []
-    shots = {Verdict.DETERMINED.value: [], **shots}
-    listed = [f"{len(shots[each])} {each}" for each in shots if _is_success(each)]
-    doubtful = {verdict: names for verdict, names in shots.items() if not _is_success(verdict)}
-    warnings = (f"{len(n)} {verdict}: {_list_text(n)}" for verdict, n in doubtful.items())
-    return [("verdicts", ", ".join(listed)), *(("warning", text) for text in warnings)]
 
 
 @as_file_errors
@@ -321,7 +322,7 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     With `verify`, read all files and compare them with their checksums.
     """
     store = StackStore(path, every_byte=verify)
-    rows = store_rows(store, trouble=not every)
+    rows = [*_store_rows(store), *([] if every else _trouble_rows(store))]
     if verify:
         count = len(store.damage.shots) + len(store.damage.files)
         text = f"{count} do not match" if count else "all files match"
@@ -332,12 +333,7 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
         return tables, is_damaged
     listed = _column_table(store, [column for column in store.columns if column.format])
     # A column of the table above would leave them a few letters a line.
-    notes: Rows = []
-    for index, report in enumerate(store.reports()):
-        cautions = map(Caution.from_json, report.get("warnings", ()))
-        reason = report.get("reason")
-        texts = [reason] if reason else [caution.text for caution in cautions]
-        notes += [(f"shot {index}", text) for text in texts]
+    notes: Rows = [(f"shot {index}", text) for index, _, _, text in _troubles(store)]
     tables += [listed, *([two_columns("Reasons and warnings", notes)] if notes else [])]
     return tables, is_damaged
 
@@ -363,91 +359,19 @@ def _column_table(store: StackStore, columns: Sequence[ShotColumn]) -> Table:
     return shots
 
 
-def store_rows(store: StackStore, *, trouble: bool = True) -> Rows:
+def _store_rows(store: StackStore) -> Rows:
     """Describe a store."""
     attributes = store.attributes
-    seconds = [report["seconds"] for report in store.reports() if "stages" in report]
-    fit = {}
-    if store.field is not None:
-        fit = {**json.loads(attributes["fit"]), "fields": json.loads(attributes["fields"])}
-    rows = [
+    return [
         ("kind", f"stack of {len(store.names)} shots, shadowinv {attributes['package_version']}"),
         ("created", str(attributes["created"])),
         ("shots", _counts_text(store)),
-        ("image", str(attributes["image_size"])),
-        *_recipe_rows(store),
-        *_beam_rows(store),
+        ("size", str(attributes["image_size"])),
+        *provenance_rows(Provenance.of(attributes)),
+        *_report_rows(store),
         ("stored", str(attributes["stored"])),
-        *([("fit", options_text(fit))] if fit else []),
         ("options", options_text(json.loads(attributes["options"]))),
-        *_site_rows(store),
     ]
-    if seconds:
-        mean = sum(seconds) / len(seconds)
-        rows.append(("time per shot", f"{mean:.2f} s on one worker, on average"))
-    return rows + (_trouble_rows(store) if trouble else [])
-
-
-@dataclass
-class _WatchPrinter:
-    """Printer of the shots, with the latest status of the run."""
-
-    folder: Path
-    pattern: str
-    quiet: bool
-    out: Console
-    err: Console
-    status: RunStatus | None = None
-    warned: set[str] = field(default_factory=set)
-    is_watching: bool = False
-
-    def update(self, status: RunStatus) -> None:
-        self.status = status
-        if self.quiet:
-            return
-        if status.note or status.stage:
-            text = status.note or f"{status.stage[:1].upper()}{status.stage[1:]}"
-            self._print(self.err, text, "dim")
-        elif status.outcome is not None:
-            self._print_shot(status)
-        elif not self.is_watching:
-            self.is_watching = True
-            skipped = f", {status.skipped} skipped" if status.skipped else ""
-            counts = f"{status.done} done, {status.failed} failed{skipped}; "
-            counts = counts if status.total else ""
-            names = "images" if self.pattern == "*" else self.pattern
-            self._print(
-                self.out, f"Watching {self.folder} for {names}; {counts}press Ctrl-C to stop."
-            )
-
-    def _print_shot(self, status: RunStatus) -> None:
-        outcome = status.outcome
-        assert outcome is not None
-        name = f"{status.name} (again, as the file has changed)" if status.again else status.name
-        waiting = f"  {status.waiting} waiting" if status.waiting else ""
-        waiting += f"  {status.skipped} skipped" if status.skipped else ""
-        if outcome.reason:
-            self._print(self.err, f"failed: {name}: {outcome.reason}", "red")
-            return
-        result = status.result
-        assert result is not None
-        summary = "  ".join(fact.short for fact in result.facts if fact.short)
-        summary = f"  {summary}  {outcome.seconds:.2f} s{waiting}"
-        # A verdict that is no success implies its warnings.
-        if result.verdict.level.is_success and (count := len(result.cautions)):
-            summary += f", {count} warning{'s' if count > 1 else ''}"
-        columns = max(_LINE_COLUMNS - len(summary), _MIN_NAME_COLUMNS)
-        if len(name) > columns:  # its end identifies the file
-            name = f"…{name[1 - columns :]}"
-        is_success = result.headline.level.is_success
-        self._print(self.out, f"{name}{summary}", "" if is_success else "yellow")
-        for warning in result.cautions:
-            if warning.code not in self.warned:
-                self.warned.add(warning.code)
-                self._print(self.err, f"warning: {status.name}: {warning.text}", "yellow")
-
-    def _print(self, console: Console, text: str, style: str = "") -> None:
-        console.print(plain(text, style), soft_wrap=True, highlight=False)
 
 
 def run_watch(
@@ -462,7 +386,8 @@ def run_watch(
     """Watch a folder; print a line for each shot and a summary."""
     from napari_shadowinv.stack import RunStatus, watch_stack
 
-    printer = _WatchPrinter(folder, watch.pattern, quiet, Console(), Console(stderr=True))
+    names = "images" if watch.pattern == "*" else watch.pattern
+    printer = _Printer(quiet, watched=f"{folder} for {names}")
     with suppress(KeyboardInterrupt, InversionCancelled):
         watch_stack(
             folder,
@@ -474,21 +399,17 @@ def run_watch(
             should_stop=is_interrupted,
         )
     status = printer.status or RunStatus()
-    done, failed, waiting = status.done, status.failed, status.waiting
-    remaining = f", {status.skipped} skipped" if status.skipped else ""
-    remaining += f", {waiting} not yet inverted" if waiting else ""
-    if not done:
-        text = f"Stopped: {failed} failed" if failed else "Stopped: no shots"
-        text = f"{text}{remaining}; repeat the command to watch again."
+    if status.done:
+        text = f"Stopped: {status.text}; repeat the command to continue {out}."
     else:
-        text = f"Stopped: {done} done, {failed} failed{remaining}"
-        text = f"{text}; repeat the command to continue {out}."
-    if is_interrupted() and waiting:
+        counts = status.text if status.failed else "no shots"
+        text = f"Stopped: {counts}; repeat the command to watch again."
+    if is_interrupted() and status.waiting:
         say_on_stderr(text)
         raise typer.Exit(cancel_exit_code())
     if not quiet:
         say(text)
-    if done:
+    if status.done:
         exit_unless_reliable(StackStore(out))
-    elif failed or waiting:
+    elif status.failed or status.waiting:
         raise typer.Exit(EXIT_FAILED_SHOTS)

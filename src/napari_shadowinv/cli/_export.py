@@ -1,9 +1,7 @@
-"""Shots of a store as files (`shadowinv export`) and as a movie (`shadowinv movie`)."""
+"""Shots of a store as files, for `shadowinv export`."""
 
 from __future__ import annotations
 
-import csv
-import importlib.util
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -11,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv.cli._inputs import protect_store
+from napari_shadowinv._system.safety import resolved_path
+from napari_shadowinv._system.tables import write_cells
 from napari_shadowinv.cli._terminal import escape_invisible
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.files import make_folder
@@ -41,21 +40,41 @@ def export_shots(
     protect_store(store, out)
     if form == "csv":
         return [_write_table(store, out, shots, overwrite)]
-    field = StackStore(store).field
-    if form == "pradformat" and field is not None:
+    if form == "pradformat" and StackStore(store).field is not None:
         raise InputError(
             f"{store} holds fits, expected inversions for pradformat: use --format tiff or csv"
         )
     dataset = open_shots(store, shots)
-    if form == "openpmd":
-        return _write_openpmd(dataset, out, overwrite)
-    jobs = list(_tiff_jobs(dataset, variables) if form == "tiff" else _pradformat_jobs(dataset))
+    if form == "tiff":
+        _check_images(dataset, variables)
+    series = f"{out.name}_%06T{PRADFORMAT.suffix}"
+    jobs: list[tuple[Path, Callable[[Path], object]]] = []
+    for position in range(dataset.sizes["shot"]):
+        shot = dataset.isel(shot=position)
+        setup, index = setup_from_dataset(shot), int(shot["index"])
+        if form == "tiff":
+            for name, plane in _planes(shot, variables):
+                job = partial(_write_plane, plane=plane, setup=setup, overwrite=overwrite)
+                jobs.append((out / f"{_stem(shot)}_{name}{TIFF.suffix}", job))
+        elif form == "openpmd":
+            setup = check_openpmd_setup(setup)
+            job = partial(
+                _write_openpmd, shot=shot, setup=setup, series=series, overwrite=overwrite
+            )
+            jobs.append((out / f"{out.name}_{index:06d}{PRADFORMAT.suffix}", job))
+        else:
+            check_pradformat_setup(setup)
+            # A shot may have its own provenance.
+            if (provenance := provenance_of(shot)) is not None:
+                shot = shot.assign_attrs(provenance=provenance.to_json())
+            job = partial(_write_field, shot=shot, setup=setup, overwrite=overwrite)
+            jobs.append((out / f"{_stem(shot)}{PRADFORMAT.suffix}", job))
     make_folder(out)
-    for name, *_ in jobs:
-        check_output(out / name, overwrite)
-    return [
-        write(out / name, load(), setup=setup, overwrite=overwrite) for name, load, setup in jobs
-    ]
+    for path, _ in jobs:
+        check_output(path, overwrite)
+    for path, write_shot in jobs:
+        write_shot(path)
+    return [path for path, _ in jobs]
 
 
 def _stem(shot: xarray.Dataset) -> str:
@@ -63,10 +82,6 @@ def _stem(shot: xarray.Dataset) -> str:
     stem = name if "[" in name or name.isdecimal() else Path(name).stem
     safe = "".join(c if c.isalnum() or c in "-_." else "_" for c in stem)
     return f"{int(shot['index']):04d}_{safe}"
-
-
-# Name of a file, reader of its content, and setup, which gives the pixel size.
-_Job = tuple[str, Callable[[], Any], Any]
 
 
 def _check_images(dataset: xarray.Dataset, variables: list[str]) -> None:
@@ -80,49 +95,29 @@ def _check_images(dataset: xarray.Dataset, variables: list[str]) -> None:
             )
 
 
-def _write_openpmd(dataset: xarray.Dataset, out: Path, overwrite: bool) -> list[Path]:
-    """Write the fields of each shot as a file of a series."""
-    check_openpmd_setup(setup_from_dataset(dataset))
-    make_folder(out)
-    series = f"{out.name}_%06T{PRADFORMAT.suffix}"
-    files = [
-        out / f"{out.name}_{index:06d}{PRADFORMAT.suffix}" for index in dataset["index"].values
-    ]
-    for file in files:
-        check_output(file, overwrite)
-    for file, position in zip(files, range(dataset.sizes["shot"]), strict=True):
-        shot = dataset.isel(shot=position)
-        setup = check_openpmd_setup(setup_from_dataset(shot))
-        with replacing(file, overwrite) as temporary:
-            write_openpmd(temporary, shot, setup, series, int(shot["index"]))
-    return files
+def _planes(shot: xarray.Dataset, variables: list[str]) -> Iterator[tuple[str, xarray.DataArray]]:
+    """Yield the planes of variables, of each component, with their names."""
+    for variable in variables:
+        if "component" in shot[variable].dims:
+            for component in ("y", "x"):
+                yield f"{variable}_{component}", shot[variable].sel(component=component)
+        else:
+            yield variable, shot[variable]
 
 
-def _tiff_jobs(dataset: xarray.Dataset, variables: list[str]) -> Iterator[_Job]:
-    _check_images(dataset, variables)
-    for index in range(dataset.sizes["shot"]):
-        shot = dataset.isel(shot=index)
-        setup = setup_from_dataset(shot)
-        for variable in variables:
-            planes = {variable: shot[variable]}
-            if "component" in shot[variable].dims:
-                planes = {
-                    f"{variable}_{component}": shot[variable].sel(component=component)
-                    for component in ("y", "x")
-                }
-            for name, plane in planes.items():
-                load = partial(np.asarray, plane, dtype=float)
-                yield f"{_stem(shot)}_{name}{TIFF.suffix}", load, setup
+def _write_plane(path: Path, plane: xarray.DataArray, setup: Any, overwrite: bool) -> None:
+    write(path, np.asarray(plane, dtype=float), setup=setup, overwrite=overwrite)
 
 
-def _pradformat_jobs(dataset: xarray.Dataset) -> Iterator[_Job]:
-    check_pradformat_setup(setup_from_dataset(dataset))
-    for index in range(dataset.sizes["shot"]):
-        shot = dataset.isel(shot=index)
-        # A shot may have its own provenance.
-        if (provenance := provenance_of(shot)) is not None:
-            shot = shot.assign_attrs(provenance=provenance.to_json())
-        yield f"{_stem(shot)}{PRADFORMAT.suffix}", shot.compute, setup_from_dataset(shot)
+def _write_field(path: Path, shot: xarray.Dataset, setup: Any, overwrite: bool) -> None:
+    write(path, shot.compute(), setup=setup, overwrite=overwrite)
+
+
+def _write_openpmd(
+    path: Path, shot: xarray.Dataset, setup: Any, series: str, overwrite: bool
+) -> None:
+    with replacing(path, overwrite) as temporary:
+        write_openpmd(temporary, shot, setup, series, int(shot["index"]))
 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
@@ -130,27 +125,32 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
     from napari_shadowinv.stack import stack_statistics
 
     content = StackStore(store)
-    peaks = stack_statistics(read_stack(store))
-    names = [str(name) for name in peaks.data_vars if str(name).endswith("_peak")]
-    columns = {name: np.asarray(peaks[name].values) for name in names}
-    headings = [f"{name} ({display_unit(peaks[name].attrs['units'])})" for name in names]
-    count = len(content.names)
-    indices = range(count) if shots is None else parse_shots(shots, count)
-    statuses, reports = content.statuses(), content.reports()
-    with (
-        replacing(out, overwrite) as temporary,
-        temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as f,
-    ):
-        rows = csv.writer(f)
-        listed = [column.heading for column in content.columns]
-        rows.writerow(["shot", "name", "status", *listed, "reason", *headings])
-        keys = [*(column.entry for column in content.columns), "reason"]
-        for index in indices:
-            report = (_escape_cell(reports[index].get(key, "")) for key in keys)
-            peak = (f"{columns[name][index]:.9g}" for name in names)
-            status = STATUS_NAMES[statuses[index]]
-            rows.writerow([index, _escape_cell(content.names[index]), status, *report, *peak])
+    statistics = stack_statistics(read_stack(store))
+    peaks = {
+        f"{name} ({display_unit(values.attrs['units'])})": np.asarray(values)
+        for name, values in statistics.data_vars.items()
+        if str(name).endswith("_peak")
+    }
+    headings = {column.entry: column.heading for column in content.columns} | {"reason": "reason"}
+    statuses, reports, count = content.statuses(), content.reports(), len(content.names)
+    rows = [
+        {"shot": index, "name": content.names[index], "status": STATUS_NAMES[statuses[index]]}
+        | {headings[entry]: reports[index].get(entry, "") for entry in headings}
+        | {heading: f"{values[index]:.9g}" for heading, values in peaks.items()}
+        for index in (range(count) if shots is None else parse_shots(shots, count))
+    ]
+    cells = [{heading: _escape_cell(value) for heading, value in row.items()} for row in rows]
+    with replacing(out, overwrite) as temporary:
+        write_cells(temporary, ["shot", "name", "status", *headings.values(), *peaks], cells)
     return out
+
+
+def protect_store(store: Path, output: Path) -> None:
+    """Refuse to write into a store that is read."""
+    if resolved_path(output).is_relative_to(resolved_path(store)):
+        raise InputError(
+            f"{output} is inside the store being read: choose another name for the output"
+        )
 
 
 def _escape_cell(value: Any) -> Any:
@@ -159,30 +159,3 @@ def _escape_cell(value: Any) -> Any:
         return value
     cell = escape_invisible(value)
     return f"'{cell}" if cell.startswith(_FORMULA_SIGNS) else cell
-
-
-def write_movie(
-    store: Path,
-    out: Path,
-    variable: str | None,
-    shots: str | None,
-    rate: float,
-    limits: tuple[float, float] | None,
-    overwrite: bool,
-) -> int:
-    """Write a movie of a store on one colour scale; return its number of frames."""
-    from napari_shadowinv.plotting import stack_frames, write_film
-
-    check_output(out, overwrite, suffixes=(".mp4", ".gif"))
-    protect_store(store, out)
-    if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise FileFormatError(
-            f"{out} needs the package imageio-ffmpeg: install it with pip install "
-            "'napari-shadowinv[movie]', or write a .gif"
-        )
-    if not 0 < rate <= 120:
-        raise InputError(
-            f"--rate is {rate:g}: expected more than 0 and at most 120 frames a second"
-        )
-    frames = stack_frames(open_shots(store, shots), variable, limits=limits)
-    return write_film(out, frames, rate, overwrite=overwrite)

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from typer import Option
 
-from napari_shadowinv.cli import _flags, _inputs
-from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
+from napari_shadowinv.cli import _flags
+from napari_shadowinv.cli._outputs import Outputs, result_and_figure
+from napari_shadowinv.cli._summary import fact_rows
 from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import ResultKind
@@ -78,6 +79,7 @@ def film(
         write_new_pack,
     )
 
+    outputs = Outputs(overwrite, quiet)
     if new is not None:
         if pack is not None:
             raise InputError(
@@ -85,32 +87,27 @@ def film(
                 "them"
             )
         entries = draft_pack(new)
+        outputs.files.append(write_new_pack(new, entries, overwrite=overwrite))
         rows = [("layers", str(len(entries["layers"])))]
-        rows += [("to complete", text) for text in missing_entries(entries)]
-        written = [write_new_pack(new, entries, overwrite=overwrite)]
-        say(two_columns("New pack", [*rows, *written_rows(written)]))
+        outputs.show("New pack", [*rows, *(("to complete", t) for t in missing_entries(entries))])
         return
     if pack is None:
         raise InputError(
             "received no pack file: name one, or write one for a folder of scans with --new"
         )
-    result, figure = _inputs.result_and_figure(pack, out, figure)
-    files = _inputs.result_outputs(ResultKind.FILM_DOSES, result, figure)
-    files.append((corners, SITES.suffixes))
-    layers = flags.layers
-    if layers is not None and (table := layers / LAYERS_TABLE).exists():
-        files.append((table, SITES.suffixes))
-    outputs = _inputs.check_outputs(files, overwrite)
+    result, figure = result_and_figure(pack, out, figure)
+    outputs.check_result(ResultKind.FILM_DOSES, result, figure)
+    table = None if flags.layers is None else flags.layers / LAYERS_TABLE
+    replaced = table if table is not None and table.exists() else None
+    outputs.check([(corners, SITES.suffixes), (replaced, SITES.suffixes)], [])
     content = read_pack(pack)
-    _inputs.protect(outputs, [pack, *content.files])
+    outputs.protect([pack, *content.files])
     with work_callbacks(quiet) as callbacks:
         doses = run_film(content, **callbacks)
-    written = [result, figure]
-    failed = _inputs.write_result(doses, [str(pack)], result, figure, overwrite)
-    if layers is not None:
-        written.append(
-            write_layers(doses, layers, form=flags.layers_format, overwrite=overwrite)[-1]
-        )
+    outputs.write_result(doses, [str(pack)], result, figure)
+    if flags.layers is not None:
+        files = write_layers(doses, flags.layers, form=flags.layers_format, overwrite=overwrite)
+        outputs.files.append(files[-1])
     if corners is not None:
         corners_by_film = {
             str(number): places
@@ -119,11 +116,10 @@ def film(
         }
         with replacing(corners, overwrite) as temporary:
             write_corners(temporary, corners_by_film)
-        written.append(corners)
     if not quiet:
         say(film_table(doses))
-        say(two_columns("Film pack", [*fact_rows(doses.facts), *written_rows(written, failed)]))
-    _inputs.exit_unless_drawn(failed)
+    outputs.show("Film pack", fact_rows(doses.facts))
+    outputs.exit_unless_drawn()
 
 
 def film_table(doses: FilmDoses) -> Table:

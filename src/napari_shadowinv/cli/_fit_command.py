@@ -2,24 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
-from napari_shadowinv.cli import _flags, _inputs
-from napari_shadowinv.cli._settings import FILE_KEYS, FIT_SECTIONS, settings_of
-from napari_shadowinv.cli._summary import fact_rows, two_columns, written_rows
-from napari_shadowinv.cli._terminal import (
+from napari_shadowinv.cli import _flags
+from napari_shadowinv.cli._inputs import recipe_from
+from napari_shadowinv.cli._outputs import (
+    Outputs,
+    check_setup,
     exit_unless_sound,
-    notify_errors,
-    say,
-    warn_of_setups,
-    work_callbacks,
+    left_out_path,
+    result_and_figure,
 )
+from napari_shadowinv.cli._settings import FILE_KEYS, FIT_SECTIONS, Settings, settings_of
+from napari_shadowinv.cli._summary import fact_rows, result_rows, two_columns
+from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.formats import RESULT
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from napari_shadowinv.fitting import Fit
+    from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.pipeline.shot_table import ShotRow
+    from napari_shadowinv.preprocessing import Recipe
+    from napari_shadowinv.shot import Shot
 
 EPILOG = """
 shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --set fit.fields=B,E
@@ -49,56 +62,121 @@ def fit(
 
     Rays may cross, images may be blurred, and the beam may be unknown.
     """
-    from napari_shadowinv.cli import _fit_result
-    from napari_shadowinv.pipeline import run_fit, run_leave_one_out, write_recipe
+    from napari_shadowinv.pipeline import run_comparison, run_fit, run_leave_one_out, write_recipe
     from napari_shadowinv.pipeline.fit_run import read_row_images
     from napari_shadowinv.pipeline.shot_table import shot_rows
 
     rows = shot_rows(
         images, {"setup": flags.setup}, {"energy": flags.energies}, {"energy": "--energies"}
     )
-    first = rows[0].file
+    first, outputs = rows[0].file, Outputs(overwrite, quiet)
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
-    result, figure = _inputs.result_and_figure(first, target, figure)
+    result, figure = result_and_figure(first, target, figure)
     figures = [figure]
     if flags.leave_one_out:
-        _fit_result.check_leave_one_out(len(rows), flags.fiducials, result)
-        figures.append(_inputs.left_out_path(figure))
-    files = _inputs.result_outputs(ResultKind.FIT, result, *figures)
-    outputs = _inputs.check_outputs([*files, (save_recipe, (".toml",))], overwrite)
-    row_files = [file for row in rows for file in row.files.values()]
-    _inputs.protect(outputs, [*images, flags.fiducials, flags.recipe, *row_files])
+        _check_leave_one_out(len(rows), flags.fiducials, result)
+        figures.append(left_out_path(figure))
+    inputs = [*images, flags.fiducials, flags.recipe]
+    inputs += [file for row in rows for file in row.files.values()]
+    outputs.check_result(ResultKind.FIT, result, *figures, recipe=save_recipe, inputs=inputs)
     stated = settings_of(settings or (), FIT_SECTIONS, flags.by_key, FILE_KEYS[:1])
-    chosen = _inputs.fit_recipe_from(flags, stated)
-    _inputs.protect_files_of(chosen, outputs)
-    shots = read_row_images(rows, chosen, channel=flags.channel, variable=flags.variable)
+    recipe = recipe_from(flags, stated)
+    outputs.protect_files_of(recipe)
+    shots = read_row_images(rows, recipe, channel=flags.channel, variable=flags.variable)
     shots = (replace(shots[0], fiducials=flags.fiducials), *shots[1:])
-    _inputs.check_setup(result, shots[0].setup, chosen.fit.fields if chosen.fit else None)
-    printed = warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
-    names = [str(row.file) for row in rows]
-    beams = ["" if shot.setup else row.beam_text for row, shot in zip(rows, shots, strict=True)]
-    short = _fit_result.short_names(names, beams)
-    if flags.compare:
-        written = stated.values.get("fit.fields")
-        result_fit = _fit_result.compare_fields(chosen, shots, quiet, written=written)
-    else:
-        with work_callbacks(quiet) as callbacks:
-            result_fit = run_fit(chosen, shots, **callbacks)
-    left_out = None
-    if flags.leave_one_out:
-        named_shots = [replace(shot, name=name) for shot, name in zip(shots, short, strict=True)]
-        fields = [field.name for field in result_fit.fields]
-        with work_callbacks(quiet) as callbacks:
-            left_out = run_leave_one_out(chosen, named_shots, fields, **callbacks)
-    failed = _inputs.write_result(result_fit, names, result, figure, overwrite, left_out)
+    check_setup(result, shots[0].setup, recipe.fit.fields if recipe.fit else None)
+    outputs.warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
+    wanted = _wanted_fields(recipe, stated, shots[0].setup) if flags.compare else set()
+    names, left_out = [str(row.file) for row in rows], None
+    with work_callbacks(quiet) as callbacks:
+        if flags.compare:
+            fits = run_comparison(recipe, shots, **callbacks)
+        else:
+            fits = (run_fit(recipe, shots, **callbacks),)
+        found = next((each for each in fits if _fields_of(each) == wanted), fits[0])
+        if flags.leave_one_out:
+            left_out = run_leave_one_out(
+                recipe, _named(shots, rows), [*_fields_of(found)], **callbacks
+            )
+    outputs.write_result(found, names, result, figure, left_out)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
-        write_recipe(save_recipe, chosen.model_copy(update={"setup": common}), overwrite=overwrite)
-    if not quiet:
-        if left_out is not None:
-            say(two_columns("Left out", fact_rows(left_out.facts)))
-        fit_rows = _fit_result.fit_rows(result_fit, names, printed)
-        say(two_columns("Fit", [*fit_rows, *written_rows(outputs, failed)]))
-    exit_unless_sound(result_fit, result, left_out)
-    _inputs.exit_unless_drawn(failed)
+        write_recipe(save_recipe, recipe.model_copy(update={"setup": common}), overwrite=overwrite)
+    if flags.compare and not quiet:
+        say(_comparison_table(fits))
+    if left_out is not None and not quiet:
+        say(two_columns("Left out", fact_rows(left_out.facts)))
+    outputs.show("Fit", result_rows(found, outputs.printed, names=names))
+    exit_unless_sound(found, result, left_out)
+    outputs.exit_unless_drawn()
+
+
+def _fields_of(fit: Fit) -> set[str]:
+    return {field.name for field in fit.fields}
+
+
+def _wanted_fields(recipe: Recipe, stated: Settings, setup: Setup | None) -> set[str]:
+    """Return the fields of the fit to write, among those to compare; none for the likeliest."""
+    from napari_shadowinv.pipeline.fit_run import compared_fields
+
+    written = stated.values.get("fit.fields")
+    if written is None or recipe.fit is None:
+        return set()
+    compared = compared_fields(None if setup is None else [setup])
+    wanted = set(recipe.fit.fields or ())
+    if wanted not in map(set, compared):
+        choices = "; ".join(",".join(choice) for choice in compared)
+        raise InputError(
+            f"received fit.fields={written} and --compare, which compares {choices}: write one of "
+            "these, or leave out fit.fields to write the likeliest"
+        )
+    return wanted
+
+
+def _comparison_table(fits: Sequence[Fit]) -> Table:
+    """Build a table of the choices of fields, the likeliest first."""
+    from rich import box
+    from rich.table import Table
+
+    headings = "fields", "χ²", "log evidence", "verdict"
+    table = Table(*headings, title="Comparison", title_justify="left", box=box.SIMPLE)
+    table.caption = "A difference of 10 is decisive."
+    best = fits[0].report.log_evidence
+    for fit in fits:
+        names = ", ".join(field.name for field in fit.fields)
+        chi2 = ", ".join(f"{value:.3g}" for value in fit.chi2)
+        evidence = "likeliest" if fit is fits[0] else f"{fit.report.log_evidence - best:+.1f}"
+        table.add_row(names, chi2, evidence, fit.verdict)
+    return table
+
+
+def _check_leave_one_out(count: int, fiducials: Path | None, result: Path) -> None:
+    """Refuse, before any work, to leave images out where inputs or outputs do not allow it."""
+    from napari_shadowinv.fitting.left_out import check_count
+
+    check_count(count)
+    if fiducials is not None:
+        raise InputError(
+            "received --leave-one-out and --fiducials, which apply to the first image only: use "
+            "one of them"
+        )
+    if result.suffix.lower() not in RESULT.suffixes:
+        raise InputError(
+            f"received --leave-one-out and {result}, a format without it: write a {RESULT.suffix} "
+            "file"
+        )
+
+
+def _named(shots: Sequence[Shot], rows: Sequence[ShotRow]) -> list[Shot]:
+    """Name shots by their files without folders and endings, unless two of them become equal.
+
+    The energy or wavelength of an image without a setup follows its name.
+    """
+    stems = [row.file.stem for row in rows]
+    names = stems if len({*stems}) == len(stems) else [str(row.file) for row in rows]
+    named = []
+    for name, shot, row in zip(names, shots, rows, strict=True):
+        beam = "" if shot.setup else row.beam_text
+        named.append(replace(shot, name=f"{name} ({beam})" if beam else name))
+    return named

@@ -39,6 +39,15 @@ Figure = Annotated[Path | None, Option(help=".png, .pdf or .svg. Default: a PNG.
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
 Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
 QuietInversion = Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")]
+# Names of two words have a hyphen on the command line.
+Deflector = Annotated[
+    str | None,
+    Option(
+        metavar="CAUSE",
+        help="Cause of the deflection.",
+        callback=lambda text: text and text.replace("-", " "),
+    ),
+]
 InstrumentNames = Annotated[
     str | None, Option(metavar="NAMES", help="Detector, beam, or both: film,TNSA.")
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Any
 from napari_shadowinv import __version__
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.safety import as_file_errors
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import _summary
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.physics.beam import setup_warnings
-from napari_shadowinv.physics.setup import Setup, beam_quantities
+from napari_shadowinv.physics.setup import beam_quantities
+from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.results import unpack_result
 from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
@@ -24,7 +27,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io.formats import Format
-    from napari_shadowinv.provenance import Provenance
 
 PACKAGES = (
     "numpy scipy numba llvmlite dask distributed xarray zarr h5py h5netcdf scikit-image matplotlib "
@@ -60,7 +62,7 @@ def _rows(path: Path, variable: str | None) -> _summary.Rows:
     if form.name not in ("npy", "mat", "cpsa", "text", "hdf5") and "result" not in form.holds:
         return _picture_rows(path, form)
     content = read(path, variable=variable)
-    return _radiograph_rows(content) if isinstance(content, Shot) else _result_rows(content)
+    return _shot_rows(content) if isinstance(content, Shot) else _result_rows(content)
 
 
 def _frame_rows(frames: Shot | xarray.Dataset, array: str | None) -> _summary.Rows:
@@ -79,49 +81,51 @@ def _picture_rows(path: Path, form: Format) -> _summary.Rows:
     from napari_shadowinv.io.images import film_warnings
 
     array, metadata = form.read(path)
-    found = film_warnings(array, None) if array.ndim == 2 else ()
-    warnings = (*found, *metadata.get("warnings", ()))
-    rows: _summary.Rows = [
-        ("kind", f"{form.name.upper()} picture, {metadata['bits']} bits per sample")
-    ]
+    warnings = film_warnings(array, None) if array.ndim == 2 else ()
+    rows = [("kind", f"{form.name.upper()} picture, {metadata['bits']} bits per sample")]
     if array.ndim == 3:
         advice = "convert a film scan to dose, or choose one with --channel"
         rows.append(("channels", f"{array.shape[-1]}: {advice}"))
-    rows += [*_array_rows(array), *_geometry_rows(metadata)]
-    rows += [("note", text) for text in metadata.get("notes", ())]
-    return [*rows, *[("warning", caution.text) for caution in warnings]]
+    return [*rows, *_array_rows(array), *_metadata_rows(metadata, warnings)]
 
 
-def _radiograph_rows(shot: Shot) -> _summary.Rows:
+def _shot_rows(shot: Shot) -> _summary.Rows:
     names = {
         "text": "numbers as text",
         "pradformat": "pradformat radiograph",
         "cpsa": "CR-39 tracks",
         "npy": "NPY array",
+        "hdf5": f"array {shot.metadata.get('variable')!r} of an HDF5 file",
+        "mat": f"array {shot.metadata.get('variable')!r} of a MATLAB file",
     }
-    kind = str(shot.metadata["kind"])
-    for name, title in (("hdf5", "an HDF5"), ("mat", "a MATLAB")):
-        names[name] = f"array {shot.metadata.get('variable')!r} of {title} file"
-    dtype = shot.metadata["dtype"]
-    rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image, dtype)]
+    kind, warnings = str(shot.metadata["kind"]), shot.warnings
+    rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image, shot.metadata["dtype"])]
     if shot.source is not None:
         rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
         rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels excluded"))
-    rows += _geometry_rows(shot.metadata)
+    if shot.setup is not None:
+        warnings = (*warnings, *setup_warnings(shot.setup, shot.shape))
     rows.append(("setup", _summary.setup_text(shot.setup, shot, shot.shape)))
-    rows += [("note", text) for text in shot.notes]
-    warnings = () if shot.setup is None else setup_warnings(shot.setup, shot.shape)
-    return [*rows, *[("warning", caution.text) for caution in (*shot.warnings, *warnings)]]
+    return [*rows, *_metadata_rows(shot.metadata, warnings)]
 
 
-def _geometry_rows(metadata: Mapping[str, Any]) -> _summary.Rows:
+def _metadata_rows(metadata: Mapping[str, Any], warnings: Iterable[Caution]) -> _summary.Rows:
+    """Return the geometry in the metadata of an image, its notes, and the warnings."""
     quantities = beam_quantities()
     numbers = metadata.get("geometry", {}).items()
     return [
-        (f"{name.replace('_', ' ')} ({quantities[name].unit if name in quantities else 'm'})", text)
-        for name, value in numbers
-        if isinstance(value, int | float) and (text := f"{value:g}")
+        *(
+            (f"{name.replace('_', ' ')} ({unit})", f"{value:g}")
+            for name, value in numbers
+            if isinstance(value, int | float)
+            for unit in [quantities[name].unit if name in quantities else "m"]
+        ),
+        *(("note", text) for text in metadata.get("notes", ())),
+        *(
+            ("warning", each.text)
+            for each in dict.fromkeys((*warnings, *metadata.get("warnings", ())))
+        ),
     ]
 
 
@@ -140,84 +144,40 @@ def _array_rows(array: AnyArray, dtype: str = "") -> _summary.Rows:
 
 
 def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
+    """Describe a result of any kind: its facts, its origin and its options."""
     from napari_shadowinv.analysis import products_in
-    from napari_shadowinv.cli._fit_result import fit_file_rows
+    from napari_shadowinv.fitting import LeaveOneOut
 
-    rows_by_kind = {
-        ResultKind.INVERSION: _inversion_rows,
-        ResultKind.FIT: fit_file_rows,
-        ResultKind.FILM_DOSES: _film_rows,
-        ResultKind.FIELD: _field_rows,
-    }
-    rows = rows_by_kind[ResultKind.of(dataset.attrs)](dataset)
+    content, setup = unpack_result(dataset)
+    result: Any = content
+    kind = f"{content.kind.noun} of shadowinv {dataset.attrs.get('package_version')}"
+    if content.kind is ResultKind.FIELD and "options" not in dataset.attrs:
+        is_pradformat = dataset.attrs.get("format") == "pradformat"
+        kind = "pradformat inversion" if is_pradformat else "field retrieved by another program"
+    if content.kind is ResultKind.INVERSION:
+        result = result.in_units(setup)
+    facts = list(result.facts)
+    if "left_out_chi2" in dataset:
+        facts += LeaveOneOut.from_dataset(dataset).facts
+    shape = (dataset.sizes["y"], dataset.sizes["x"])
+    has_verdict = result.headline.verdict is not None
+    rows: _summary.Rows = [
+        *([_summary.headline_row(result.headline)] if has_verdict else []),
+        ("kind", kind),
+        *[("created", str(dataset.attrs[name])) for name in ("created",) if name in dataset.attrs],
+        ("image", _summary.size_text(shape)),
+        ("setup", _summary.setup_text(setup, shape=shape)),
+        *_summary.fact_rows(facts, details=True),
+        *_summary.provenance_rows(Provenance.of(dataset.attrs, dataset.variables)),
+    ]
+    if options := getattr(content, "options", None):
+        rows.append(("options", _summary.options_text(options.model_dump())))
     return rows + [
         (each.name, f"{fact.title.lower()} {fact.text}")
         for each in products_in(dataset)
         for fact in each.facts
         if fact.key in each.variables
     ]
-
-
-def _inversion_rows(dataset: xarray.Dataset) -> _summary.Rows:
-    from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.inversion.variables import setup_from_dataset
-
-    inversion, setup = Inversion.from_dataset(dataset), setup_from_dataset(dataset)
-    return [
-        _summary.headline_row(inversion.in_units(setup).headline),
-        ("kind", f"result of shadowinv {dataset.attrs['package_version']}"),
-        ("created", str(dataset.attrs["created"])),
-        *_origin_rows(inversion.provenance),
-        *_experiment_rows(inversion.displacement, setup),
-        *_summary.fact_rows(inversion.in_units(setup).facts, details=True),
-        ("options", _summary.options_text(inversion.options.model_dump())),
-    ]
-
-
-def _film_rows(dataset: xarray.Dataset) -> _summary.Rows:
-    from napari_shadowinv.film_doses import FilmDoses
-
-    doses = FilmDoses.from_dataset(dataset)
-    return [
-        ("kind", f"film pack of shadowinv {doses.provenance.version}"),
-        ("created", doses.created),
-        *_summary.fact_rows(doses.facts, details=True),
-    ]
-
-
-def _field_rows(dataset: xarray.Dataset) -> _summary.Rows:
-    from napari_shadowinv.inversion.result import RetrievedField
-
-    field = RetrievedField.from_dataset(dataset)
-    kind = "field retrieved by another program"
-    if dataset.attrs.get("format") == "pradformat":
-        kind = "pradformat inversion"
-    elif "options" in dataset.attrs:
-        kind = f"field of a shot of shadowinv {dataset.attrs['package_version']}"
-    return [
-        ("kind", kind),
-        *_experiment_rows(field.displacement, field.setup),
-        *_summary.fact_rows(field.facts, details=True),
-    ]
-
-
-def _experiment_rows(displacement: AnyArray, setup: Setup | None) -> _summary.Rows:
-    return [
-        ("image", _summary.size_text(displacement[0])),
-        ("setup", _summary.setup_text(setup, shape=displacement.shape[1:])),
-    ]
-
-
-def _origin_rows(provenance: Provenance | None) -> _summary.Rows:
-    """Return the files that a result was made from, and the steps before the inversion."""
-    if provenance is None:
-        return []
-    origins = {"image": provenance.image, "source": provenance.image.source}
-    rows: _summary.Rows = []
-    for name, origin in origins.items():
-        if origin is not None and origin.file:
-            rows += [(f"{name} file", origin.file), (f"{name} sha256", origin.sha256)]
-    return rows + _summary.provenance_rows(provenance)
 
 
 def system_report() -> str:

@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from typer import Exit, Option
 
+from napari_shadowinv._system.tables import write_cells
 from napari_shadowinv._system.validation import validate
-from napari_shadowinv.cli import _flags, _inputs
-from napari_shadowinv.cli._settings import Sections, Settings, settings_of
-from napari_shadowinv.cli._terminal import (
-    EXIT_NOT_CONVERGED,
-    notify_errors,
-    say,
-    warn_of_setups,
-    work_callbacks,
-)
+from napari_shadowinv.cli import _flags
+from napari_shadowinv.cli._inputs import read_setup
+from napari_shadowinv.cli._outputs import Outputs, figure_beside
+from napari_shadowinv.cli._settings import Sections, Settings, numbers_of, settings_of
+from napari_shadowinv.cli._summary import fact_rows, headline_row
+from napari_shadowinv.cli._terminal import EXIT_NOT_CONVERGED, notify_errors, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.trace_options import GridView
@@ -35,7 +33,6 @@ HELP = {
     "energies": "MeV of each image, or wavelength in m.",
     "size": "Height and width, such as 200x200.",
     "recorded_with": "TOML file of the object's setup.",
-    "deflector": "Cause of the object's deflection.",
     "counts": "Mean counts a pixel. Default: 1000.",
     "sweep": "A curve, such as counts=100,300,1000.",
     "out": "Table (.csv) of draws or sweep.",
@@ -62,7 +59,7 @@ class PlanFlags:
     counts: Annotated[float | None, Option(help=HELP["counts"])] = None
     size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None
     recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None
-    deflector: Annotated[str | None, Option(metavar="CAUSE", help=HELP["deflector"])] = None
+    deflector: _flags.Deflector = None
     sweep: Annotated[str | None, Option(metavar="NAME=VALUES", help=HELP["sweep"])] = None
 
 
@@ -78,51 +75,48 @@ def plan(
     quiet: _flags.Quiet = False,
 ) -> None:
     """Simulate shots of an experiment, and report whether the field would be determined."""
-    from napari_shadowinv.cli._summary import fact_rows, headline_row, two_columns, written_rows
     from napari_shadowinv.io.files import replacing
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES
     from napari_shadowinv.pipeline.experiment import plan_experiment, sweep_experiment
     from napari_shadowinv.pipeline.experiment_object import shape_of_text
-    from napari_shadowinv.pipeline.experiment_result import ExperimentSweep, table_text
-    from napari_shadowinv.pipeline.files import setup_from
     from napari_shadowinv.plotting import plan_figure, sweep_figure
 
-    page = figure or _inputs.figure_beside(out)
-    _inputs.check_outputs([(out, SITES.suffixes), (page, FIGURE_SUFFIXES)], overwrite)
-    _inputs.protect([out, page], [flags.setup, flags.recorded_with, _file_of(object)])
+    page, outputs = figure or figure_beside(out), Outputs(overwrite, quiet)
+    outputs.check(
+        [(out, SITES.suffixes), (page, FIGURE_SUFFIXES)],
+        [flags.setup, flags.recorded_with, _file_of(object)],
+    )
     keys = _flags.instrument_keys(flags.instrument) | {"plan.counts": ("--counts", flags.counts)}
     stated = settings_of(settings or (), SECTIONS, keys)
     options = stated.change("plan", ExperimentOptions())
     instrument = stated.change("instrument", Instrument())
-    setup = None if flags.setup is None else setup_from(flags.setup)
-    setups = _setups(setup, flags.energies)
+    setups = _setups(read_setup(flags.setup), flags.energies)
     shape = None if flags.size is None else shape_of_text(flags.size, "--size")
     target: Any = _object(object, flags, setups, stated)
     choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
-    warn_of_setups((each, shape) for each in setups or ())
+    outputs.warn_of_setups((each, shape) for each in setups or ())
     result: Any
+    draw: Any
     with work_callbacks(quiet) as callbacks:
         choices |= callbacks
         if flags.sweep is None:
-            result = plan_experiment(target, setups, **choices)
+            result, draw = plan_experiment(target, setups, **choices), plan_figure
         else:
             quantity, values = _sweep(flags.sweep)
-            result = sweep_experiment(target, setups, quantity=quantity, values=values, **choices)
-    is_sweep = isinstance(result, ExperimentSweep)
+            choices |= {"quantity": quantity, "values": values}
+            result, draw = sweep_experiment(target, setups, **choices), sweep_figure
     with replacing(out, overwrite) as temporary:
-        temporary.write_text(table_text(result.rows()), encoding="utf-8")
-    draw: Any = partial(sweep_figure if is_sweep else plan_figure, result)
-    failed = _inputs.write_figures({page: draw}, overwrite)
-    if not quiet:
-        rows = [
-            headline_row(result.headline),
-            *fact_rows(result.facts),
-            *written_rows([out, page], failed),
+        cells = [
+            {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
+            for row in result.rows()
         ]
-        say(two_columns("Sweep" if is_sweep else "Plan", rows))
+        write_cells(temporary, [*cells[0]], cells)
+    outputs.write_figures({page: partial(draw, result)})
+    rows = [headline_row(result.headline), *fact_rows(result.facts)]
+    outputs.show("Plan" if flags.sweep is None else "Sweep", rows)
     if not result.is_determined:
         raise Exit(EXIT_NOT_CONVERGED)
-    _inputs.exit_unless_drawn(failed)
+    outputs.exit_unless_drawn()
 
 
 def _file_of(text: str) -> Path | None:
@@ -133,41 +127,39 @@ def _object(
     text: str, flags: PlanFlags, setups: list[Setup] | None, settings: Settings
 ) -> PlannedObject | Any:
     """Return the phantom of a text, or the object of a file."""
-    from napari_shadowinv.io import is_field_grid
-    from napari_shadowinv.pipeline.experiment_object import object_of_displacement, phantom_of_text
-    from napari_shadowinv.pipeline.traced_file import object_of_file
+    from napari_shadowinv.cli._forward_command import field_from
+    from napari_shadowinv.io.field_grids import is_field_grid, read_field_grid
+    from napari_shadowinv.pipeline.experiment_object import (
+        object_of_displacement,
+        object_of_field,
+        phantom_of_text,
+    )
 
-    recorded_with, deflector = flags.recorded_with, flags.deflector
     is_file = _file_of(text.partition(":")[0]) is not None
     is_grid = is_file and is_field_grid(Path(text))
-    view = [key for key in settings.values if key.startswith("view.")]
-    if view and not is_grid:
-        names = ", ".join(view)
-        raise InputError(f"received {names}, but {text} is no 3-D field: leave them out")
+    stated = {"--recorded-with": flags.recorded_with, "--deflector": flags.deflector}
+    received = [] if is_file and not is_grid else [flag for flag in stated if stated[flag]]
+    received += [] if is_grid else [key for key in settings.values if key.startswith("view.")]
+    if received:
+        kind = "a 3-D field" if is_grid else "a displacement" if is_file else "a phantom"
+        raise InputError(
+            f"received {', '.join(received)}, which does not apply to {text}, {kind}: leave it out"
+        )
     if is_grid:
-        if recorded_with is not None or deflector is not None:
-            raise InputError(
-                f"received --recorded-with or --deflector, but {text} is a 3-D field, which needs "
-                "only --setup: leave them out"
-            )
         if setups is None:
             raise InputError(f"{text} is a 3-D field: particles through it need --setup")
-        return object_of_file(Path(text), setups[0], settings.change("view", GridView()))
+        grid = settings.change("view", GridView()).apply(read_field_grid(Path(text)))
+        return object_of_field(grid, setups[0], title=Path(text).name)
     if not is_file:
-        if recorded_with is not None or deflector is not None:
-            flag = "--deflector" if recorded_with is None else "--recorded-with"
-            raise InputError(f"received {flag}: it belongs to the object of a file, not a phantom")
         return phantom_of_text(text)
-    from napari_shadowinv.cli._shot_commands import field_from
-    from napari_shadowinv.pipeline.files import setup_from
-
-    path = Path(text)
-    content = field_from(path)
-    if content.setup is not None and recorded_with is not None:
-        raise InputError(f"{path} has its setup: leave out --recorded-with")
-    original = content.setup if recorded_with is None else setup_from(recorded_with)
+    content, original = field_from(Path(text)), read_setup(flags.recorded_with)
+    if content.setup is not None and original is not None:
+        raise InputError(f"{text} has its setup: leave out --recorded-with")
     return object_of_displacement(
-        content.displacement, original, deflector=deflector, title=path.name
+        content.displacement,
+        original or content.setup,
+        deflector=flags.deflector,
+        title=Path(text).name,
     )
 
 
@@ -178,19 +170,12 @@ def _setups(setup: Setup | None, energies: str | None) -> list[Setup] | None:
         raise InputError("received --energies: it needs --setup, the geometry of all images")
     return [
         validate(type(setup), {**setup.model_dump(), setup.beam_field: value}, "--energies")
-        for value in _numbers("--energies", energies)
+        for value in numbers_of("--energies", energies)
     ]
-
-
-def _numbers(flag: str, text: str) -> list[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"{flag} is '{text}': expected numbers separated by commas") from None
 
 
 def _sweep(text: str) -> tuple[str, list[float]]:
     name, equals, values = text.partition("=")
     if not equals:
         raise InputError(f"--sweep is '{text}': expected NAME=VALUES, such as counts=100,300,1000")
-    return name.strip().replace("-", "_"), _numbers("--sweep", values)
+    return name.strip().replace("-", "_"), numbers_of("--sweep", values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,9 @@ from typing import Annotated, Any
 
 from typer import Option
 
-from napari_shadowinv.cli import _flags, _inputs
+from napari_shadowinv.cli import _flags
+from napari_shadowinv.cli._inputs import read_setup, shots_recipe_from
+from napari_shadowinv.cli._outputs import Outputs
 from napari_shadowinv.cli._settings import (
     FILE_KEYS,
     FIT_SECTIONS,
@@ -18,7 +21,8 @@ from napari_shadowinv.cli._settings import (
     Settings,
     settings_of,
 )
-from napari_shadowinv.cli._terminal import notify_errors, say, warn_of_setups
+from napari_shadowinv.cli._terminal import notify_errors, say
+from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 # Help of options, where it is longer than a line.
@@ -75,13 +79,11 @@ class WatchFlags:
 
 def _stack_inputs(flags: _flags.InversionFlags, settings: Settings, quiet: bool) -> dict[str, Any]:
     """Return the inputs of `batch` and `watch`."""
-    from napari_shadowinv.pipeline.files import setup_from
-
-    chosen = _inputs.shots_recipe_from(flags, settings)
+    chosen = shots_recipe_from(flags, settings)
     if flags.setup is not None:
-        chosen = chosen.model_copy(update={"setup": setup_from(flags.setup)})
+        chosen = chosen.model_copy(update={"setup": read_setup(flags.setup)})
     if not quiet:
-        warn_of_setups([(chosen.setup, None)])
+        Outputs(overwrite=False, quiet=quiet).warn_of_setups([(chosen.setup, None)])
     from napari_shadowinv.stack import read_shot
 
     # A reader is part of a store's identity: only a variable that is there names itself.
@@ -168,7 +170,7 @@ def movie(
     out: Annotated[Path, Option("--out", "-o", help="Output movie: .mp4 or .gif.")],
     variable: Annotated[str | None, Option(help=HELP["variable"])] = None,
     shots: _flags.ChosenShots = None,
-    rate: Annotated[float, Option(help="Shots per second.")] = 10.0,
+    rate: Annotated[float, Option(min=0.1, max=120, help="Shots per second.")] = 10.0,
     limits: Annotated[
         tuple[float, float] | None, Option(metavar="MIN MAX", help=HELP["limits"])
     ] = None,
@@ -176,8 +178,19 @@ def movie(
     quiet: _flags.Quiet = False,
 ) -> None:
     """Make a movie of a store, with all shots on one colour scale."""
-    from napari_shadowinv.cli._export import write_movie
+    from napari_shadowinv.cli._export import protect_store
+    from napari_shadowinv.io import check_output
+    from napari_shadowinv.io.store_shots import open_shots
+    from napari_shadowinv.plotting import stack_frames, write_film
 
-    frames = write_movie(store, out, variable, shots, rate, limits, overwrite)
+    check_output(out, overwrite, suffixes=(".mp4", ".gif"))
+    protect_store(store, out)
+    if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise FileFormatError(
+            f"{out} needs the package imageio-ffmpeg: install it with pip install "
+            "'napari-shadowinv[movie]', or write a .gif"
+        )
+    frames = stack_frames(open_shots(store, shots), variable, limits=limits)
+    count = write_film(out, frames, rate, overwrite=overwrite)
     if not quiet:
-        say(f"Wrote {out}: {frames} shots, {frames / rate:.1f} s")
+        say(f"Wrote {out}: {count} shots, {count / rate:.1f} s")

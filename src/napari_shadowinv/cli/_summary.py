@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from pathlib import Path
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv.cli._terminal import plain
@@ -11,7 +10,6 @@ from napari_shadowinv.cli._terminal import plain
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.facts import Fact, Headline
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.provenance import Provenance
@@ -51,40 +49,64 @@ def headline_row(headline: Headline) -> tuple[str, str, str]:
 
 
 def provenance_rows(provenance: Provenance | None) -> Rows:
-    """Return the steps before the inversion, and the origin of the source."""
+    """Return the files that a result was made from, the steps before it, and its choices."""
     if provenance is None:
         return []
-    image, estimate = provenance.image, provenance.recipe.estimate
-    source = image.source
-    if source is not None:
-        origin = source.file or "an array"
-    else:
-        origin = "uniform" if estimate is None else estimate.summary
-    rows: Rows = [*[("prepared", note) for note in image.notes], ("source", origin)]
-    for name, index in (("mask", image.mask), ("source mask", image.source_mask)):
-        if (mask := provenance.mask_of(index)) is not None:
-            rows.append((name, mask.file or "drawn"))
-    if image.brightness is not None:
-        rows.append(("brightness", f"{image.brightness:g} (the image was divided by it)"))
+    rows: Rows = []
+    for number, image in enumerate(provenance.images, 1):
+        of_image = f" {number}" if len(provenance.images) > 1 else ""
+        masks = (provenance.mask_of(image.mask), provenance.mask_of(image.source_mask))
+        origins = (image, image.source, image.dark, *masks)
+        names = ("image", "source", "dark frame", "mask", "source mask")
+        for name, origin in zip(names, origins, strict=True):
+            if origin is not None and (origin.file or origin is not image):
+                checksum = f", sha256 {origin.sha256}" if origin.sha256 else ""
+                rows.append((name + of_image, f"{origin.file or 'an array'}{checksum}"))
+        rows += [(f"prepared{of_image}", note) for note in image.notes]
+        if image.brightness is not None:
+            rows.append((f"brightness{of_image}", f"{image.brightness:g}"))
+    recipe, table = provenance.recipe, provenance.fiducials
+    if recipe.estimate is not None:
+        rows.append(("source", recipe.estimate.summary))
+    if recipe.fit is not None:
+        choices = recipe.fit.model_dump(exclude_none=True, exclude={"options"})
+        rows.append(("fit", options_text(choices)))
+    if table is not None and table.sha256:
+        rows.append(("fiducials", f"{table.file}, sha256 {table.sha256}"))
     return rows
 
 
 def fact_rows(
-    facts: Iterable[Fact], printed: tuple[str, ...] = (), *, details: bool = False
+    facts: Iterable[Fact], printed: Collection[str] = (), *, details: bool = False
 ) -> Rows:
     """Return facts as rows of a table, without the verdict and cautions that are printed."""
     return [
         (fact.title[:1].lower() + fact.title[1:], fact.text)
         for fact in facts
         # A fit puts the name of the image first.
-        if fact.key != "verdict" and not fact.text.endswith(printed)
+        if fact.key != "verdict" and not fact.text.endswith(tuple(printed))
         if details or not fact.is_detail
     ]
 
 
-def written_rows(paths: Iterable[Path], failed: Collection[Path] = ()) -> Rows:
-    """Return a row for each file that was written, unless writing it has failed."""
-    return [("written", str(path)) for path in paths if path not in failed]
+def result_rows(
+    result: Any,
+    printed: Collection[str] = (),
+    *,
+    names: Sequence[str] = (),
+    shot: Shot | None = None,
+) -> Rows:
+    """Return headline, facts and setup of a result, without the cautions that are printed.
+
+    `names` are the images of a fit; `shot` has what the file of an image says about the setup.
+    """
+    facts = result.facts_with_names(names) if names else result.facts
+    image = result.images[0] if hasattr(result, "images") else result.image
+    return [
+        headline_row(result.headline),
+        *fact_rows(facts, printed),
+        ("setup", setup_text(result.setup, shot, image.shape)),
+    ]
 
 
 def setup_text(
@@ -102,20 +124,15 @@ def setup_text(
             return text
         return f"{text}, field of view {field_of_view_text(setup, (shape[0], shape[1]))}"
     geometry = {} if shot is None else shot.metadata.get("geometry", {})
-    if not geometry:
-        return "none: results in pixels; give --setup for SI units"
-    needed = {
-        "energy": "energy",
-        "source_object_distance": "distance from source to object",
-        "object_image_distance": "distance from object to image",
-    }
-    missing = [words for name, words in needed.items() if name not in geometry]
-    if not {"pixel_size", "detector_pixel_size"} & geometry.keys():
-        missing.append("pixel size")
-    return (
-        f"none: the file gives the geometry but not the {', nor the '.join(missing)}; give it "
-        "with --setup"
-    )
+    if geometry:
+        known = {name.removeprefix("detector_") for name in geometry}
+        needed = ("energy", "source_object_distance", "object_image_distance", "pixel_size")
+        missing = [name.replace("_", " ") for name in needed if name not in known]
+        return (
+            f"none: the file gives the geometry but not the {', nor the '.join(missing)}; give it "
+            "with --setup"
+        )
+    return "none: results in pixels; give --setup for SI units"
 
 
 def options_text(options: Mapping[str, Any]) -> str:
@@ -123,6 +140,6 @@ def options_text(options: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} = {value}" for name, value in options.items() if value is not None)
 
 
-def size_text(array: AnyArray) -> str:
-    """Format the size of an image, width first."""
-    return f"{array.shape[1]} × {array.shape[0]} px (width × height)"
+def size_text(shape: Sequence[int]) -> str:
+    """Format the size of an image of shape (H, W), width first."""
+    return f"{shape[1]} × {shape[0]} px (width × height)"

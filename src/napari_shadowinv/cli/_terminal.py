@@ -11,9 +11,8 @@ import signal
 import sys
 import time
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
 import typer
@@ -21,8 +20,6 @@ from pydantic import ValidationError
 
 from napari_shadowinv._system.machine import ENDING_SIGNALS, handling
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import ResultKind, to_figures
-from napari_shadowinv.physics.beam import setup_warnings
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -30,13 +27,10 @@ if TYPE_CHECKING:
     from rich.text import Text
 
     from napari_shadowinv._system.progress import OnProgress, Progress
-    from napari_shadowinv.fitting import LeaveOneOut
-    from napari_shadowinv.inversion import Inversion
-    from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Recipe
-    from napari_shadowinv.shot import Shot
 
+EXIT_FAILED_SHOTS = 1
 EXIT_MISTAKE = 2
+EXIT_NO_FIGURE = 1
 EXIT_NOT_CONVERGED = 3
 
 # Control characters, marks of direction, lone surrogates, and ends of lines.
@@ -65,50 +59,18 @@ def escape_invisible(text: object) -> str:
     )
 
 
-def say(content: str | Table) -> None:
+def say(content: str | Table, style: str = "", *, on_stderr: bool = False) -> None:
     """Print a sentence or a table."""
     from rich.console import Console
 
-    if isinstance(content, str):
-        Console().print(plain(content), soft_wrap=True, highlight=False)
-    else:
-        Console().print(content, highlight=False)
+    is_text = isinstance(content, str)
+    text = plain(content, style) if is_text else content
+    Console(stderr=on_stderr).print(text, soft_wrap=is_text, highlight=False)
 
 
 def say_on_stderr(text: str, style: str = "bold red") -> None:
     """Print an error, or a warning in another style, in one line."""
-    from rich.console import Console
-
-    line = plain(" ".join(text.split()), style)
-    Console(stderr=True).print(line, soft_wrap=True, highlight=False)
-
-
-def invert_shot(recipe: Recipe, shot: Shot, quiet: bool = False) -> Inversion:
-    """Apply a recipe to a shot; errors name the file."""
-    from napari_shadowinv.pipeline import run
-
-    with work_callbacks(quiet) as callbacks:
-        try:
-            return run(recipe, shot, **callbacks)
-        except InputError as error:
-            if shot.path is None:
-                raise
-            raise error.about(shot.path) from error
-
-
-def warn_of_setups(
-    experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]],
-) -> tuple[str, ...]:
-    """Print and return the doubts about setups and their images' shapes, before the work begins."""
-    texts = dict.fromkeys(
-        caution.text
-        for setup, shape in experiments
-        if setup is not None
-        for caution in setup_warnings(setup, shape)
-    )
-    for text in texts:
-        say_on_stderr(text, "yellow")
-    return tuple(texts)
+    say(" ".join(text.split()), style, on_stderr=True)
 
 
 @contextmanager
@@ -148,8 +110,8 @@ def progress_bars() -> Iterator[OnProgress | None]:
             if progress.stage not in tasks:
                 finish_all()
                 tasks[progress.stage] = bars.add_task(progress.stage, total=None, message="")
-            task = tasks[progress.stage]
-            bars.update(task, total=progress.total, completed=progress.step, message=progress.text)
+            task, message = tasks[progress.stage], escape_invisible(progress.text)
+            bars.update(task, total=progress.total, completed=progress.step, message=message)
 
         yield show
         finish_all()
@@ -183,33 +145,6 @@ def notify_errors(command: Callable[P, None]) -> Callable[P, None]:
             raise typer.Exit(code) from None
 
     return run
-
-
-def exit_unless_sound(result: Any, out: Path, left_out: LeaveOneOut | None = None) -> None:
-    """Exit with an error code if an inversion did not converge or a fit is doubtful.
-
-    Also if a static field does not explain an image that was left out.
-    """
-    is_inversion = result.kind is ResultKind.INVERSION
-    # Of a fit; a film pack has none.
-    verdict: Any = None if is_inversion else getattr(result, "verdict", None)
-    if left_out is not None and not left_out.explained.all():
-        text = f"NOT STATIC: {out} was written, but {left_out.explanation}"
-    elif is_inversion and not result.report.converged:
-        report = result.report
-        text = (
-            f"NOT CONVERGED: {out} was written, but its flux residual is "
-            f"{to_figures(report.residual)} (tolerance {to_figures(report.tolerance)}): do not "
-            "trust the field"
-        )
-    elif verdict is not None and not verdict.level.is_success:
-        text = f"{verdict.upper()}: {out} was written, but {result.explanation}"
-    elif doubts := [each.text for each in result.cautions if each.code == "samples"]:
-        text = f"UNRELIABLE ERROR BARS: {out} was written, but {doubts[0]}"
-    else:
-        return
-    say_on_stderr(text)
-    raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
 def is_interrupted() -> bool:

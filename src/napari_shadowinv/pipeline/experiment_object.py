@@ -3,8 +3,7 @@
 - a phantom, by its model: `object_of_phantom`; by a text: `phantom_of_text`; the size of an image
   by a text: `shape_of_text`
 - a 3-D field, through which particles are traced: `object_of_field`
-- a field that was retrieved or computed before: `object_of_result`, `object_of_displacement`,
-  `object_of_potential`
+- a field that was retrieved or computed before: `object_of_result`, `object_of_displacement`
 
 An object supplies the displacement of rays in any setup.
 """
@@ -18,11 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates, spline_filter
 
-from napari_shadowinv._system.arrays import as_numbers, complete_block_means, plain_array
+from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.forward import checked_displacement, synthetic_image
 from napari_shadowinv.physics.particle_flight import check_particles
@@ -341,17 +339,6 @@ def object_of_displacement(
             "the displacement of the object has values that are not finite: expected numbers in px"
         )
     return PlannedObject(samples, title=title, setup=setup, deflector=deflector)
-
-
-def object_of_potential(
-    potential: ArrayLike, setup: Setup | None = None, *, deflector: str | None = None
-) -> PlannedObject:
-    """Return an object with a potential: in px², or with a setup in m, shape (H, W)."""
-    plane = as_numbers("potential", plain_array(potential, "potential"))
-    if setup is not None:
-        plane = setup.normalized_potential(plane)
-    moved = displacement_from_potential(plane)
-    return object_of_displacement(moved, setup, deflector=deflector, title="a potential")
 
 
 def object_of_result(result: Any, *, deflector: str | None = None) -> PlannedObject:

@@ -6,15 +6,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -33,23 +30,12 @@ from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 
-if TYPE_CHECKING:
-    import xarray
-
 _DETERMINED_SHARE = 0.9  # of the shots, for a field that would be determined
 _SILENT_TOTALS = 3.0  # an error beyond so many reported ones is wrong in silence
 _LIMITS = (0.16, 0.84)
 _MIN_GAIN = 0.02  # of the error, worth a sentence
 _LISTED_GAINS = 3
 _LEAST_PART = 0.01  # of the largest one
-
-# Numbers of a shot in tables and datasets: attribute and title.
-_NUMBERS = {
-    "error": ("error", "Error made, r.m.s."),
-    "peak_error": ("peak_error", "Error made at the peak"),
-    "reported_error": ("total", "Error reported, r.m.s."),
-    "searched": ("is_searched", "Whether alternative solutions were looked for"),
-}
 
 
 @dataclass(frozen=True)
@@ -375,56 +361,14 @@ class ExperimentPlan(Summarised):
             {
                 "draw": shot.number,
                 "verdict": str(shot.verdict),
-                **{name: getattr(shot, attribute) for name, (attribute, _) in _NUMBERS.items()},
+                "error": shot.error,
+                "peak_error": shot.peak_error,
+                "reported_error": shot.total,
+                "searched": shot.is_searched,
                 **{f"part_{name}": shot.parts.get(name, math.nan) for name in self.parts},
             }
             for shot in self.shots
         ]
-
-    def to_dataset(self) -> xarray.Dataset:
-        """Return the plan as one labelled dataset.
-
-        Returns
-        -------
-        xarray.Dataset
-            Dimensions draw, image, component, y, x and cause. Errors are shares of the field. The
-            attributes hold setups, instrument and options as JSON texts, and the headline.
-        """
-        import xarray
-
-        causes = list(self.parts)
-        parts = [[shot.parts.get(name, math.nan) for name in causes] for shot in self.shots]
-        variables: dict[str, Any] = {}
-        for name, (attribute, title) in _NUMBERS.items():
-            numbers = np.asarray([getattr(shot, attribute) for shot in self.shots])
-            variables[name] = "draw", numbers, {"units": "1", "long_name": title}
-        variables["verdict"] = "draw", [str(shot.verdict) for shot in self.shots]
-        label = {"units": "1", "long_name": "Parts of the reported error, r.m.s."}
-        variables["parts"] = ("draw", "cause"), np.reshape(parts, (len(self.shots), -1)), label
-        label = {"units": "1", "long_name": "Counts of the first draw"}
-        variables["images"] = ("image", "y", "x"), self.images, label
-        for name, values, title in (
-            ("true_displacement", self.truth, "Displacement at the stated energy"),
-            ("displacement", self.retrieved, "Displacement retrieved in the first draw"),
-        ):
-            label = {"units": "pixel", "long_name": title}
-            variables[name] = ("component", "y", "x"), values, label
-        attributes = {
-            "format": "shadowinv plan",
-            "object": self.title,
-            "method": self.method,
-            "setups": json.dumps([setup.model_dump(mode="json") for setup in self.setups]),
-            "instrument": self.instrument.model_dump_json(),
-            "options": self.options.model_dump_json(),
-            "gains": json.dumps([asdict(gain) for gain in self.gains]),
-            "headline": self.headline.text,
-        }
-        coordinates = {
-            "draw": [shot.number for shot in self.shots],
-            "cause": causes,
-            "component": ["y", "x"],
-        }
-        return xarray.Dataset(variables, coordinates, attributes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -500,13 +444,3 @@ class ExperimentSweep:
             }
             for value, plan in zip(self.values, self.plans, strict=True)
         ]
-
-
-def table_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return rows as comma-separated values with a line of names."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-    return text.getvalue()

@@ -259,23 +259,27 @@ def run(
     report = Reporter(on_progress, should_stop)
     clock = time.perf_counter()
     report("prepare", 0, None, "image and source")
-    inputs = collect_inputs(recipe, shot)
-    inputs.recipe.check(inputs.shot)
-    of_fits = ("strength", "psf", "noise", "fiducials", "start")
-    if unused := [name for name in of_fits if getattr(inputs.shot, name) is not None]:
-        text = f"the shot has {', '.join(unused)}, which only fits use: fit the image to use it"
-        warnings = (*inputs.shot.warnings, Caution("file", text))
-        inputs = replace(inputs, shot=replace(inputs.shot, warnings=warnings))
-    ready = inputs.prepare(should_stop)
-    return run_prepared(
-        inputs,
-        ready,
-        on_progress=on_progress,
-        should_stop=should_stop,
-        cache=cache,
-        preview=preview,
-        began=clock,
-    )
+    try:
+        inputs = collect_inputs(recipe, shot)
+        inputs.recipe.check(inputs.shot)
+        of_fits = ("strength", "psf", "noise", "fiducials", "start")
+        if unused := [name for name in of_fits if getattr(inputs.shot, name) is not None]:
+            text = f"the shot has {', '.join(unused)}, which only fits use: fit the image to use it"
+            warnings = (*inputs.shot.warnings, Caution("file", text))
+            inputs = replace(inputs, shot=replace(inputs.shot, warnings=warnings))
+        return run_prepared(
+            inputs,
+            inputs.prepare(should_stop),
+            on_progress=on_progress,
+            should_stop=should_stop,
+            cache=cache,
+            preview=preview,
+            began=clock,
+        )
+    except InputError as error:
+        if not isinstance(shot, Shot) or shot.path is None:
+            raise
+        raise error.about(shot.path) from error
 
 
 def run_prepared(

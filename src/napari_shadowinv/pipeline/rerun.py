@@ -134,12 +134,7 @@ class RerunInputs:
 
     def _invert(self, recipe: Recipe, **callbacks: Any) -> Inversion:
         (shot,) = self.shots
-        try:
-            inversion = run(recipe, shot, **callbacks)
-        except InputError as error:
-            if shot.path is None:
-                raise
-            raise error.about(shot.path) from error
+        inversion = run(recipe, shot, **callbacks)
         assert inversion.provenance is not None
         # The masks were passed as arrays.
         masks_before = (self.provenance.start or self.provenance).masks

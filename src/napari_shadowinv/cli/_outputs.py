@@ -1,0 +1,227 @@
+"""Files that a command writes, and the end of its work: `Outputs`.
+
+Their names are chosen and checked before the work. Afterwards they are written and listed below the
+facts of the result, and a result that is not sound ends the command with an exit code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from typer import Exit
+
+from napari_shadowinv._system.safety import resolved_path
+from napari_shadowinv.cli._summary import Rows, two_columns
+from napari_shadowinv.cli._terminal import (
+    EXIT_NO_FIGURE,
+    EXIT_NOT_CONVERGED,
+    is_interrupted,
+    say,
+    say_on_stderr,
+)
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import ResultKind, to_figures
+from napari_shadowinv.io.files import split_address
+from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
+from napari_shadowinv.physics.beam import setup_warnings
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from napari_shadowinv.fitting import LeaveOneOut
+    from napari_shadowinv.physics.setup import Setup
+    from napari_shadowinv.preprocessing import Recipe
+    from napari_shadowinv.results import AnyResult
+
+Output = tuple[Path | None, tuple[str, ...]]
+"""A file, or None, and the endings that it may have."""
+
+
+@dataclass
+class Outputs:
+    """Files of a command, with what it has printed.
+
+    Attributes
+    ----------
+    overwrite, quiet : bool
+        As the command received them.
+    files : list of Path
+        Files to be written; those that could not be are removed.
+    printed : list of str
+        Cautions about setups, which are printed before the work.
+    """
+
+    overwrite: bool
+    quiet: bool
+    files: list[Path] = field(default_factory=list)
+    printed: list[str] = field(default_factory=list)
+    undrawn: list[Path] = field(default_factory=list)
+
+    def check(self, outputs: Iterable[Output], inputs: Iterable[Path | None]) -> None:
+        """Add files to be written; refuse, before any work, one that cannot be, or is read."""
+        from napari_shadowinv.io import check_output
+
+        for path, suffixes in outputs:
+            if path is not None:
+                check_output(path, self.overwrite, suffixes=suffixes)
+                self.files.append(path)
+        self.protect(inputs)
+
+    def check_result(
+        self,
+        kind: ResultKind,
+        result: Path,
+        *figures: Path,
+        recipe: Path | None = None,
+        inputs: Iterable[Path | None] = (),
+    ) -> None:
+        """Add a result with its figures and its recipe, as `check` does."""
+        pages: list[Output] = [(figure, FIGURE_SUFFIXES) for figure in figures]
+        self.check([(result, suffixes_for(kind)), *pages, (recipe, (".toml",))], inputs)
+
+    def protect(self, inputs: Iterable[Path | None]) -> None:
+        """Refuse to overwrite an input, even with --overwrite, or to write a file twice."""
+        sources = {resolved_path(split_address(file)[0]) for file in inputs if file is not None}
+        seen: set[Path] = set()
+        for path in self.files:
+            file = resolved_path(path)
+            if file in sources:
+                text = f"{path} is both read and written: choose another name for the output"
+                raise InputError(text)
+            if file in seen:
+                raise InputError(f"{path} would be written twice: choose two names")
+            seen.add(file)
+
+    def protect_files_of(self, recipe: Recipe) -> None:
+        """Refuse to overwrite a file that a recipe names."""
+        self.protect([recipe.mask, recipe.source_mask, getattr(recipe.source, "file", None)])
+
+    def warn_of_setups(
+        self, experiments: Iterable[tuple[Setup | None, tuple[int, int] | None]]
+    ) -> None:
+        """Print the doubts about setups and their images' shapes, before the work begins."""
+        texts = dict.fromkeys(
+            caution.text
+            for setup, shape in experiments
+            if setup is not None
+            for caution in setup_warnings(setup, shape)
+        )
+        for text in texts:
+            say_on_stderr(text, "yellow")
+        self.printed += texts
+
+    def write_result(
+        self,
+        result: AnyResult,
+        names: Sequence[str],
+        out: Path,
+        figure: Path,
+        left_out: LeaveOneOut | None = None,
+    ) -> None:
+        """Write a result, then its figures, whose title is the names of its files."""
+        from napari_shadowinv.io import write
+        from napari_shadowinv.io.files import name_of
+        from napari_shadowinv.plotting import left_out_figure, result_figure
+
+        title = ", ".join(name_of(name) for name in names)
+        dataset = result.to_dataset()
+        figures: dict[Path, Callable[[], Figure]] = {
+            figure: partial(result_figure, result, title=title)
+        }
+        if left_out is not None:
+            dataset = left_out.added_to(dataset)
+            figures[left_out_path(figure)] = partial(left_out_figure, left_out, title=title)
+        write(out, dataset, overwrite=self.overwrite)
+        self.write_figures(figures)
+
+    def write_figures(self, figures: Mapping[Path, Callable[[], Figure]]) -> None:
+        """Draw and write figures; print a caution for each that fails: see `exit_unless_drawn`."""
+        from napari_shadowinv.plotting import save_figure
+
+        for path, draw in figures.items():
+            try:
+                save_figure(path, draw(), self.overwrite)
+            except Exception as error:
+                if is_interrupted():
+                    raise
+                self.files.remove(path)
+                self.undrawn.append(path)
+                reason = str(error) or type(error).__name__
+                text = f"the figure {path} could not be drawn, everything else is written: {reason}"
+                say_on_stderr(text, "yellow")
+
+    def show(self, title: str, rows: Rows) -> None:
+        """Print facts, and below them the files that were written."""
+        if not self.quiet:
+            written = [("written", str(path)) for path in dict.fromkeys(self.files)]
+            say(two_columns(title, [*rows, *written]))
+
+    def exit_unless_drawn(self) -> None:
+        """Exit with an error code if a figure could not be written."""
+        if self.undrawn:
+            raise Exit(EXIT_NO_FIGURE)
+
+
+def exit_unless_sound(result: Any, out: Path, left_out: LeaveOneOut | None = None) -> None:
+    """Exit with an error code if an inversion did not converge or a fit is doubtful.
+
+    Also if a static field does not explain an image that was left out.
+    """
+    is_inversion = result.kind is ResultKind.INVERSION
+    # Of a fit; a film pack has none.
+    verdict: Any = None if is_inversion else getattr(result, "verdict", None)
+    if left_out is not None and not left_out.explained.all():
+        text = f"NOT STATIC: {out} was written, but {left_out.explanation}"
+    elif is_inversion and not result.report.converged:
+        report = result.report
+        text = (
+            f"NOT CONVERGED: {out} was written, but its flux residual is "
+            f"{to_figures(report.residual)} (tolerance {to_figures(report.tolerance)}): do not "
+            "trust the field"
+        )
+    elif verdict is not None and not verdict.level.is_success:
+        text = f"{verdict.upper()}: {out} was written, but {result.explanation}"
+    elif doubts := [each.text for each in result.cautions if each.code == "samples"]:
+        text = f"UNRELIABLE ERROR BARS: {out} was written, but {doubts[0]}"
+    else:
+        return
+    say_on_stderr(text)
+    raise Exit(EXIT_NOT_CONVERGED)
+
+
+def result_and_figure(image: Path, out: Path | None, figure: Path | None) -> tuple[Path, Path]:
+    """Choose the names of result and figure; the figure never replaces the image."""
+    if not image.stem:
+        raise InputError(f"{image} is a folder: expected an image; give the name of a file")
+    result = Path(f"{image.stem}{RESULT.suffix}") if out is None else out
+    if figure is not None:
+        return result, figure
+    figure = figure_beside(result)
+    if resolved_path(figure) == resolved_path(image):
+        figure = result.with_name(f"{result.stem}_report{PNG.suffix}")
+    return result, figure
+
+
+def figure_beside(result: Path) -> Path:
+    """Name a figure after a result, which must have a name itself."""
+    if not result.name:
+        raise InputError(f"{result} is a folder: expected the name of a file; add it to --out")
+    return result.with_suffix(PNG.suffix)
+
+
+def left_out_path(figure: Path) -> Path:
+    """Return the file of the figure of images that were left out."""
+    return figure.with_name(f"{figure.stem}_left_out{figure.suffix}")
+
+
+def check_setup(result: Path, setup: Setup | None, fields: Sequence[str] | None = None) -> None:
+    """Refuse a setup, or fields, that the result's format cannot store."""
+    from napari_shadowinv.io.pradformat import check_pradformat_fields, check_pradformat_setup
+
+    if result.suffix.lower() in PRADFORMAT.suffixes:
+        check_pradformat_setup(setup)
+        check_pradformat_fields(fields or ())
