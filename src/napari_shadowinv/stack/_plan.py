@@ -152,8 +152,11 @@ def describe_stack(
         pairs = zip(stack_shots.items, sources.items, strict=True)
         items = [replace(shot, source=own) for shot, own in pairs]
         stack_shots = replace(stack_shots, items=items)
-    plan = _plan_inversion if resolved.fit is None else _plan_fit
-    task = plan(stack_shots, inputs, resolved, variables)
+    task: AnyTask
+    if resolved.fit is None:
+        task = _plan_inversion(stack_shots, inputs, resolved, variables)
+    else:
+        task = _plan_fit(inputs, resolved, variables)
     return Stack(stack_shots, task, reader_text(reader))
 
 
@@ -173,9 +176,7 @@ def _plan_inversion(
     return InvertTask(inputs=inputs, variables=chosen, requested=recipe, by_row=bool(rows))
 
 
-def _plan_fit(
-    shots: Shots, inputs: Inputs, recipe: Recipe, variables: Collection[str] | None
-) -> FitTask:
+def _plan_fit(inputs: Inputs, recipe: Recipe, variables: Collection[str] | None) -> FitTask:
     check_fit(recipe)
     task = FitTask(inputs=inputs, variables=(), requested=recipe)
     fields = task.choices.fields
