@@ -289,7 +289,7 @@ class _Work:
     ) -> _SampledFit:
         """Fit some images, from a joint fit of these and others if there is one.
 
-        So many samples show how far the images leave the unknowns open.
+        `count` samples show how far the images leave the unknowns open.
         """
         linear = self._linear_of(members)
         large = False

@@ -41,8 +41,8 @@ from napari_shadowinv.inversion.samples import Pairs
 class Openness:
     """How far the images leave the best unknowns open, and how far an instrument would move them.
 
-    `posterior` belongs to counts; `pairs` compares samples with ones that are solved in full;
-    `errors`, `by_part` and `by_beam` belong to the displacement, `sensitivities` are shares of it.
+    There is a `posterior` for counts alone; `pairs` compares samples with those that are solved in
+    full; `errors`, `by_part` and `by_beam` are displacements, `sensitivities` shares of it.
     `assumed` are the likely changes by a detector of which nothing was stated.
     """
 

@@ -167,7 +167,7 @@ def collect_data(
         weights=np.pad(np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0), fill),
         strengths=matrix,
         beams=np.pad(in_units, ((0, 0), *around), mode="edge"),
-        psf=[_checked_point_spread(names[k], shot.psf, shape) for k, shot in enumerate(shots)],
+        psf=[_checked_point_spread(shot.psf, shape) for shot in shots],
         smoothness=np.tile(smoothness, (matrix.shape[1], 1)),
         **strip,
         free_brightness=free_brightness or unknown or is_dimmed,
@@ -324,12 +324,12 @@ def _relative_noise(
     left in a pixel of each beam, as recorded.
     """
     # Differences of image and beam contain the noise of both.
-    deviations = _deviations(noise, data - recorded if noise is None else data, used, names)
+    deviations = _deviations(noise, data - recorded if noise is None else data, used)
     floors = _LEAST_NOISE * _means(recorded, used)[:, None, None]
     beams, shares = smooth_references(recorded, data, np.maximum(deviations, floors), used)
     remaining = shares[:, None, None] * deviations
     if noise is None:
-        deviations = _deviations(None, data - beams, used, names)
+        deviations = _deviations(None, data - beams, used)
     elif not remaining.any():
         remaining += np.array(list(map(estimated_noise, beams, used)))[:, None, None]
     units = _means(beams, used)[:, None, None]
@@ -412,7 +412,7 @@ def _checked_planes(
 ) -> tuple[FloatArray, FloatArray | None, BoolArray]:
     """Return images, sources if there are any, and usable pixels, each of shape (L, H, W).
 
-    A fit takes a number of bytes of memory for a pixel, and for a pixel of each image.
+    `bytes_of` are the memory that a fit takes for a pixel, and for a pixel of each image.
     """
     common_values(names, [shot.beam_unknown or None for shot in shots], "unknown source")
     sources = common_values(names, [None if s.beam_unknown else s.source for s in shots], "source")
@@ -578,7 +578,7 @@ def _refuse_other_units(brightness: FloatArray, names: Sequence[str], most: floa
             )
 
 
-def _deviations(noise: Any, data: FloatArray, used: BoolArray, names: Sequence[str]) -> FloatArray:
+def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
     """Standard deviation of each pixel's noise."""
     if isinstance(noise, str):
         if noise not in KINDS_OF_NOISE:
@@ -596,18 +596,15 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray, names: Sequence[s
     if noise is None:
         levels = np.array(list(map(estimated_noise, data, used)))
         return np.asarray(np.ones(data.shape) * levels[:, None, None])
-    planes = []
-    for name, each in zip(names, noise, strict=True):
-        sigma = as_numbers(f"noise of {name}", each)
+    sigmas = [as_numbers("noise", each) for each in noise]
+    for sigma in sigmas:
         if not sigma.size or not np.isfinite(sigma).all() or sigma.min() <= 0:
-            raise InputError(f"noise of {name} is not positive: expected standard deviations")
+            raise InputError("noise is not positive everywhere: expected standard deviations")
         if sigma.shape not in ((), data.shape[1:]):
             raise InputError(
-                f"noise of {name} has shape {sigma.shape}: expected one number, or an array like "
-                "the image"
+                f"noise has shape {sigma.shape}: expected one number, or an array like the image"
             )
-        planes.append(np.broadcast_to(sigma, data.shape[1:]))
-    return np.array(planes)
+    return np.array([np.broadcast_to(sigma, data.shape[1:]) for sigma in sigmas])
 
 
 def _refuse_hopeless_noise(
@@ -679,19 +676,15 @@ def _checked_fiducials(
     return Fiducials(places + 0.5, displacements, errors)
 
 
-def _checked_point_spread(name: str, psf: Any, size: tuple[int, int]) -> float | FloatArray:
+def _checked_point_spread(psf: Any, size: tuple[int, int]) -> float | FloatArray:
     """Return a standard deviation in px, 0 for None, or a normalised kernel."""
-    values = as_numbers(f"psf of {name}", 0.0 if psf is None else psf)
+    values = as_numbers("psf", 0.0 if psf is None else psf)
     if not values.size or not np.isfinite(values).all() or values.min() < 0:
-        raise InputError(f"psf of {name} is {psf}: expected a standard deviation in px or a kernel")
+        raise InputError(f"psf is {psf}: expected a standard deviation in px or a kernel")
     if values.ndim == 0:
         if float(values) > min(size) / 8:
-            raise InputError(
-                f"psf of {name} is {float(values):g} px: expected less than an eighth of a side"
-            )
+            raise InputError(f"psf is {float(values):g} px: expected less than an eighth of a side")
         return float(values)
     if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:
-        raise InputError(
-            f"psf of {name} has shape {values.shape}: expected a kernel with odd sides"
-        )
+        raise InputError(f"psf has shape {values.shape}: expected a kernel with odd sides")
     return np.asarray(values / values.sum())

@@ -1,4 +1,4 @@
-"""Noise that is given or estimated, against the images' own: `match_noise`, `NoiseMatch`."""
+"""Noise that is given or estimated, against the images: `match_noise`, `NoiseMatch`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from napari_shadowinv.inversion.noise import measure_correlation
 
 @dataclass(frozen=True)
 class NoiseMatch:
-    """Noise that is given or estimated, against the images' calm parts.
+    """Noise that is given or estimated, against that of the images' calm parts.
 
     Weights are made for the power of the noise on long waves, where it bends fields: correlated
     noise has more of it than white noise of the same pixels, smoothed counts less per pixel.
@@ -78,9 +78,9 @@ def match_noise(
     width : float or None
         Standard deviation of the blur that correlates the noise, px, if it is stated.
     is_estimated : bool
-        Whether the standard deviations belong to differences between neighbouring pixels.
+        Whether the standard deviations are those of differences between neighbouring pixels.
     too_large : float, default 2.5
-        A variance is too large where it exceeds the calm parts' by this factor.
+        Ratio to the variance of the calm parts beyond which a variance is too large.
     """
     factors, expected = np.ones((2, len(excess)))
     correlation = 0.0

@@ -220,7 +220,7 @@ class Pattern:
         return self.largest > self.suspect
 
     def lacks_counts(self, deviations: float = 4.0) -> bool:
-        """Return whether the noise is smaller than counts make it, by a number of deviations."""
+        """Return whether the noise is smaller than counts make it, by these deviations or more."""
         return self.missing_counts > deviations * self.counts_deviation
 
 

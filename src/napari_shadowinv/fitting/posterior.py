@@ -153,9 +153,9 @@ class Posterior:
         """Return random changes of the unknowns, as large as the data leave possible.
 
         Numbers of the instrument that are held are drawn first; all other unknowns respond to them.
-        The tolerance is that of the equations. By default they are solved `closely`, as the longest
-        waves, which noise moves most, are found last; even more so `in_valley`, where fields and
-        numbers of an instrument explain an image alike.
+        Of the equations, the relative residual is the `tolerance`. By default they are solved
+        `closely`, as the longest waves, which noise moves most, are found last; even more so
+        `in_valley`, where fields and numbers of an instrument explain an image alike.
         """
         if tolerance is None:
             tolerance = in_valley if self._scales.has_rough_numbers else closely
@@ -382,8 +382,8 @@ class Posterior:
     ) -> float:
         """Return half the log-determinant of the Hessian relative to the prior of potentials.
 
-        By stochastic Lanczos quadrature in the space of a number of powers of the Hessian, with the
-        same probes for both, and for each field probes of its own generator: a field that the data
+        By stochastic Lanczos quadrature in the space of some `powers` of the Hessian, with the
+        same probes for both, and for each field those of its own generator: a field that the data
         do not show adds nothing to others.
         """
         # What is fixed has no scale, and no part in the volume; nor what nothing holds.
@@ -552,7 +552,7 @@ def errors_by_part(
 ) -> dict[str, FloatArray]:
     """Return standard deviations of each field's displacement by noise and by imperfections.
 
-    From at most `most` samples, of which each costs a solution for an imperfection.
+    From `most` samples at most, of which each costs a solution for an imperfection.
     """
     if not scene.imperfect.parts:
         return {}
@@ -600,7 +600,7 @@ def shifts_by_beam(
 ) -> BeamShifts | None:
     """Return the effect of beams that differ from their sources; None if beams are fitted.
 
-    Half as many beams are drawn as there are `samples` of the posterior, but at least `least`.
+    Half as many beams are drawn as there are `samples` of the posterior, or the `least`.
     """
     if not samples or scene.imperfect.parts:
         return None

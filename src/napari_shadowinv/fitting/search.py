@@ -107,7 +107,7 @@ class _Descent(NamedTuple):
     def run(
         self, scene: Scene, on_step: OnStep, steps: int = 60, spacing: float = 1 / 3
     ) -> Minimum:
-        """Return the minimum at the end of the stages, each of a most number of steps."""
+        """Return the minimum at the end of the stages, with the most steps of each."""
         end = replace(self.minimum, start=self.start.name)
         for factor, blur in self.stages:
             # So wide a blur hides how far apart rays are.
@@ -134,9 +134,9 @@ def search(
 ) -> list[Minimum]:
     """Descend from each start to pixels of two; return the distinct minima, best first.
 
-    Starts without a field share their first stage if it is the same. Of those that have come to the
-    same stage before the last, at most a number of them, the best, go on. Before the data show λ
-    and κ, they are `stiffness` times the first ones.
+    Starts without a field share their first stage if it is the same. After the stage before the
+    last, the best go on, `most` at most. Until λ and κ are estimated, they are `stiffness` times
+    the first ones.
     """
     rough = replace(
         scene, smoothness=stiffness * np.tile(FIRST_SMOOTHNESS, (len(scene.smoothness), 1))
@@ -212,7 +212,7 @@ def estimate_smoothness(
     """Find λ and κ, unless they are given, and the unknowns that belong to them.
 
     Numbers of an instrument that change the response to fields are found, too, and held. That is in
-    recorded pixels where these matter, and all images have at most a number of them.
+    recorded pixels where these matter, unless all images have more than `most_pixels`.
     """
     is_fixed = bool(scene.smoothness.any())
     smoothness = scene.smoothness

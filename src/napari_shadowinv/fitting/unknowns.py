@@ -67,7 +67,7 @@ class Unknowns(NamedTuple):
         return Unknowns(*part[:_COMMON], *blocks)
 
     def plus(self, other: Unknowns, times: float = 1.0) -> Unknowns:
-        """Return the sum with another, times a factor."""
+        """Return the sum with a multiple of another."""
         return Unknowns(*(a + times * b for a, b in zip(self, other, strict=True)))
 
     def zeros(self) -> Unknowns:
