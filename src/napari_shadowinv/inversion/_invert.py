@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -241,44 +241,11 @@ def invert(
     seconds: dict[str, float] = {}
     with measure_time("prepare", seconds):
         report("prepare", 0, 1)
-        if plan is None:
-            image, source, mask = unpack_shot(image, source, mask)
-            measured = measured and source is not None
-        else:
-            _check_plan(plan, options, has_own=source is None and mask is None, measured=measured)
-            image, source, mask = _unmasked_values(image, plan.mask), plan.source, plan.mask
-            measured = plan.measured
         inputs = _prepare(image, source, mask, options, instrument, plan, start, measured=measured)
         report("prepare", 1, 1)
-    with measure_time("sites", seconds):
-        plan = inputs.plan or _plan(inputs.prepared.source, options, inputs.mask, measured)
-        levels = plan.levels.with_reporter(report)
-    with measure_time("transport", seconds):
-        prepared = _with_fitted_flux(inputs, plan, levels, options, report)
-        problem = _Problem.begin(plan, prepared, inputs, options)
-        levels = _levels_to_solve(plan, levels, inputs.start, options)
-    solution = _solve(problem, levels, inputs.start, report, seconds)
-    quality = _make_report(
-        prepared.in_units(),
-        problem.noise(),
-        solution.levels,
-        solution.fields,
-        seconds,
-        problem.budget,
-        inputs.is_dark,
-    )
-    with measure_time("errors", seconds):
-        errors = solution.wait_for_errors()
-    with measure_time("prepare", seconds):
-        warnings = _warnings(problem, inputs, solution, quality, errors)
-    quality = replace(
-        quality,
-        warnings=warnings,
-        sites_reason=_sites_reason(levels, problem.budget, solution, inputs.start),
-        measured=plan.measured,
-    )
-    inversion = _inversion(plan, prepared, solution, quality, inputs.instrument, options)
-    return replace(inversion, errors=errors)
+    problem = _pose(inputs, options, report, seconds)
+    solution = _solve(problem, report, seconds)
+    return _assess(problem, solution, seconds)
 
 
 class _Inputs(NamedTuple):
@@ -294,12 +261,13 @@ class _Inputs(NamedTuple):
     registered: RegisteredSource
     unlit: list[Caution]
     is_dark: BoolArray | bool
+    measured: bool
 
 
 def _prepare(
     image: ArrayLike,
     source: ArrayLike | None,
-    mask: Any,
+    mask: ArrayLike | None,
     options: InversionOptions,
     instrument: Instrument,
     plan: SitePlan | None,
@@ -308,6 +276,13 @@ def _prepare(
     measured: bool,
 ) -> _Inputs:
     """Mask unlit pixels, check image and source, and bring a recorded source into register."""
+    if plan is None:
+        image, source, mask = unpack_shot(image, source, mask)
+        measured = measured and source is not None
+    else:
+        _check_plan(plan, options, has_own=source is None and mask is None, measured=measured)
+        image, source, mask = _unmasked_values(image, plan.mask), plan.source, plan.mask
+        measured = plan.measured
     recorded = source if measured else None
     mask, unlit = mask_unlit(image, recorded, mask)
     is_dark = _dark_in_source(recorded, mask)
@@ -323,7 +298,7 @@ def _prepare(
             plan = start = None
             prepared = prepare(image, source, options, mask)
     return _Inputs(
-        prepared, image, source, mask, plan, start, instrument, registered, unlit, is_dark
+        prepared, image, source, mask, plan, start, instrument, registered, unlit, is_dark, measured
     )
 
 
@@ -346,24 +321,19 @@ class _Problem:
     `noise` and `checks` wait for their results; the checks begin when `checks` is first looked up.
     """
 
+    inputs: _Inputs
     plan: SitePlan
-    prepared: Prepared
+    levels: Levels  # to be solved, at most
+    prepared: Prepared  # with the flux that is solved
     options: InversionOptions
     noise: Callable[[], ImageNoise]
     budget: Budget
 
-    @classmethod
-    def begin(
-        cls, plan: SitePlan, prepared: Prepared, inputs: _Inputs, options: InversionOptions
-    ) -> _Problem:
-        """Begin to estimate the noise, which does not depend on the transport."""
-        correlation = inputs.instrument.noise_correlation
-        noise = begin(
-            lambda: ImageNoise(prepared.in_units(), options, correlation), options.threads
-        )
-        assumed = inputs.registered.is_assumed
-        budget = Budget(plan, prepared, noise, options, inputs.instrument, is_shift_assumed=assumed)
-        return cls(plan, prepared, options, noise, budget)
+    @property
+    def is_adaptive(self) -> bool:
+        """Whether the number of sites follows from the errors."""
+        is_free = self.options.is_adaptive and not self.levels.is_complete
+        return is_free and self.inputs.start is None
 
     @cached_property
     def checks(self) -> Callable[[], tuple[Caution, ...]]:
@@ -373,13 +343,32 @@ class _Problem:
             partial(_check_image, self.plan, self.prepared, self.noise), self.options.threads
         )
 
-    def needed(self, levels: Levels, solutions: Sequence[LevelSolution]) -> float:
+    def needed(self, solutions: Sequence[LevelSolution]) -> float:
         """Return the factor by which more sites are needed; see `Budget.needed`."""
         factor = self.budget.needed(solutions)
-        finer = sum(count > len(solutions[-1].weights) for count in levels.counts)
+        finer = sum(count > len(solutions[-1].weights) for count in self.levels.counts)
         if factor <= RATIO or finer == 1:
             _ = self.checks  # begin, while the solver waits for the sites of the last level
         return factor
+
+
+def _pose(
+    inputs: _Inputs, options: InversionOptions, report: Reporter, seconds: dict[str, float]
+) -> _Problem:
+    """Place the sites, and begin to estimate the noise, which does not depend on the transport."""
+    with measure_time("sites", seconds):
+        plan = inputs.plan or _plan(inputs.prepared.source, options, inputs.mask, inputs.measured)
+        levels = plan.levels.with_reporter(report)
+    with measure_time("transport", seconds):
+        prepared = _with_fitted_flux(inputs, plan, levels, options, report)
+        correlation = inputs.instrument.noise_correlation
+        noise = begin(
+            lambda: ImageNoise(prepared.in_units(), options, correlation), options.threads
+        )
+        assumed = inputs.registered.is_assumed
+        budget = Budget(plan, prepared, noise, options, inputs.instrument, is_shift_assumed=assumed)
+        levels = _levels_to_solve(plan, levels, inputs.start, options)
+    return _Problem(inputs, plan, levels, prepared, options, noise, budget)
 
 
 def _check_image(
@@ -409,26 +398,14 @@ class _Solution(NamedTuple):
     levels: list[LevelSolution]
     fields: _Fields
     wait_for_errors: Callable[[], ErrorBudget | None]
-    adaptive: bool  # whether the number of sites follows from the errors
-    finest: bool  # whether it is the largest
+    finest: bool  # whether an adaptive number of sites is the largest
     coarse: int  # sites with which structures of the image were missed; 0 if there were none
 
 
-def _solve(
-    problem: _Problem,
-    levels: Levels,
-    start: Inversion | None,
-    report: Reporter,
-    seconds: dict[str, float],
-) -> _Solution:
+def _solve(problem: _Problem, report: Reporter, seconds: dict[str, float]) -> _Solution:
     """Solve levels until errors and re-projection need no more sites, and read the fields out."""
-    plan, prepared, options, budget = (
-        problem.plan,
-        problem.prepared,
-        problem.options,
-        problem.budget,
-    )
-    adaptive = options.is_adaptive and not levels.is_complete and start is None
+    options, levels, budget = problem.options, problem.levels, problem.budget
+    start, adaptive = problem.inputs.start, problem.is_adaptive
     if not adaptive:
         _ = problem.checks  # begin
     solutions: list[LevelSolution] = []
@@ -440,57 +417,32 @@ def _solve(
                 budget.target,
                 report,
                 start=None if start is None else start.cells.weights,
-                needed=partial(problem.needed, levels) if adaptive else None,
+                needed=problem.needed if adaptive else None,
                 solved=solutions,
             )
         answer = solutions[-1]
         if answer.converged:
             with measure_time("errors", seconds):
                 budget.free_target(solutions)
-        fields, wait_for_errors = _read_fields(plan, prepared, solutions, budget, report, seconds)
+        fields, wait_for_errors = _read_fields(problem, solutions, report, seconds)
         finest = adaptive and len(answer.weights) == levels.counts[-1]
         more = adaptive and answer.converged and not finest
-        units = prepared.in_units()
+        units = problem.prepared.in_units()
         if not more or not is_coarse(units, fields.reprojection, problem.noise(), options.threads):
-            return _Solution(solutions, fields, wait_for_errors, adaptive, finest, coarse)
+            return _Solution(solutions, fields, wait_for_errors, finest, coarse)
         wait_for_errors()  # they use the budget that the next solution changes
         coarse = len(answer.weights)
 
 
-def _warnings(
-    problem: _Problem,
-    inputs: _Inputs,
-    solution: _Solution,
-    quality: Report,
-    errors: ErrorBudget | None,
-) -> tuple[Caution, ...]:
-    """Return all reasons to doubt an inversion, the gravest first."""
-    options = problem.options
-    by_errors: list[Caution | None] = []
-    by_accuracy: list[Caution | None] = []
-    if errors is not None:
-        by_errors = [errors.beam_caution(), errors.edge_caution(options.max_error)]
-        is_chosen = "accuracy" in options.model_fields_set
-        if errors.condition(options.max_error) is None:
-            is_chosen |= errors.share > options.max_error
-        if solution.finest and is_chosen and quality.warnings == problem.prepared.warnings:
-            why = "with the most sites placed unless more are given"
-            by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
-    registered = inputs.registered.caution
-    of_image = (*inputs.unlit, *quality.warnings, *by_accuracy, *problem.checks())
-    return tuple(filter(None, (*by_errors, registered, *of_image)))
-
-
-def _inversion(
-    plan: SitePlan,
-    prepared: Prepared,
-    solution: _Solution,
-    report: Report,
-    instrument: Instrument,
-    options: InversionOptions,
-) -> Inversion:
-    """Return the fields of a solution in units of the image, with its report."""
+def _assess(problem: _Problem, solution: _Solution, seconds: dict[str, float]) -> Inversion:
+    """Check the fields of a solution, wait for their errors, and return them with a report."""
+    plan, prepared, inputs = problem.plan, problem.prepared, problem.inputs
     answer, fields = solution.levels[-1], solution.fields
+    cautions = _cautions(problem, solution)
+    with measure_time("errors", seconds):
+        errors = solution.wait_for_errors()
+    with measure_time("prepare", seconds):
+        cautions = _ranked(problem, solution, cautions, errors)
     reprojection = fields.reprojection * prepared.unit
     return Inversion(
         image=prepared.image,
@@ -507,13 +459,58 @@ def _inversion(
         reprojection=reprojection,
         residual=np.where(prepared.mask, prepared.image - reprojection, 0.0),
         caustic=mark_caustics(
-            fields.jacobian, prepared.mask, len(answer.weights), options.caustic_jacobian
+            fields.jacobian, prepared.mask, len(answer.weights), problem.options.caustic_jacobian
         ),
         mask=prepared.mask,
-        report=report,
-        options=options,
-        instrument=instrument,
+        report=_make_report(problem, solution, seconds, cautions),
+        options=problem.options,
+        instrument=inputs.instrument,
+        errors=errors,
     )
+
+
+def _cautions(problem: _Problem, solution: _Solution) -> tuple[Caution, ...]:
+    """Return the reasons to doubt a solution, of the transport and of its fields."""
+    finest, fields, options = solution.levels[-1], solution.fields, problem.options
+    if not finest.converged:
+        text = (
+            f"not converged: flux residual {to_figures(finest.residual)} per cell, tolerance "
+            f"{to_figures(options.tolerance)}; {finest.reason}"
+        )
+        return (Caution("not-converged", text),)
+    return find_cautions(
+        problem.prepared.in_units(),
+        problem.noise(),
+        fields.displacement,
+        fields.reprojection,
+        fields.jacobian,
+        len(finest.weights),
+        options,
+        is_dark=problem.inputs.is_dark,
+    )
+
+
+def _ranked(
+    problem: _Problem,
+    solution: _Solution,
+    cautions: tuple[Caution, ...],
+    errors: ErrorBudget | None,
+) -> tuple[Caution, ...]:
+    """Return all reasons to doubt an inversion, the gravest first."""
+    options, inputs, prepared = problem.options, problem.inputs, problem.prepared
+    by_errors: list[Caution | None] = []
+    by_accuracy: list[Caution | None] = []
+    if errors is not None:
+        by_errors = [errors.beam_caution(), errors.edge_caution(options.max_error)]
+        is_chosen = "accuracy" in options.model_fields_set
+        if errors.condition(options.max_error) is None:
+            is_chosen |= errors.share > options.max_error
+        if solution.finest and is_chosen and not cautions:
+            why = "with the most sites placed unless more are given"
+            by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
+    of_image = (*cautions, *prepared.warnings, *by_accuracy, *problem.checks())
+    registered = inputs.registered.caution
+    return tuple(filter(None, (*by_errors, registered, *inputs.unlit, *of_image)))
 
 
 def _dark_in_source(source: ArrayLike | None, mask: BoolArray | None) -> BoolArray | bool:
@@ -533,19 +530,17 @@ def _checked_source(plan: SitePlan) -> CheckedImage:
     return _checked_sources.setdefault(plan, CheckedImage.of(plan.source, plan.mask))
 
 
-def _sites_reason(
-    levels: Levels, budget: Budget, solution: _Solution, start: Inversion | None
-) -> str:
+def _sites_reason(problem: _Problem, solution: _Solution) -> str:
     """Return the reason for the number of sites."""
-    if start is not None:
+    if problem.inputs.start is not None:
         return "as many as in the inversion that it started from"
-    if not solution.adaptive:
+    if not problem.is_adaptive:
         return "as requested"
     if solution.coarse:
         return f"with {solution.coarse:,} the re-projection missed structures of the image"
-    if budget.reason:
-        return budget.reason
-    if levels.counts[-1] < MAX_DEFAULT_SITES:
+    if problem.budget.reason:
+        return problem.budget.reason
+    if problem.levels.counts[-1] < MAX_DEFAULT_SITES:
         return "one for each pixel, the most that are placed unless more are asked for"
     return "the most that are placed unless more are asked for"
 
@@ -617,15 +612,11 @@ class _Fields:
 
 
 def _read_fields(
-    plan: SitePlan,
-    prepared: Prepared,
-    solutions: list[LevelSolution],
-    budget: Budget,
-    report: Reporter,
-    seconds: dict[str, float],
+    problem: _Problem, solutions: list[LevelSolution], report: Reporter, seconds: dict[str, float]
 ) -> tuple[_Fields, Callable[[], ErrorBudget | None]]:
     """Read the last solution, and begin to estimate its errors; return a function that waits."""
-    solution, options = solutions[-1], budget.options
+    plan, prepared, options = problem.plan, problem.prepared, problem.options
+    solution, budget = solutions[-1], problem.budget
 
     def report_share(report: Reporter, share: float, first: int, last: int) -> None:
         report("read-out", round(first + share * (last - first)), _STEPS)
@@ -702,48 +693,30 @@ def _levels_from_start(
 
 
 def _make_report(
-    prepared: Prepared,
-    noise: ImageNoise,
-    solutions: list[LevelSolution],
-    fields: _Fields,
+    problem: _Problem,
+    solution: _Solution,
     seconds: dict[str, float],
-    budget: Budget,
-    is_dark: BoolArray | bool,
+    cautions: tuple[Caution, ...],
 ) -> Report:
-    finest, options = solutions[-1], budget.options
-    text = (
-        f"not converged: flux residual {to_figures(finest.residual)} per cell, tolerance "
-        f"{to_figures(options.tolerance)}; {finest.reason}"
-    )
-    cautions: tuple[Caution, ...] = (Caution("not-converged", text),)
-    if finest.converged:
-        cautions = find_cautions(
-            prepared,
-            noise,
-            fields.displacement,
-            fields.reprojection,
-            fields.jacobian,
-            len(finest.weights),
-            options,
-            is_dark=is_dark,
-        )
+    finest, fields, prepared = solution.levels[-1], solution.fields, problem.prepared.in_units()
     return Report(
         converged=finest.converged,
-        iterations=sum(solution.iterations for solution in solutions),
+        iterations=sum(level.iterations for level in solution.levels),
         residual=finest.residual,
-        tolerance=options.tolerance,
+        tolerance=problem.options.tolerance,
         n_sites=len(finest.weights),
-        floor=options.floor,
+        floor=problem.options.floor,
         floored_pixels=prepared.floored_pixels,
         clipped_pixels=prepared.clipped_pixels,
         levels=tuple(
-            (len(solution.weights), solution.iterations, solution.residual)
-            for solution in solutions
+            (len(level.weights), level.iterations, level.residual) for level in solution.levels
         ),
         seconds=seconds,
-        warnings=(*cautions, *prepared.warnings),
+        warnings=cautions,
         flux_scale=prepared.flux_scale,
         flux_left=fields.flux_left,
         flux_entered=fields.flux_entered,
         image_residual=image_residual(prepared.image, fields.reprojection, prepared.mask),
+        sites_reason=_sites_reason(problem, solution),
+        measured=problem.plan.measured,
     )
