@@ -23,6 +23,7 @@ from helpers.jobs import run_job
 from helpers.reports import texts_of
 from napari_shadowinv import Instrument, InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari import jobs
+from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import (
     frame_of,
     metadata_for,
@@ -30,7 +31,6 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     unit_of,
 )
-from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent
@@ -71,17 +71,14 @@ def run(qtbot: Any) -> Callable[[Any], None]:
 def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """Make every run wait, as a large image would, until it is stopped or let go."""
     let_go = threading.Event()
-    run = _panels._run
+    work = Job.work
 
-    def waiting(work: Any, box: Any) -> None:
-        def work_slowly(on_progress: Any, should_stop: Any) -> Any:
-            while not let_go.is_set() and not should_stop():
-                time.sleep(0.01)
-            return work(on_progress, should_stop)
+    def work_slowly(job: Job, on_progress: Any, should_stop: Any) -> Any:
+        while not let_go.is_set() and not should_stop():
+            time.sleep(0.01)
+        return work(job, on_progress, should_stop)
 
-        run(work_slowly, box)
-
-    monkeypatch.setattr(_panels, "_run", waiting)
+    monkeypatch.setattr(Job, "work", work_slowly)
     return let_go
 
 
@@ -274,24 +271,21 @@ def test_cancel_ends_the_work_itself(
 
     cancelled = threading.Event()
     stages_after_cancel: list[str] = []
-    run = _panels._run
+    work = Job.work
 
-    def run_held(work: Any, box: Any) -> None:
+    def held(job: Job, on_progress: Any, should_stop: Any) -> Any:
         """Hold the work at its first site until it is cancelled, and record its later stages."""
 
-        def held(on_progress: Any, should_stop: Any) -> Any:
-            def watch(progress: Any) -> None:
-                if cancelled.is_set():
-                    stages_after_cancel.append(progress.stage)
-                on_progress(progress)
-                if progress.stage == "sites":
-                    cancelled.wait()
+        def watch(progress: Any) -> None:
+            if cancelled.is_set():
+                stages_after_cancel.append(progress.stage)
+            on_progress(progress)
+            if progress.stage == "sites":
+                cancelled.wait()
 
-            return work(watch, should_stop)
+        return work(job, watch, should_stop)
 
-        run(held, box)
-
-    monkeypatch.setattr(_panels, "_run", run_held)
+    monkeypatch.setattr(Job, "work", held)
     slow.set()
     shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement)
     window.layers["shot"].data = shot
