@@ -77,7 +77,9 @@ class VerdictLimits:
     """Limits of the rules, as benchmarks/trust.py shows them to be needed.
 
     Of rings that fold 14 % of one image, the found field was 20 % wrong with 7 to 10 % folded and
-    χ² 0.93: where rays meet or cross, one image can be explained by fields of other folds.
+    χ² 0.93: where rays meet or cross, one image can be explained by fields of other folds. Of 60
+    single images of slopes from 0.85 to 1.3, whose rays meet in up to 50 % of the object, none was
+    wrong.
 
     Of 60 fits with a fitted instrument on 96 px, the r.m.s. ratio of error to total was 1.0, with a
     transmission 1.3; of 60 on 64 px the largest was 3.9, of one on 200 px with a blur 3.0. Of 14
@@ -94,7 +96,7 @@ class VerdictLimits:
     missing_counts: float = 0.05
     lost_rays: float = 0.01
     meeting: float = 0.2  # Jacobian
-    few: float = 0.02  # share of the object in which rays meet
+    few: float = 0.04  # share of the object in which rays meet
     hidden: float = 0.5  # of the strongest contrast
     safety: float = 2.0
 
