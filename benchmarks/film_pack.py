@@ -196,7 +196,7 @@ def fitted(
     source = fit.source[0]
     beam_error = np.std(source / source.mean() / (beam / beam.mean()) - 1)
     chi2 = f"{fit.chi2.min():.2f} to {fit.chi2.max():.2f}"
-    told = fit.report.total
+    told = fit.total_error
     figures = [f"{100 * error:.1f}" for error in (*errors, beam_error, told)]
     return [*figures, chi2, str(fit.verdict), f"{seconds:.0f}"]
 

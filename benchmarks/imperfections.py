@@ -427,7 +427,7 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
     truth = shots.displacement()
     error = result.fields[0].displacement - truth
     share = float(np.sqrt((error**2).mean() / (truth**2).mean()))
-    total = result.report.total
+    total = result.total_error
     mark = ""
     if is_right and result.verdict != "determined":
         mark = "FALSE ALARM"

@@ -544,10 +544,10 @@ def fit_outcome(
     exact_field = times * truth(side, name)
     (field,) = result.fields
     error = length(field.displacement - exact_field) / length(exact_field)
-    assert field.uncertainty is not None
-    off = np.abs(field.displacement - exact_field) / field.uncertainty
+    assert field.errors.per_pixel is not None
+    off = np.abs(field.displacement - exact_field) / field.errors.per_pixel
     within = (off < 1).mean(), (off < 1.96).mean()
-    return FitOutcome(error, result.report.total, result.verdict, *within)
+    return FitOutcome(error, result.total_error, result.verdict, *within)
 
 
 def table_of_energies(side: int, first_seed: int) -> None:

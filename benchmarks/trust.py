@@ -799,7 +799,7 @@ def coverage(seed: int, count: int) -> Iterator[Answer]:
                     instrument=drawn.stated,
                     options={"samples": 60},
                 )
-                std = result.fields[0].uncertainty
+                std = result.fields[0].errors.per_pixel
                 off = np.abs(result.fields[0].displacement - truth) / std
                 pixels = [float((off < limit).mean()) for limit in (0.994, 1.96)]
             else:

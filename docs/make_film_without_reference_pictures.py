@@ -76,7 +76,7 @@ def print_table(side: int = 48) -> None:
         result = fit(shots_of(films, setup=setups, noise=0.03), instrument=instrument)
         print(
             f"| {name} | {single:.0%} | {error(result.fields[0].displacement):.1%} | "
-            f"{result.report.total:.1%} | {result.verdict} |",
+            f"{result.total_error:.1%} | {result.verdict} |",
             flush=True,
         )
 

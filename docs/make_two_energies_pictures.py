@@ -79,7 +79,7 @@ def draw_cut(axes: Axes, page: Any) -> None:
         return np.asarray(setup.path_integrated_b(displacement, unit="MG um")[0][ROW])
 
     x = np.arange(page.truth.shape[2])
-    found, deviation = along_x(page.field.displacement), along_x(page.field.uncertainty)
+    found, deviation = along_x(page.field.displacement), along_x(page.field.errors.per_pixel)
     two = 2 * np.abs(deviation)
     axes.plot(x, along_x(page.guess.displacement), color=BLUE, lw=1.2, label="transport, uniform")
     axes.fill_between(x, found - two, found + two, color=ORANGE, alpha=0.4, lw=0, label="fit ± 2 σ")

@@ -254,10 +254,9 @@ def test_each_fitted_field_has_its_significance(image):
     (fact,) = [fact for fact in result.facts if fact.key == "significance_B"]
     structures = result.structures(result.fields[0])
     assert fact.text.startswith(f"{len(structures.peaks)} structure")
-    causes = "beam; noise; assumed background, 5 %; assumed gamma, 0.05"
+    causes = "beam assumed, 5 %; noise; assumed background, 5 %; assumed gamma, 0.05"
     assert f"up to {structures.peaks[0]:.3g} σ (σ by {causes})" in fact.text
-    assert "assumed" not in result.report.ranking, "parts keep their names"
     assert dict(table_rows(result.facts, details=True))["significance B"] == fact.text
     assert dict(window_rows(result.facts, details=True))["Significance B"] == fact.text
-    field = dataclasses.replace(result.fields[0], uncertainty=None)
+    field = dataclasses.replace(result.fields[0], errors=None)
     assert "significance_B" not in texts_by_key(dataclasses.replace(result, fields=(field,)).facts)

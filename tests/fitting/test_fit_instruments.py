@@ -239,10 +239,12 @@ def test_neither_threads_nor_a_second_time_change_a_bit(shots: list[FloatArray])
         runs.append(fit(shots_of(images, strength=STRENGTHS, noise=NOISE), options=options))
     first, second = runs
     np.testing.assert_array_equal(first.fields[0].displacement, second.fields[0].displacement)
-    assert first.fields[0].uncertainty is not None
-    np.testing.assert_array_equal(first.fields[0].uncertainty, second.fields[0].uncertainty)
+    assert first.fields[0].errors.per_pixel is not None
+    np.testing.assert_array_equal(
+        first.fields[0].errors.per_pixel, second.fields[0].errors.per_pixel
+    )
     np.testing.assert_array_equal(first.reprojection, second.reprojection)
-    assert first.report.sensitivities == second.report.sensitivities
+    assert first.errors.sensitivities == second.errors.sensitivities
     assert first.explanation == second.explanation
 
 

@@ -10,9 +10,10 @@ import pytest
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Assessment, Headline, Verdict
 from napari_shadowinv.fitting.pattern import Pattern
-from napari_shadowinv.fitting.posterior import BeamError
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.verdict import Evidence, assess_verdict
+from napari_shadowinv.instrument.effects import EFFECTS
+from napari_shadowinv.inversion.error_budget import ErrorBudget, ErrorEstimate
 from napari_shadowinv.options import FitOptions, Instrument
 
 
@@ -33,7 +34,7 @@ GOOD: dict[str, Any] = {
     "total": 0.02,
     "ended": True,
     "pattern": Pattern(np.array([-1.0, 1.0])),
-    "beam": None,
+    "is_fitted": True,
     "displacement": blob((24, 24)),
     "used": np.ones((48, 48), bool),
     "hidden": 0.0,
@@ -46,11 +47,41 @@ GOOD: dict[str, Any] = {
 CUT: dict[str, Any] = {"parts": {"edge": 0.3, "noise": 0.02}, "total": 0.3}
 
 
+def budget_of(
+    total: float, parts: dict[str, float], instrument: Instrument, *, is_fitted: bool
+) -> ErrorBudget | None:
+    """The budget of these shares, a tenth as large at the peak; None for a total of NaN.
+
+    A beam that is not fitted moves the displacement by a tenth for each per cent.
+    """
+    if np.isnan(total):
+        return None
+    estimates = {key: ErrorEstimate(share, share / 10) for key, share in parts.items()}
+    noise, edge, beam = (estimates.pop(key, None) for key in ("noise", "edge", "beam"))
+    names = {each.key: each.name(each.tested) for each in EFFECTS}
+    effects = {names[key]: estimate for key, estimate in estimates.items()}
+    return ErrorBudget(
+        1.0,
+        1.0,
+        noise or ErrorEstimate(0.0, 0.0),
+        effects,
+        edge=edge and ErrorEstimate(total, total / 10),
+        sides=SIDES,
+        beam=beam,
+        beam_sensitivity=None if is_fitted else ErrorEstimate(0.1, 0.01),
+        sizes={each.name(each.tested): each.tested for each in EFFECTS},
+        beam_variation=0.05,
+        beam_basis="assumed" if instrument.beam_rms is None else "stated",
+        assumed=() if instrument.has_numbers else tuple(effects),
+        sampled=ErrorEstimate(total, total / 10),
+    )
+
+
 def assess(
     *,
     total: float,
     ended: bool,
-    beam: BeamError | None,
+    is_fitted: bool,
     parts: dict[str, float],
     chi2: FloatArray,
     rivals: list[tuple[float, float]],
@@ -67,7 +98,7 @@ def assess(
     solutions = [(0.0, 0.0), *rivals]
     mask = np.tile(used, (len(chi2), 1, 1))
     planes, of_each = np.zeros(mask.shape), np.ones(len(chi2))
-    errors = np.full(displacement.shape, 0.02)
+    errors = budget_of(total, parts, instrument, is_fitted=is_fitted)
     fit = Fit(
         images=planes,
         mask=mask,
@@ -88,11 +119,6 @@ def assess(
             1,
             ended,
             {},
-            total,
-            beam=beam,
-            parts=parts,
-            sides=SIDES,
-            beam_rms=0.05,
             numbers={key: [[0.0, 0.01]] for key in parts if instrument.has_numbers},
         ),
         options=options,
@@ -225,9 +251,8 @@ def test_one_image_does_not_tell_where_rays_meet_or_cross(
 
 
 def of_assumed_beam(noise: float, share: float) -> dict[str, Any]:
-    beam = BeamError(sensitivity=0.1, variation=0.05, share=share, scale=0.25, assumed=True)
     parts = {"beam": share, "noise": noise}
-    return {"beam": beam, "total": float(np.hypot(noise, share)), "parts": parts}
+    return {"is_fitted": False, "total": float(np.hypot(noise, share)), "parts": parts}
 
 
 @pytest.mark.parametrize(

@@ -98,12 +98,11 @@ def test_unknown_parts_stay_unknown(tmp_path: Path, make_fit: MakeFit) -> None:
     complete_fit = make_fit(
         strengths=(1.0,), assessment=Assessment(Verdict.AMBIGUOUS, "cannot tell")
     )
-    fields = tuple(dataclasses.replace(field, uncertainty=None) for field in complete_fit.fields)
-    report = dataclasses.replace(complete_fit.report, total=float("nan"))
-    fit = dataclasses.replace(complete_fit, fields=fields, report=report)
+    fields = tuple(dataclasses.replace(field, errors=None) for field in complete_fit.fields)
+    fit = dataclasses.replace(complete_fit, fields=fields)
     again = Fit.from_dataset(read_back(tmp_path / "fit.shadowinv", fit))
     assert_same(fit, again)
-    assert again.fields[0].uncertainty is None
+    assert again.fields[0].errors is None
     assert again.verdict is Verdict.AMBIGUOUS
 
 

@@ -204,7 +204,7 @@ def test_significance_and_structures_are_among_the_other_layers(
     layers = more(viewer, layers)
     for part, fitted_field in zip(("", " E"), two_fields.fields, strict=True):
         length = np.hypot(*fitted_field.displacement)
-        std = fitted_field.uncertainty
+        std = fitted_field.errors.per_pixel
         along = np.hypot(*(fitted_field.displacement * std)) / length
         np.testing.assert_allclose(layers[f"significance{part}"].data, length / along)
         structures = two_fields.structures(fitted_field)

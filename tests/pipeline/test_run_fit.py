@@ -218,8 +218,9 @@ def test_a_source_declared_as_an_estimate_is_one_after_a_repeat(
             for file, setup in zip(files, SETUPS, strict=True)
         ]
         result = run_fit(Recipe(fit=choices), shots)
-        are_fitted[measured] = result.report.beam is None  # or else its error is estimated
-        assert (result.report.parts["beam"] > 0) == (not measured)  # a uniform one is exact
+        # A beam that is not fitted has an estimated error; a uniform one is exact.
+        are_fitted[measured] = result.errors.beam_sensitivity is None
+        assert (result.errors.shares.get("beam", 0.0) > 0) == (not measured)
         assert result.provenance is not None
         assert [image.measured for image in result.provenance.images] == 2 * [measured]
     assert are_fitted == {True: False, False: True}

@@ -289,14 +289,14 @@ def test_fields_and_error_bars_of_a_fit_are_in_si(
     labels = [axes.child_axes[0].get_ylabel() for axes in axes_list[6:8] + axes_list[9:11]]
     assert labels == ["|∫B×dz| (µT·m)", "σ of |∫B×dz| (µT·m)", "|∫E dz| (kV)", "σ of |∫E dz| (kV)"]
     field = fit.fields[0]
-    assert field.uncertainty is not None
-    error = np.hypot(*proton_setup.path_integrated_b(field.uncertainty)) * 1e6
+    assert field.errors.per_pixel is not None
+    error = np.hypot(*proton_setup.path_integrated_b(field.errors.per_pixel)) * 1e6
     np.testing.assert_allclose(axes_list[7].images[0].get_array(), error)
     # The band of the cut along x, at the peak: the error along the field.
     (in_si,) = shown_fields([field.displacement], proton_setup)
     row, column = in_si.peak
     direction = field.displacement[:, row, column] / np.hypot(*field.displacement[:, row, column])
-    expected = np.hypot(*(direction * field.uncertainty[:, row, column]))
+    expected = np.hypot(*(direction * field.errors.per_pixel[:, row, column]))
     expected *= proton_setup.path_integrated_b([[0.0], [1.0]])[0, 0] * -1e6
     band = axes_list[8].collections[0].get_paths()[0].vertices
     place = column * proton_setup.object_pixel_size * 1e6
@@ -326,7 +326,7 @@ def test_a_fit_without_error_bars_or_misfit_is_no_error(make_fit: MakeFit) -> No
             field,
             potential=0 * field.potential,
             displacement=0 * field.displacement,
-            uncertainty=None,
+            errors=None,
         )
         for field in fit.fields
     )

@@ -171,7 +171,7 @@ def test_error_bars_are_stored_if_they_are_made(images: Any, out: Path) -> None:
     store = run_stack(images[:1], out, recipe, scheduler="synchronous")
     assert store["displacement_uncertainty"].attrs["units"] == "pixel"
     assert float(store["displacement_uncertainty"].min()) > 0
-    assert float(store["total_error"][0]) == run_fit(recipe, [images[0]]).report.total
+    assert float(store["total_error"][0]) == run_fit(recipe, [images[0]]).total_error
     shot = RetrievedField(store.isel(shot=0))
     fact = next(fact for fact in shot.facts if fact.key == "significance")
     assert "(σ by noise, instrument and beam)" in fact.text

@@ -20,6 +20,7 @@ from napari_shadowinv._napari.layers import (
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Level
+from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import intensity_limits
 
@@ -51,8 +52,8 @@ def fit_layers(result: Result[Fit], frame: Frame, name: str, *, alone: bool = Fa
         }
         if fit.mask.shape[1:] == field.potential.shape:
             variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
-        structures = fit.structures(field)
-        variables |= significance_variables(field.displacement, field.uncertainty, structures)
+        std = per_pixel_of(field.errors)
+        variables |= significance_variables(field.displacement, std, fit.structures(field))
         title = _field_title(name, fit, field)
         part = {"part": field.name} if m else {}
         level = fit.headline.level

@@ -15,6 +15,7 @@ from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.facts import Level
+from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
 from napari_shadowinv.physics.significance import Structures, significance
@@ -167,7 +168,7 @@ def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> La
     import xarray as xr
 
     content = result.content
-    std = None if content.errors is None else content.errors.per_pixel
+    std = per_pixel_of(content.errors)
     dataset = xr.Dataset(
         {name: (dims, content.variable(name)) for name, (dims, _, _) in VARIABLES.items()}
     ).assign(significance_variables(content.displacement, std, content.structures))

@@ -174,9 +174,10 @@ def is_noise_notable(errors: ErrorBudget, least: float = 0.2) -> bool:
 
     Without noise, they differ by the tolerance of the solver.
     """
-    assert errors.per_pixel is not None
+    if errors.per_pixel is None or errors.discretisation is None:
+        return True
     scatter = float(np.sqrt((errors.per_pixel**2).sum(axis=0).mean()))
-    return not scatter < least * errors.discretisation.rms
+    return scatter >= least * errors.discretisation.rms
 
 
 def number_of_inner_sites(inversion: Inversion) -> int:
@@ -244,7 +245,7 @@ def _of_fit(
         if field.samples is None or not len(field.samples):
             yield SampledField(*parts)
         else:
-            causes = ("noise",) if field.uncertainty is None else tuple(fit.report.causes)
+            causes = ("noise",) if field.errors is None else field.errors.causes
             yield StoredSamples(*parts, field.samples, causes)
 
 

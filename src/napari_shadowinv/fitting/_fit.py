@@ -139,7 +139,7 @@ def fit(
             evidence = log_evidence(data, minima.scene, minima.best, on_step)
             report = replace(report, log_evidence=evidence)
     report = replace(report, seconds=seconds)
-    return summarise(data, refined, basins, errors, report, pattern)
+    return summarise(data, refined, basins, openness, errors, report, pattern)
 
 
 @dataclass(frozen=True, eq=False)

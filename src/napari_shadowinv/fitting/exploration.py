@@ -21,7 +21,7 @@ from napari_shadowinv.fitting.posterior import (
     compare_samples,
     displacement_errors,
     errors_by_part,
-    largest_share,
+    shares_of,
     shifts_by_beam,
 )
 from napari_shadowinv.fitting.result import Basin
@@ -42,8 +42,8 @@ class Openness:
     """How far the images leave the best unknowns open, and how far an instrument would move them.
 
     There is a `posterior` for counts alone; `pairs` compares samples with those that are solved in
-    full; `errors`, `by_part` and `by_beam` are displacements, `sensitivities` shares of it.
-    `assumed` are the likely changes by a detector of which nothing was stated.
+    full; `errors`, `by_part` and `by_beam` are displacements, `sensitivities` shares of each
+    field's, (M,). `assumed` are the likely changes by a detector of which nothing was stated.
     """
 
     posterior: Posterior | None
@@ -53,7 +53,7 @@ class Openness:
     by_part: dict[str, FloatArray]
     by_beam: BeamShifts | None
     assumed: dict[str, Unknowns]
-    sensitivities: dict[str, float]
+    sensitivities: dict[str, FloatArray]
 
     def amplified(self, factor: float) -> Openness:
         """Return the same with larger errors by noise, as correlated noise makes them."""
@@ -133,7 +133,7 @@ def explore(
         by_part = {"noise": errors}
     by_beam = shifts_by_beam(data, scene, posterior, samples)
     responses: dict[str, tuple[Unknowns, float]] = {}
-    sensitivities: dict[str, float] = {}
+    sensitivities: dict[str, FloatArray] = {}
     if samples:
         tested = replace(scene, imperfect=_tested_instrument(data, best))
         response = posterior_with(tested, adapt(best, tested.imperfect, EXACT))
@@ -143,7 +143,7 @@ def explore(
         moves = response.scene.displacement
         of_best = moves(best.unknowns)
         sensitivities = {
-            key: largest_share(moves(change), of_best) for key, (change, _) in responses.items()
+            key: shares_of(moves(change), of_best) for key, (change, _) in responses.items()
         }
     # Counts are those of a detector that is linear and has no dark level.
     is_linear = data.counted or data.instrument.has_numbers

@@ -2,7 +2,7 @@
 
 - random changes that the data leave open, and the evidence: `Posterior`, `Sample`, `Response`
 - error bars by random changes, such as those by the noise: `displacement_errors`
-- by an unmeasured or inexact beam: `shifts_by_beam`, `BeamError`, `draw_variations`
+- by an unmeasured or inexact beam: `shifts_by_beam`, `draw_variations`
 - fields that noise, beam and instrument leave possible: `sampled_potentials`
 
 References
@@ -29,7 +29,6 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import run_in_parallel
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.descent import finer, settle
 from napari_shadowinv.fitting.forward import Linear, Scene
@@ -454,47 +453,6 @@ class Posterior:
         return size * float((eigenvectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
 
 
-@dataclass(frozen=True)
-class BeamError:
-    """Response of a fit's displacement to a beam that differs from its source.
-
-    Attributes
-    ----------
-    sensitivity : float
-        R.m.s. change of the displacement, as a share of it, if the beam differs by 1 % (r.m.s.).
-    variation : float
-        R.m.s. difference that the total error takes into account.
-    share : float
-        R.m.s. error of the displacement, as a share of it, by beams that differ that far.
-    scale : float
-        Distance over which the beam varies, in shorter sides of the image.
-    assumed : bool
-        Whether nobody measured how far the beam may differ from its source.
-    """
-
-    sensitivity: float
-    variation: float
-    share: float
-    scale: float
-    assumed: bool
-
-    @property
-    def name(self) -> str:
-        """The name of an error that includes the beam's, such as "beam assumed, 5 %"."""
-        origin = "assumed" if self.assumed else "stated"
-        return f"beam {origin}, {percent(self.variation)}" if self.variation else "noise"
-
-    @property
-    def text(self) -> str:
-        """The response in a sentence."""
-        sentence = (
-            f"a beam that differs by 1 % (r.m.s.) over {to_figures(self.scale)} of the "
-            f"image's shorter side would move the displacement by {percent(self.sensitivity)} "
-            "(r.m.s.)"
-        )
-        if self.variation:
-            sentence += f", one by {percent(self.variation)} by {percent(self.share)}"
-        return sentence
 
 
 def draw_variations(
@@ -679,7 +637,7 @@ def potentials_of(scene: Scene, change: Unknowns, size: tuple[int, int]) -> Floa
     return np.stack([plane - border_mean(plane) for plane in planes])
 
 
-def largest_share(errors: FloatArray, displacements: FloatArray) -> float:
-    """Return the largest of all fields' r.m.s. error over r.m.s. displacement."""
+def shares_of(errors: FloatArray, displacements: FloatArray) -> FloatArray:
+    """Return each field's r.m.s. error over its r.m.s. displacement, (M,)."""
     size = np.maximum((displacements**2).mean(axis=(1, 2, 3)), 1e-12)
-    return float(np.sqrt(((errors**2).mean(axis=(1, 2, 3)) / size).max()))
+    return np.asarray(np.sqrt((errors**2).mean(axis=(1, 2, 3)) / size))

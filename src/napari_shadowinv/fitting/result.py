@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -32,23 +31,20 @@ from napari_shadowinv.facts import (
     to_figures,
     verdict_fact,
 )
-from napari_shadowinv.fitting.instrument import ASSUMED, TITLES, number_text
-from napari_shadowinv.fitting.posterior import BeamError
-from napari_shadowinv.instrument.effects import EFFECTS, Effect
+from napari_shadowinv.fitting.instrument import number_text
+from napari_shadowinv.inversion.error_budget import ErrorBudget, per_pixel_of
 from napari_shadowinv.inversion.variables import FIT_VARIABLES, belongs, dataset_from_field
 from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.physics.edge import LARGER_FIELD
 from napari_shadowinv.physics.setup import Setup, deflector_titles, setup_from_dict
 from napari_shadowinv.physics.significance import (
     Structures,
-    deviation_along,
     significance_facts,
     structures_of,
 )
 from napari_shadowinv.physics.units import (
     FLUX_DENSITY,
     PIXEL,
-    Condition,
     PeakError,
     ShownField,
     label,
@@ -93,7 +89,8 @@ _OF_IMAGES = "images", "source", "reprojection", "residual", "mask", "chi2", "br
 _OF_BASINS = "objective", "chi2", "distance", "displacement"
 _LINEAR_ENOUGH, _SPREAD_ENOUGH = 0.5, 0.3
 _WORDS = "reason", "advice", "explanation"  # of the assessment
-_ATTRIBUTES = ("options", "instrument", "report", "verdict", *_WORDS, "folded", "setups")
+_BUDGET = "errors", "error_causes"
+_ATTRIBUTES = ("options", "instrument", "report", *_BUDGET, "verdict", *_WORDS, "folded", "setups")
 _REPORT = "verdict", "errors", "error_limited_by", "error_measure_next", "residual"
 
 # What makes a part of the errors smaller.
@@ -119,9 +116,8 @@ class FittedField:
         Normalised deflection potential in px²; its mean over the image's border is 0.
     displacement : ndarray, shape (2, H, W)
         Displacement in px, axis order (y, x).
-    uncertainty : ndarray, shape (2, H, W), or None
-        Standard deviation of the displacement in px by all parts of the error budget, if error
-        bars were asked for.
+    errors : ErrorBudget or None
+        Errors of the displacement, in all and in every pixel, if error bars were asked for.
     smoothness : tuple of float
         The weights λ and κ of its squared fourth and sixth derivatives (px).
     samples : ndarray of float32, shape (n, H, W), or None
@@ -132,18 +128,9 @@ class FittedField:
     name: str
     potential: FloatArray
     displacement: FloatArray
-    uncertainty: FloatArray | None
+    errors: ErrorBudget | None
     smoothness: tuple[float, float]
     samples: AnyArray | None = None
-
-    def error_at(self, row: int, column: int) -> float:
-        """Return the relative standard deviation of the displacement in a pixel; NaN if unknown."""
-        move = self.displacement[:, row, column]
-        length = np.hypot(*move)
-        if self.uncertainty is None or not length > 0:
-            return float("nan")
-        error = deviation_along(move, self.uncertainty[:, row, column])
-        return float(error / length)
 
 
 @dataclass(frozen=True)
@@ -186,65 +173,37 @@ class FitReport:
     seconds : dict of str to float
         Time of each stage; of "samples" what they take longer than "full size", beside which they
         are drawn.
-    total : float
-        R.m.s. standard deviation of the displacement by all `parts`, as a share of the
-        displacement; NaN if not known.
     log_evidence : float
         Logarithm of the evidence, up to a constant that is the same for all choices of fields; NaN
         if it was not requested.
     pattern : float
         How far the smoothed residual of an image stands out of white noise, in standard
         deviations; the largest of all images, NaN if not known. See `pattern_strength`.
-    beam : BeamError or None
-        Change of the displacement by a beam that differs from its source, if computed.
-    noise_correlation : float
-        Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise. The
-        error bars take it into account.
-    parts : dict of str to float
-        What `total` is made of, the largest first: r.m.s. standard deviations by noise, by the
-        beam, by each stated imperfection and by the edge, as shares of the displacement.
-    sides : tuple of str
-        Sides of the image from which the part by the edge comes.
-    beam_rms : float
-        Relative r.m.s. difference of beam and source in the error bars.
-    recorded : bool
-        Whether the source was recorded.
     numbers : dict of str to list
         Numbers of the instrument as fitted, by their names in `Instrument`, each with its standard
         deviation, for all images or for each; see `numbers_in_units`.
-    sensitivities : dict of str to float
-        R.m.s. change of the displacement, as a share of it, by imperfections of the instrument of
-        the tested sizes in `EFFECTS`.
     sampling : {"linear", "resolve"}
         Whether the samples of the error bars respond to first order, or were fitted.
-    nonlinearity, spread_ratio : float
+    nonlinearity, spread_ratio : float or None
         Of those that were fitted: deviation of their displacements to first order, as a share of
-        them, and their size relative to these (r.m.s.); NaN if none was.
+        them, and their size relative to these (r.m.s.); None if none was.
     """
 
     objective: float
     iterations: int
     converged: bool
     seconds: dict[str, float]
-    total: float
     log_evidence: float = float("nan")
     pattern: float = float("nan")
-    noise_correlation: float = 0.0
-    beam: BeamError | None = None
-    parts: dict[str, float] = dataclasses.field(default_factory=dict)
-    sides: tuple[str, ...] = ()
-    beam_rms: float = 0.0
-    recorded: bool = False
     numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
-    sensitivities: dict[str, float] = dataclasses.field(default_factory=dict)
     sampling: str = "linear"
-    nonlinearity: float = float("nan")
-    spread_ratio: float = float("nan")
+    nonlinearity: float | None = None
+    spread_ratio: float | None = None
 
     @property
     def sampling_text(self) -> str:
         """How far samples to first order are from those that were fitted; "" if none was."""
-        if np.isnan(self.nonlinearity):
+        if self.nonlinearity is None or self.spread_ratio is None:
             return ""
         return (
             f"to first order, samples differ from fitted ones by {percent(self.nonlinearity)} of "
@@ -254,38 +213,10 @@ class FitReport:
     @property
     def is_linear_enough(self) -> bool:
         """Whether the samples hold the response to noise and instrument."""
+        if self.sampling == "resolve" or self.nonlinearity is None or self.spread_ratio is None:
+            return True
         is_spread = abs(self.spread_ratio - 1) > _SPREAD_ENOUGH
-        return self.sampling == "resolve" or not (is_spread or self.nonlinearity > _LINEAR_ENOUGH)
-
-    @property
-    def ranking(self) -> str:
-        """The parts as shares of the displacement, the largest first."""
-        return ", ".join(f"{TITLES[key]} {percent(share)}" for key, share in self.parts.items())
-
-    @property
-    def next_step(self) -> str:
-        """A remedy for the largest part."""
-        largest = next(iter(self.parts), "noise")
-        return _REMEDIES.get(largest, _MEASURE).format(TITLES[largest])
-
-    @property
-    def error_name(self) -> str:
-        """Largest part of the total in a few words, such as "beam assumed, 5 %"."""
-        return next(iter(self.causes), "noise")
-
-    @property
-    def causes(self) -> list[str]:
-        """The parts in a few words, the largest first."""
-        titles = TITLES if self.beam is None else {**TITLES, "beam": self.beam.name}
-        assumed = {each.key: f"assumed {each.name(each.tested)}" for each, _ in self.assumed}
-        titles = {**titles, **assumed}
-        return [titles[key] for key, part in self.parts.items() if part > 0]
-
-    @property
-    def assumed(self) -> list[tuple[Effect, float]]:
-        """Imperfections of tested sizes, and their parts, where no detector was stated."""
-        keys = (self.parts.keys() & ASSUMED) - self.numbers.keys()
-        return [(each, self.parts[each.key]) for each in EFFECTS if each.key in keys]
+        return not (is_spread or self.nonlinearity > _LINEAR_ENOUGH)
 
 
 @dataclass(frozen=True, repr=False)
@@ -380,47 +311,37 @@ class Fit(Summarised):
         return np.asarray(self.mask.any(axis=0))
 
     @property
+    def errors(self) -> ErrorBudget | None:
+        """Error budget of the field with the largest share of errors; None if not computed."""
+        budgets = [field.errors for field in self.fields if field.errors is not None]
+        return max(budgets, key=lambda budget: budget.share, default=None)
+
+    @property
     def total_error(self) -> float | None:
         """Total error as a share of the displacement (r.m.s.); None if not computed."""
-        total = self.report.total
-        return None if np.isnan(total) else total
+        return None if self.errors is None else self.errors.share
 
     @property
     def limited_by(self) -> str | None:
         """Largest part of the error with its share, such as "beam 3 %"; None if not computed."""
-        if self.total_error is None:
-            return None
-        key, share = next(iter(self.report.parts.items()))
-        return f"{TITLES[key]} {percent(share)}"
+        return None if self.errors is None else self.errors.limited_by
+
+    @property
+    def next_step(self) -> str:
+        """A remedy for the largest part of the errors."""
+        largest = "noise" if self.errors is None else self.errors.limiting
+        return _REMEDIES.get(largest, _MEASURE).format(largest)
 
     def _error_facts(self) -> Iterator[Fact]:
-        """The errors of the displacement, and its sensitivity to numbers that are not stated."""
-        report = self.report
-        if np.isnan(report.total):
+        """The errors of the displacement, and the numbers of the instrument as fitted."""
+        if self.errors is None:
             return
-        text = f"{percent(report.total)} of the displacement (r.m.s.)"
-        if report.noise_correlation > 0:
-            text += f"; noise is correlated over {report.noise_correlation:.1f} px"
-        yield error_fact("errors", text)
-        yield error_fact("limited by", report.ranking)
         is_condition = self.verdict.level is Level.CONDITIONAL
-        yield error_fact("measure next", self.explanation if is_condition else report.next_step)
-        if report.numbers:
-            numbers = "; ".join(number_text(*each) for each in report.numbers.items())
-            yield error_fact("instrument", numbers)
-        if report.beam is not None:
-            unmeasured = report.beam.assumed and not report.recorded
-            origin = "the beam was assumed to be the source or uniform: " if unmeasured else ""
-            yield error_fact("beam", f"{origin}{report.beam.text}")
-        names = {each.key: each.name(each.tested) for each in EFFECTS}
-        effects = ", ".join(
-            f"{percent(share)} ({names[key]})"
-            for key, share in report.sensitivities.items()
-            if key not in report.parts
-        )
-        if effects:
-            text = f"the displacement would move by (r.m.s.): {effects}"
-            yield error_fact("sensitivity", text)
+        rows = dict(self.errors.rows())
+        rows["measure next"] = self.explanation if is_condition else self.next_step
+        if numbers := self.report.numbers:
+            rows["instrument"] = "; ".join(number_text(*each) for each in numbers.items())
+        yield from (error_fact(name, text) for name, text in rows.items())
 
     @property
     def warnings(self) -> tuple[Caution, ...]:
@@ -455,8 +376,8 @@ class Fit(Summarised):
     def headline(self) -> Headline:
         """The peaks of the fields, the verdict and the warnings in one line."""
         peaks = [
-            peak.short_peak_text(error)
-            for peak, error in (self._shown_peak(field, self.setup) for field in self.fields)
+            self.shown(field).short_peak_text(self.peak_error(field, self.setup))
+            for field in self.fields
         ]
         converged = self.report.converged
         return Headline.of(peaks, self.assessment, self.warnings, converged=converged)
@@ -498,81 +419,37 @@ class Fit(Summarised):
 
     def structures(self, field: FittedField) -> Structures | None:
         """Return the regions where a field stands above its error; None if that is not known."""
-        return structures_of(field.displacement, field.uncertainty, self.used)
+        std = per_pixel_of(field.errors)
+        return structures_of(field.displacement, std, self.used)
 
     def _significance_facts(self) -> Iterator[Fact]:
         for field in self.fields:
-            key, causes = f"significance_{field.name}", self.report.causes
+            key, causes = f"significance_{field.name}", field.errors.causes if field.errors else ()
             structures = self.structures(field)
             yield from significance_facts(structures, causes, key=key, name=field.name)
 
-    def peak_error(self, field: FittedField, shown: ShownField) -> PeakError | None:
-        """Return the total error of the largest magnitude of a field; None if not known."""
-        share = field.error_at(*shown.peak)
-        if np.isnan(share):
-            return None
-        by_energy, setup = 0.0, self.setup
-        if shown.unit != "px" and setup is not None and self.instrument.energy:
-            main = setup.other_fields.get(deflector_titles()[field.name], setup.main_field)
-            by_energy = self.instrument.energy * abs(setup.sensitivity_to_beam(main.name))
-        cause = f"energy, {percent(self.instrument.energy)}"
-        cause = cause if by_energy > share else self.report.error_name
-        return PeakError(float(np.hypot(share, by_energy)), cause)
-
-    def condition(self, share: float, *, beam_unknown: bool) -> Condition | None:
-        """Return the condition on assumptions; None if these do not suffice.
-
-        Parameters
-        ----------
-        share : float
-            Largest total of the displacement (r.m.s.).
-        beam_unknown : bool
-            Whether the beam is fitted without a source.
-        """
-        report, beam, field = self.report, self.report.beam, self.fields[0]
-        if not report.total > 0:
-            return None
-        of_beam = []
-        if beam is not None and beam.assumed:
-            effect = 100 * beam.sensitivity * beam.variation  # the images exclude part of it
-            of_beam = [("%", 100 * beam.variation, effect, beam.share)]
-        elif "beam" in report.parts and self.instrument.beam_rms is None and not beam_unknown:
-            of_beam = [("%", 100 * report.beam_rms, *2 * (report.parts["beam"],))]
-        of_detector = [
-            (f"{each.unit} of {each.key}".strip(), each.factor * each.tested, *2 * (part,))
-            for each, part in report.assumed
-        ]
-        subjects = {
-            "reference" if report.recorded else "beam": of_beam,
-            "detector": of_detector,
-            "beam and detector": of_beam + of_detector,
-        }
-        (shown,) = shown_fields([field.displacement], None, mask=self.used)
-        at_peak = field.error_at(*shown.peak)
-        scale = at_peak / report.total
-        for subject, assumed in subjects.items():
-            rest = math.sqrt(max(report.total**2 - sum(share**2 for *_, share in assumed), 0.0))
-            effects = [(unit, size, effect, scale * effect) for unit, size, effect, _ in assumed]
-            condition = Condition.within(share, (rest, scale * rest), effects, subject=subject)
-            if condition:
-                return condition._replace(peak_if_off=at_peak, field_if_off=report.total)
-        return None
+    def peak_error(self, field: FittedField, setup: Setup | None) -> PeakError | None:
+        """Return the error of the largest magnitude of a field in a setup's units, if known."""
+        main = ""
+        if setup is not None:
+            main = setup.other_fields.get(deflector_titles()[field.name], setup.main_field).name
+        errors = field.errors and field.errors.in_field(setup, main, self.instrument.energy)
+        return None if errors is None else errors.of_peak
 
     @property
     def _origins(self) -> tuple[ImageOrigin, ...]:
         return () if self.provenance is None else self.provenance.images
 
-    def _shown_peak(
-        self, field: FittedField, frame: Setup | None
-    ) -> tuple[ShownField, PeakError | None]:
+    def shown(self, field: FittedField) -> ShownField:
+        """Return a field in the unit that it is shown in."""
         deflector = deflector_titles()[field.name]
-        (shown,) = shown_fields([field.displacement], frame, deflector, mask=self.used)
-        return shown, self.peak_error(field, shown)
+        (shown,) = shown_fields([field.displacement], self.setup, deflector, mask=self.used)
+        return shown
 
     def _field_facts(self, field: FittedField) -> Iterator[Fact]:
         setup, deflector = self.setup, deflector_titles()[field.name]
-        (_, error), (_, field_error) = (self._shown_peak(field, frame) for frame in (None, setup))
-        errors = {"error": error, "field_error": field_error}
+        in_pixels, in_setup = (self.peak_error(field, each) for each in (None, setup))
+        errors = {"error": in_pixels, "field_error": in_setup}
         peaks = peak_facts(field.displacement, setup, deflector, mask=self.used, **errors)
         for key, peak in zip(("field", "displacement"), peaks, strict=False):
             yield Fact(f"{key}_{field.name}", f"{key.capitalize()} {field.name}", peak.text)
@@ -594,7 +471,9 @@ class Fit(Summarised):
             name, as in ``displacement_B``, unless there is only one field. Options, report,
             verdict and setups are in the attributes; `from_dataset` finds all of the fit in it.
         """
-        names = [field.name for field in self.fields]
+        names, budgets = (
+            [getattr(each, key) for each in self.fields] for key in ("name", "errors")
+        )
         history = {
             "format": self.kind.value,
             "options": self.options.model_dump_json(),
@@ -604,6 +483,8 @@ class Fit(Summarised):
             **{name: getattr(self.assessment, name) for name in _WORDS},
             "folded": self.folded,
             "fields": json.dumps(names),
+            "errors": json.dumps([each and each.to_dict() for each in budgets]),
+            "error_causes": json.dumps([each and each.causes for each in budgets]),
             "setups": json.dumps([each.model_dump(mode="json") for each in self.setups]),
         }
         merged = merge_fields(names, [field_dataset(field, self.setup) for field in self.fields])
@@ -646,13 +527,11 @@ class Fit(Summarised):
         attributes = dataset.attrs
         entries = {field.name for field in dataclasses.fields(FitReport)}
         content = json.loads(attributes["report"])
-        if content["beam"] is not None:
-            content["beam"] = BeamError(**content["beam"])
-        content["sides"] = tuple(content["sides"])
         names = [str(name) for name in dataset["field"].values]
+        budgets = zip(*(json.loads(attributes[key]) for key in _BUDGET), strict=True)
         fields = [
-            _field(dataset, name, f"_{name}" if len(names) > 1 else "", smoothness)
-            for name, smoothness in zip(names, arrays["smoothness"], strict=True)
+            _field(dataset, name, f"_{name}" if len(names) > 1 else "", smoothness, budget)
+            for name, smoothness, budget in zip(names, arrays["smoothness"], budgets, strict=True)
         ]
         rows = zip(*(arrays[f"basin_{name}"] for name in _OF_BASINS), strict=True)
         basins = [
@@ -735,7 +614,7 @@ def field_dataset(field: FittedField, setup: Setup | None) -> xarray.Dataset:
     """Return a field with its errors and samples, in the units of its setup as well."""
     part = dataset_from_field(field.displacement, field.potential, setup)
     part = part.drop_vars([name for name in part.data_vars if not belongs(name, field.name)])
-    optional = field.uncertainty, field.samples
+    optional = per_pixel_of(field.errors), field.samples
     for (name, (dims, *words)), values in zip(FIT_VARIABLES.items(), optional, strict=True):
         if values is not None:
             part[name] = dims, values, label(*words)
@@ -763,8 +642,14 @@ def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray:
     return noise
 
 
-def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArray) -> FittedField:
-    potential, displacement, uncertainty, samples = (
+def _field(
+    dataset: xarray.Dataset,
+    name: str,
+    ending: str,
+    smoothness: FloatArray,
+    budget: tuple[Any, Any],
+) -> FittedField:
+    potential, displacement, std, samples = (
         numbers_of(dataset, variable + ending) if variable + ending in dataset else None
         for variable in ("potential", "displacement", *FIT_VARIABLES)
     )
@@ -780,4 +665,5 @@ def _field(dataset: xarray.Dataset, name: str, ending: str, smoothness: FloatArr
     if samples is not None and samples.shape[1:] != potential.shape:
         raise ValueError(f"samples have shape {samples.shape}, potential {potential.shape}")
     weights = float(smoothness[0]), float(smoothness[1])
-    return FittedField(name, potential, displacement, uncertainty, weights, samples)
+    errors = ErrorBudget.from_dict(*budget, std) if budget[0] else None
+    return FittedField(name, potential, displacement, errors, weights, samples)

@@ -1,7 +1,7 @@
 """The answer of a fit.
 
 - in recorded pixels, with its verdict: `summarise`
-- its errors: `field_errors`; its report: `report_of`
+- its errors: `field_errors`, `error_budget`; its report: `report_of`
 """
 
 from __future__ import annotations
@@ -10,27 +10,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting.conjugate_gradients import product
 from napari_shadowinv.fitting.exploration import Openness
 from napari_shadowinv.fitting.forward import Scene
-from napari_shadowinv.fitting.instrument import Imperfect, numbers_in_units
+from napari_shadowinv.fitting.instrument import TITLES, Imperfect, numbers_in_units
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.posterior import (
-    BeamError,
-    BeamShifts,
     displacement_errors,
-    largest_share,
     potentials_of,
     sampled_potentials,
 )
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
 from napari_shadowinv.fitting.search import FineMinimum
 from napari_shadowinv.fitting.verdict import Evidence, assess_verdict, hidden_contrast
+from napari_shadowinv.instrument.effects import EFFECTS
+from napari_shadowinv.inversion.error_budget import ErrorBudget, ErrorEstimate, root_of
 from napari_shadowinv.physics.edge import edge_changes, edge_sides
 from napari_shadowinv.physics.forward import jacobian_determinant
+from napari_shadowinv.physics.significance import deviation_along
 
 
 @dataclass(frozen=True)
@@ -91,6 +91,7 @@ def summarise(
     data: FitData,
     refined: FineMinimum,
     basins: tuple[Basin, ...],
+    openness: Openness,
     errors: FieldErrors,
     report: FitReport,
     pattern: Pattern,
@@ -109,6 +110,7 @@ def summarise(
     potentials = potentials_of(scene, unknowns, data.size)
     errors = with_edge(errors, potentials, displacements, data.options.seed)
     jacobian = _most_folded(scene, displacements)
+    in_any = np.asarray(used.any(axis=0))
     unassessed = Fit(
         images=images,
         mask=used,
@@ -118,7 +120,9 @@ def summarise(
                 name,
                 potentials[m],
                 displacements[m],
-                None if errors.in_all is None else errors.in_all[m],
+                error_budget(
+                    data, errors, openness, m, displacements[m], in_any, pattern.correlation
+                ),
                 (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1])),
                 None if errors.samples is None else errors.samples[m],
             )
@@ -133,7 +137,7 @@ def summarise(
         basins=basins,
         folded=float((jacobian < 0).mean()),
         assessment=Assessment(Verdict.UNCERTAIN, ""),
-        report=_with_shares(report, errors, displacements),
+        report=report,
         options=data.options,
         instrument=data.instrument,
         setups=data.setups or (),
@@ -161,40 +165,96 @@ def report_of(
 ) -> FitReport:
     """Return the report of a fit, without its errors."""
     unknowns, pairs = refined.unknowns, openness.pairs
-    displacements = refined.scene.displacement(unknowns)[..., : data.size[0], : data.size[1]]
-    by_beam = openness.by_beam
     return FitReport(
         objective=refined.objective,
         iterations=refined.iterations,
         converged=refined.converged,
         seconds={},
-        total=float("nan"),
         pattern=pattern.largest,
-        noise_correlation=pattern.correlation,
         numbers=numbers_in_units(
             instrument,
             instrument.adapt(unknowns, refined.scene.imperfect),
             [sample.change for sample in openness.samples],
         ),
-        sensitivities=openness.sensitivities,
         sampling=data.options.sampling,
-        nonlinearity=float("nan") if pairs is None else pairs.nonlinearity,
-        spread_ratio=float("nan") if pairs is None else pairs.spread_ratio,
-        beam=None if by_beam is None else _beam_error(data, by_beam, displacements),
-        beam_rms=data.beam.rms,
-        recorded=not data.assumed,
+        nonlinearity=None if pairs is None else pairs.nonlinearity,
+        spread_ratio=None if pairs is None else pairs.spread_ratio,
     )
 
 
-def _with_shares(report: FitReport, errors: FieldErrors, displacements: FloatArray) -> FitReport:
-    shares = {key: largest_share(each, displacements) for key, each in errors.by_part.items()}
-    in_all = errors.in_all
-    return replace(
-        report,
-        total=float("nan") if in_all is None else largest_share(in_all, displacements),
-        parts=dict(sorted(shares.items(), key=lambda part: -part[1])),
+def error_budget(
+    data: FitData,
+    errors: FieldErrors,
+    openness: Openness,
+    number: int,
+    displacement: FloatArray,
+    used: BoolArray,
+    correlation: float,
+) -> ErrorBudget | None:
+    """Return the error budget of a field by its number and displacement, (2, H, W), if it has one.
+
+    Noise is correlated as by a blur of `correlation` px.
+    """
+    if errors.in_all is None:
+        return None
+    length = np.where(used, np.hypot(*displacement), 0.0)
+    row, column = np.unravel_index(length.argmax(), length.shape)
+
+    def estimate(std: FloatArray) -> ErrorEstimate:
+        at_peak = deviation_along(displacement[:, row, column], std[:, row, column])
+        return ErrorEstimate(_length(std), float(at_peak))
+
+    parts = {key: estimate(each[number]) for key, each in errors.by_part.items()}
+    noise, edge, by_beam = (parts.pop(key, None) for key in ("noise", "edge", "beam"))
+    assert noise is not None
+    if edge is not None:  # it is what exceeds the others
+        others = [part for part in (noise, by_beam, *parts.values()) if part is not None]
+        edge = root_of(*(np.array([edge, *others]) ** 2).sum(axis=0))
+    # Shares of no displacement are large, not infinite.
+    whole = ErrorEstimate(max(_length(displacement), 1e-6), max(float(length.max()), 1e-6))
+    assumed = [each for each in EFFECTS if each.key in openness.assumed]
+    sizes = {each.name(each.tested): each.tested for each in assumed}
+    names = TITLES | {each.key: each.name(each.tested) for each in assumed}
+    budget = ErrorBudget(
+        peak=whole.at_peak,
+        rms=whole.rms,
+        noise=noise,
+        effects={names[key]: part for key, part in parts.items()},
+        edge=edge,
         sides=errors.sides,
+        beam=by_beam if data.beam.rms else None,
+        beam_sensitivity=None
+        if openness.by_beam is None
+        else estimate(openness.by_beam.by_percent[number]),
+        sensitivities={
+            each.name(each.tested): whole.times(float(openness.sensitivities[each.key][number]))
+            for each in EFFECTS
+            if each.key in openness.sensitivities.keys() - errors.by_part.keys()
+        },
+        sizes=sizes,
+        beam_variation=data.beam.rms,
+        beam_scale=data.beam.length,
+        beam_basis=_beam_basis(data),
+        noise_correlation=correlation,
+        assumed=tuple(sizes),
+        sampled=estimate(errors.in_all[number]),
+        per_pixel=errors.in_all[number],
     )
+    return replace(budget, causes=budget.causes_of_parts)
+
+
+def _length(vectors: FloatArray) -> float:
+    """Return the length of vectors, (2, H, W), r.m.s. over the image."""
+    return float(np.sqrt((vectors**2).sum(axis=0).mean()))
+
+
+def _beam_basis(data: FitData) -> str:
+    """Return where the difference of beam and source comes from; see `ErrorBudget`."""
+    if data.unknown:
+        return "unknown"
+    if data.instrument.beam_rms is not None:
+        return "stated"
+    return "assumed" if data.assumed else "reference"
 
 
 def _most_folded(scene: Scene, displacements: FloatArray) -> FloatArray:
@@ -226,13 +286,3 @@ def _beyond_edge(samples: FloatArray, changes: FloatArray, seed: int) -> FloatAr
     draws = rng.normal(size=(samples.shape[1], changes.shape[1]))
     beyond = np.einsum("sk,mkyx->msyx", draws, changes).astype(np.float32)
     return np.asarray(samples + beyond)
-
-
-def _beam_error(data: FitData, by_beam: BeamShifts, displacements: FloatArray) -> BeamError:
-    return BeamError(
-        sensitivity=largest_share(by_beam.by_percent, displacements),
-        variation=data.beam.rms,
-        share=largest_share(by_beam.errors, displacements),
-        scale=data.beam.length,
-        assumed=data.assumed or (data.beam.rms > 0 and data.instrument.beam_rms is None),
-    )

@@ -14,15 +14,13 @@ import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.facts import Assessment, Verdict, limit_text, percent, to_figures
-from napari_shadowinv.fitting.instrument import TITLES
+from napari_shadowinv.facts import Assessment, Verdict, percent, to_figures
 from napari_shadowinv.fitting.noise_match import NoiseMatch
 from napari_shadowinv.fitting.pattern import Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
 from napari_shadowinv.physics.edge import LARGER_FIELD, beyond_sides, edge_doubt
-from napari_shadowinv.physics.setup import deflector_titles
-from napari_shadowinv.physics.units import Condition, shown_fields
+from napari_shadowinv.physics.units import Condition
 
 
 def hidden_contrast(
@@ -151,10 +149,12 @@ class Evidence:
     @property
     def at_edge(self) -> str:
         """Why an object beyond the edge may matter; "" if it does not."""
-        report = self.fit.report
-        by_edge = report.parts.get("edge", 0.0)
-        others = float(np.sqrt(max(report.total**2 - by_edge**2, 0.0)))
-        return edge_doubt(by_edge, others, self.fit.options.max_error, report.sides)
+        errors = self.fit.errors
+        if errors is None:
+            return ""
+        by_edge = errors.shares.get("edge", 0.0)
+        others = float(np.sqrt(max(errors.share**2 - by_edge**2, 0.0)))
+        return edge_doubt(by_edge, others, self.fit.options.max_error, errors.sides)
 
     @property
     def is_small(self) -> bool:
@@ -164,28 +164,30 @@ class Evidence:
     @property
     def safety(self) -> float:
         """How many times as large as stated the errors can be."""
-        fit, parts, limit = self.fit, self.fit.report.parts, self.limits.safety
-        if self.beam_unknown or (fit.instrument.beam_between and not self.single):
+        fit, errors, limit = self.fit, self.fit.errors, self.limits.safety
+        if errors is None or self.beam_unknown or (fit.instrument.beam_between and not self.single):
             return limit
         # That of one image, or of a recorded source, is a linear response.
-        numbers = {key for key, share in parts.items() if share} - {"noise", "edge"}
-        numbers -= {each.key for each, _ in fit.report.assumed}
-        is_fitted = fit.instrument.has_numbers or fit.report.beam is None
+        parts = errors.shares
+        numbers = {title for title, share in parts.items() if share} - {"noise", "edge"}
+        numbers -= {name.partition(",")[0] for name in errors.assumed}
+        is_fitted = fit.instrument.has_numbers or errors.beam_sensitivity is None
         if not (numbers and is_fitted and (self.is_small or _UNDERESTIMATED & numbers)):
             return 1.0
-        fitted = sum(parts[key] ** 2 for key in numbers) / fit.report.total**2
+        fitted = sum(parts[title] ** 2 for title in numbers) / errors.share**2
         return float(np.sqrt(1 + (limit**2 - 1) * min(fitted, 1.0)))
 
     @property
     def condition(self) -> Condition | None:
         """Condition on which the errors are small, if there is one."""
-        max_error = self.fit.options.max_error / self.safety
-        return self.fit.condition(max_error, beam_unknown=self.beam_unknown)
+        errors, max_error = self.fit.errors, self.fit.options.max_error / self.safety
+        return None if errors is None else errors.condition(max_error)
 
     @property
     def is_too_uncertain(self) -> bool:
         """Whether the errors may be larger than allowed."""
-        return self.safety * self.fit.report.total > self.fit.options.max_error
+        total = self.fit.total_error
+        return total is not None and self.safety * total > self.fit.options.max_error
 
 
 Answer = Assessment | None
@@ -296,7 +298,7 @@ def _beyond_edge(case: Evidence) -> Answer:
 
 def _other_answers(case: Evidence) -> Answer:
     (best, *alternatives), limits = case.fit.basins, case.limits
-    least = max(limits.other_field, limits.within_totals * case.fit.report.total)
+    least = max(limits.other_field, limits.within_totals * (case.fit.total_error or 0.0))
     rivals = [
         basin.distance
         for basin in alternatives
@@ -315,12 +317,12 @@ def _other_answers(case: Evidence) -> Answer:
 def _errors_large(case: Evidence) -> Answer:
     if case.condition or not case.is_too_uncertain:
         return None
-    report, explanation = case.fit.report, ""
-    if report.total <= case.fit.options.max_error:
+    explanation = ""
+    if (case.fit.total_error or 0.0) <= case.fit.options.max_error:
         small = f"with fewer than {SMALL_PX} px along a side"
         where = small if case.is_small else "where these are fitted"
         explanation = f"{where}, errors can be {case.safety:.2g} times as large"
-    return Assessment(Verdict.UNCERTAIN, _limited(case), report.next_step, explanation)
+    return Assessment(Verdict.UNCERTAIN, _limited(case), case.fit.next_step, explanation)
 
 
 def _search_unfinished(case: Evidence) -> Answer:
@@ -347,10 +349,7 @@ def _conditional(case: Evidence) -> Answer:
     condition, fit = case.condition, case.fit
     if not condition or not case.is_too_uncertain:
         return None
-    field = fit.fields[0]
-    deflector = deflector_titles()[field.name]
-    (shown,) = shown_fields([field.displacement], fit.setup, deflector, mask=fit.used)
-    return shown.conditional(condition)
+    return fit.shown(fit.fields[0]).conditional(condition)
 
 
 _RULES = (
@@ -376,14 +375,11 @@ def _doubt(verdict: Verdict, reason: str, detail: str, advice: str) -> Assessmen
 
 def _limited(case: Evidence) -> str:
     """The largest part of the errors, with their total; "" if there are none."""
-    report = case.fit.report
-    if not (report.parts and np.isfinite(report.total)):
-        return ""
-    return limit_text(TITLES[next(iter(report.parts))], percent(report.total))
+    return "" if case.fit.errors is None else case.fit.errors.limit
 
 
 def _cut_by_edge(case: Evidence, explanation: str) -> Assessment:
-    reason = f"the object goes on {beyond_sides(case.fit.report.sides)}"
+    reason = f"the object goes on {beyond_sides(case.fit.errors.sides if case.fit.errors else ())}"
     return Assessment(Verdict.EDGE, reason, LARGER_FIELD, explanation)
 
 
@@ -395,7 +391,7 @@ def _short_cause(case: Evidence) -> str:
 
 def _determined(case: Evidence) -> Assessment:
     fit, pattern, noise, chi2 = case.fit, case.pattern, case.noise, case.fit.chi2
-    unchecked = "" if np.isfinite(fit.report.total) else "; error bars were not worked out"
+    unchecked = "" if fit.errors else "; error bars were not worked out"
     if pattern.correlation > 0:
         unchecked += (
             f"; the noise is correlated over {pattern.correlation:.1f} px, which makes the error "

@@ -138,7 +138,6 @@ class Budget:
         self._moves: dict[LevelSolution, FloatArray] = {}
         self._responses: dict[LevelSolution, Callable[[], LinearResponse]] = {}
         self._by_noise: dict[LinearResponse, tuple[FloatArray, FloatArray]] = {}
-        self._look_ahead: Callable[[], None] = lambda: None
         self.reason = ""
 
     @cached_property
@@ -199,9 +198,8 @@ class Budget:
         peak = np.array([row, column], dtype=np.float64)
         along = displacement[:, row, column] / max(length[row, column], 1e-300)
         response = self._response(solved)
-        self._look_ahead()
         estimate = _Estimator.of(response, lit, peak, along)
-        discretisation = ErrorEstimate(math.nan, math.nan)
+        discretisation = None
         if len(solved) > 1:
             squares, _ = self._change(solved)
             spacing = max(solved[-2].level.spacing, _stride(mask.shape))
@@ -251,8 +249,10 @@ class Budget:
 
     def _by_effects(
         self, response: LinearResponse, displacement: FloatArray, estimate: _Estimator
-    ) -> tuple[dict[str, ErrorEstimate], dict[str, ErrorEstimate], dict[str, float], str]:
-        """Return stated effects, sensitivities, sizes, and the name of an assumed effect.
+    ) -> tuple[
+        dict[str, ErrorEstimate], dict[str, ErrorEstimate], dict[str, float], tuple[str, ...]
+    ]:
+        """Return stated effects, sensitivities, sizes, and the names of assumed effects.
 
         Effects, sensitivities and sizes are by the names of the effects.
         """
@@ -271,7 +271,7 @@ class Budget:
         effects: dict[str, ErrorEstimate] = {}
         sensitivities: dict[str, ErrorEstimate] = {}
         sizes: dict[str, float] = {}
-        assumed = ""
+        assumed: tuple[str, ...] = ()
         tests: list[tuple[dict[str, ErrorEstimate], str, FloatArray]] = []
         for each in EFFECTS:
             stated = each.stated(self.instrument)
@@ -281,7 +281,7 @@ class Budget:
             if stated:
                 sizes[each.name(stated)] = stated
                 if each.key == "registration" and self._is_shift_assumed:
-                    assumed = each.name(stated)
+                    assumed = (each.name(stated),)
         # All at once, because the solver needs as long for one as for several.
         moves = response.to(np.concatenate([pattern for *_, pattern in tests]))
         ends = np.cumsum([len(pattern) for *_, pattern in tests])
@@ -357,9 +357,7 @@ class Budget:
         """
         if solution not in self._responses:
             work = partial(LinearResponse, solution, self.target, self._plan)
-            response = self._responses[solution] = begin(work, threads)
-            ahead = partial(_look_ahead, response, solution.level, *self._beam_waves)
-            self._look_ahead = begin(ahead, threads)
+            self._responses[solution] = begin(work, threads)
         return self._responses[solution]
 
     def _coarser(self, solution: LevelSolution) -> LevelSolution:
@@ -425,15 +423,6 @@ def _nearest_sites(level: SiteLevel) -> tuple[IntArray, int]:
     height, width = (int(side / level.spacing) + 1 for side in level.shape)
     middles = (np.indices((height, width)).reshape(2, -1).T + 0.5) * level.spacing - 0.5
     return np.asarray(KDTree(level.sites).query(middles)[1]), width
-
-
-def _look_ahead(
-    response: Callable[[], LinearResponse], level: SiteLevel, length: float, seed: int
-) -> None:
-    """Compute what errors need of a level, once its response, which is needed sooner, is ready."""
-    response()
-    _unit_beams(level, length, seed)
-    _nearest_sites(level)
 
 
 def _solver_gap(

@@ -1,13 +1,15 @@
-"""The errors of an inversion by their causes: `ErrorBudget`, of `ErrorEstimate`s."""
+"""The errors of a field by their causes: `ErrorBudget`, of `ErrorEstimate`s."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, TypeAdapter
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
@@ -15,6 +17,7 @@ from napari_shadowinv.facts import limit_text, percent, round_down, to_figures
 from napari_shadowinv.instrument.effects import EFFECTS
 from napari_shadowinv.inversion.error_bars import ErrorSamples
 from napari_shadowinv.physics.edge import edge_doubt
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import Condition, PeakError
 
 SHARE_OF_NOISE = 0.2
@@ -31,6 +34,7 @@ _BEAM_BASES = {  # name of the part, and its basis in a text
     "references": ("beam by its references, {}", "by its references"),
     "filtered": ("filters, {} taken from the object", "taken from the object"),
     "outside": ("beam measured outside the object, {}", "measured outside the object"),
+    "unknown": ("beam, unknown", "unknown"),
 }
 
 _UNMEASURED = "assumed", "reference"  # bases that are conditions of a result
@@ -57,30 +61,30 @@ class ErrorEstimate(NamedTuple):
 
 @dataclass(frozen=True)
 class ErrorBudget:
-    """Error budget of an inversion: standard errors of the displacement, in px.
+    """Error budget of an inversion, or of a fitted field: standard errors of its displacement, px.
 
-    It does not include the effects of a blurred image or of crossing rays.
+    An inversion's does not include the effects of a blurred image or of crossing rays.
 
     Attributes
     ----------
     peak, rms : float
         Largest displacement inside the mask and its root mean square, px, for comparison.
-    discretisation : ErrorEstimate
-        Change by more sites; NaN if there was no coarser level to compare with.
     noise : ErrorEstimate
         Scatter by the noise of image and source.
     effects : dict of str to ErrorEstimate
         Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`, and of the
         instrument's effects.
-    edge : ErrorEstimate
+    discretisation : ErrorEstimate or None
+        Change of an inversion by more sites; None if there was no coarser level to compare with.
+    edge : ErrorEstimate or None
         Effect of an object beyond the image's edge, with the share of the other errors there.
     sides : tuple of str
         Sides of the image near which the edge matters most: 'top', 'bottom', 'left', 'right'.
     beam : ErrorEstimate or None
         Effect of a beam that differs from the source by `beam_variation`; None if the source is
         exact: stated so, or uniform and given, and no difference was seen.
-    beam_sensitivity : ErrorEstimate
-        Effect of a beam that differs from the source by 1 %.
+    beam_sensitivity : ErrorEstimate or None
+        Effect of a beam that differs from the source by 1 %; None if the beam was fitted.
     sensitivities : dict of str to ErrorEstimate
         Effects of the instrument of tested sizes, by their names with a size, such as
         "background, 5 %".
@@ -95,17 +99,21 @@ class ErrorBudget:
         recorded source, which is of another exposure, 'stated' by the user, 'seen' as a
         difference of image and source outside the object, 'references' for a prior from them,
         'outside' for a source estimated from the image outside the object, with its variance,
-        'filtered' for the share of an object that filters take, in an exact beam.
+        'filtered' for the share of an object that filters take, in an exact beam, 'unknown' for a
+        fit without a source.
     noise_correlation : float
         Standard deviation of the Gaussian blur with the measured correlation of the noise, px; 0
         for white noise.
     noise_is_bound : bool
         Whether structure hides the noise: its error is then the largest that the image allows.
-    assumed : str
-        Name of the effect, such as "registration, 0.2 px", whose size nobody stated or measured.
+    assumed : tuple of str
+        Names of effects, such as "registration, 0.2 px", whose sizes nobody stated or measured.
+    sampled : ErrorEstimate or None
+        Total error by samples of a fit, of which the parts are estimates; None if it is the sum of
+        the parts in squares.
     per_pixel : ndarray, shape (2, H, W), or None
-        Standard deviation of the displacement in every pixel, if `Inversion.uncertainty` computed
-        it.
+        Standard deviation of the displacement in every pixel, of a fit or if
+        `Inversion.uncertainty` computed it.
     causes : tuple of str
         Errors in `per_pixel`, such as "noise" and "beam, 5 %".
     samples : ErrorSamples or None
@@ -116,21 +124,22 @@ class ErrorBudget:
 
     peak: float
     rms: float
-    discretisation: ErrorEstimate
     noise: ErrorEstimate
     effects: dict[str, ErrorEstimate]
-    edge: ErrorEstimate
-    sides: tuple[str, ...]
-    beam: ErrorEstimate | None
-    beam_sensitivity: ErrorEstimate
-    sensitivities: dict[str, ErrorEstimate]
-    sizes: dict[str, float]
-    beam_variation: float
-    beam_scale: float
-    beam_basis: str
-    noise_correlation: float
+    discretisation: ErrorEstimate | None = None
+    edge: ErrorEstimate | None = None
+    sides: tuple[str, ...] = ()
+    beam: ErrorEstimate | None = None
+    beam_sensitivity: ErrorEstimate | None = None
+    sensitivities: dict[str, ErrorEstimate] = field(default_factory=dict)
+    sizes: dict[str, float] = field(default_factory=dict)
+    beam_variation: float = 0.0
+    beam_scale: float = 0.25
+    beam_basis: str = "stated"
+    noise_correlation: float = 0.0
     noise_is_bound: bool = False
-    assumed: str = ""
+    assumed: tuple[str, ...] = ()
+    sampled: ErrorEstimate | None = None
     per_pixel: FloatArray | None = None
     causes: tuple[str, ...] = ()
     samples: ErrorSamples | None = None
@@ -142,9 +151,19 @@ class ErrorBudget:
             del content[name]
         return content
 
+    @staticmethod
+    def from_dict(
+        content: Mapping[str, Any], causes: Iterable[str], per_pixel: FloatArray | None
+    ) -> ErrorBudget:
+        """Return the budget of what `to_dict` returned, with what belongs to pixels."""
+        budget = _schema().validate_python(content)
+        return replace(budget, per_pixel=per_pixel, causes=tuple(map(str, causes)))
+
     @property
     def total(self) -> ErrorEstimate:
-        """Sum of all contributions in squares."""
+        """Error by all contributions."""
+        if self.sampled is not None:
+            return self.sampled
         parts = np.array(list(self.parts.values()))
         return root_of(*(parts**2).sum(axis=0))
 
@@ -167,15 +186,35 @@ class ErrorBudget:
         if self.noise_correlation:
             limit = "at most, hidden by structure, " if self.noise_is_bound else ""
             noise = f"noise, {limit}correlated over {to_figures(self.noise_correlation)} px"
-        parts = {noise: self.noise, "discretisation": self.discretisation, **self.effects}
+        parts = {noise: self.noise}
+        if self.discretisation is not None:
+            parts["discretisation"] = self.discretisation
+        parts |= self.effects
         if self.beam is not None:
             parts[self._beam_name] = self.beam
-        finite = {name: error for name, error in parts.items() if not math.isnan(error.rms)}
-        # Other errors move the field at the edge, too: only what exceeds them is the object's.
-        excess = np.array(self.edge) ** 2 - (np.array(list(finite.values())) ** 2).sum(axis=0)
-        if excess[0] > 0:
-            finite["edge"] = root_of(*np.maximum(excess, 0.0))
-        return dict(sorted(finite.items(), key=lambda part: -part[1].rms))
+        if self.edge is not None:
+            # Other errors move the field at the edge, too: only what exceeds them is the object's.
+            excess = np.array(self.edge) ** 2 - (np.array(list(parts.values())) ** 2).sum(axis=0)
+            if excess[0] > 0:
+                parts["edge"] = root_of(*np.maximum(excess, 0.0))
+        return dict(sorted(parts.items(), key=lambda part: -part[1].rms))
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """The parts as shares of the displacement (r.m.s.), by their titles, the largest first."""
+        rms = self.rms or math.nan
+        return {self._title(name): error.rms / rms for name, error in self.parts.items()}
+
+    @property
+    def causes_of_parts(self) -> tuple[str, ...]:
+        """The parts, the largest first, as `causes`."""
+        parts = {name: error for name, error in self.parts.items() if error.rms > 0}
+        return tuple(f"assumed {name}" if name in self.assumed else name for name in parts)
+
+    @property
+    def limiting(self) -> str:
+        """Title of the largest part, such as "beam"."""
+        return next(iter(self.shares))
 
     @property
     def _beam_name(self) -> str:
@@ -184,8 +223,8 @@ class ErrorBudget:
     @property
     def limited_by(self) -> str:
         """Largest part with its share of the displacement (r.m.s.), such as "beam 23 %"."""
-        name, error = next(iter(self.parts.items()))
-        return f"{self._title(name)} {share_of(error.rms, self.rms)}"
+        error = next(iter(self.parts.values()))
+        return f"{self.limiting} {share_of(error.rms, self.rms)}"
 
     def _title(self, name: str) -> str:
         is_filtered = self.beam_basis == "filtered"
@@ -221,14 +260,24 @@ class ErrorBudget:
         return lengths.get(self.beam_scale, to_figures(self.beam_scale))
 
     @property
-    def _measured(self) -> ErrorBudget:
-        """The budget without the parts whose sizes were assumed."""
-        effects = {name: error for name, error in self.effects.items() if name != self.assumed}
-        beam = None if self.beam_basis in _UNMEASURED else self.beam
-        return replace(self, beam=beam, effects=effects, assumed="")
+    def _assumed_parts(self) -> set[str]:
+        """Names of the parts whose sizes nobody stated or measured."""
+        is_assumed = self.beam is not None and self.beam_basis in _UNMEASURED
+        return {*self.assumed, *[self._beam_name] * is_assumed}
+
+    def _without(self, names: Collection[str]) -> ErrorBudget:
+        """Return the budget without some of the parts."""
+        parts, sampled = self.parts, self.sampled
+        if sampled is not None:
+            squares = np.array([parts[name] for name in names]).reshape(-1, 2) ** 2
+            sampled = root_of(*np.maximum(np.array(sampled) ** 2 - squares.sum(axis=0), 0.0))
+        effects = {name: each for name, each in self.effects.items() if name not in names}
+        beam = None if self._beam_name in names else self.beam
+        assumed = tuple(name for name in self.assumed if name not in names)
+        return replace(self, beam=beam, effects=effects, assumed=assumed, sampled=sampled)
 
     def condition(self, share: float) -> Condition | None:
-        """Return the condition on the assumed parts; None if a small total takes more than that.
+        """Return the condition on assumed parts; None if a small total takes more than that.
 
         Parameters
         ----------
@@ -237,29 +286,50 @@ class ErrorBudget:
         """
         if not self.rms > 0:
             return None
-        sizes = []
-        if self.beam is not None and self.beam_basis in _UNMEASURED:
-            sizes.append(("%", 100 * self.beam_variation, self.beam))
-        if shift := self.effects.get(self.assumed):
-            sizes.append(("px", self.sizes[self.assumed], shift))
-        measured = self._measured.total
-        is_reference = bool(shift) or self.beam_basis == "reference"
-        return Condition.within(
-            share,
-            (measured.rms / self.rms, measured.at_peak / self.peak),
-            [(unit, n, e.rms / self.rms, e.at_peak / self.peak) for unit, n, e in sizes],
-            subject="reference" if is_reference else "beam",
-        )
+        of_beam: dict[str, tuple[str, float, ErrorEstimate]] = {}
+        of_detector: dict[str, tuple[str, float, ErrorEstimate]] = {}
+        effects = {each.key: each for each in EFFECTS}
+        for name in sorted(self._assumed_parts):
+            each, part = effects.get(name.partition(",")[0]), self.parts[name]
+            if each is None:
+                size = 100 * self.beam_variation
+                if self.beam_sensitivity is not None:  # images of a fit exclude part of it
+                    part = self.beam_sensitivity.times(size)
+                of_beam[name] = "%", size, part
+            elif each.key == "registration":
+                of_beam[name] = each.unit, self.sizes[name], part
+            else:
+                unit = f"{each.unit} of {each.key}".strip()
+                of_detector[name] = unit, each.factor * self.sizes[name], part
+        is_shifted = any(unit == "px" for unit, _, _ in of_beam.values())
+        is_reference = is_shifted or self.beam_basis == "reference"
+        subjects = {
+            "reference" if is_reference else "beam": of_beam,
+            "detector": of_detector,
+            "beam and detector": of_beam | of_detector,
+        }
+        for subject, assumed in subjects.items():
+            rest = self._without(assumed).total
+            sizes = [
+                (unit, size, part.rms / self.rms, part.at_peak / self.peak)
+                for unit, size, part in assumed.values()
+            ]
+            known = rest.rms / self.rms, rest.at_peak / self.peak
+            condition = Condition.within(share, known, sizes, subject=subject)
+            if condition:
+                at_peak = self.total.at_peak / self.peak
+                return condition._replace(peak_if_off=at_peak, field_if_off=self.share)
+        return None
 
     @property
     def limit(self) -> str:
         """The largest part, with the total, such as "limited by beam (errors 4 %)"."""
-        return limit_text(self._title(next(iter(self.parts))), self.share_text)
+        return limit_text(self.limiting, self.share_text)
 
     @property
     def reason(self) -> str:
         """The largest measured part, and the largest of all if that was assumed."""
-        measured = self._measured
+        measured = self._without(self._assumed_parts)
         if measured.parts.get("edge") != self.parts.get("edge"):  # the beam explains some of it
             measured = self
         largest = next(iter(self.parts))
@@ -325,7 +395,7 @@ class ErrorBudget:
 
     def accuracy_caution(self, accuracy: float, why: str) -> Caution | None:
         """Warn if the discretisation error exceeds the accuracy and is not hidden by noise."""
-        error = self.discretisation.rms
+        error = 0.0 if self.discretisation is None else self.discretisation.rms
         if not self.rms > 0 or not error > max(
             accuracy * self.rms, SHARE_OF_NOISE * self.noise.rms
         ):
@@ -347,13 +417,19 @@ class ErrorBudget:
                 lengths[name] = {cause: error.times(factor) for cause, error in value.items()}
         return replace(self, **lengths)
 
-    def with_scale(self, cause: str, size: float, share: float) -> ErrorBudget:
-        """Return the budget of a quantity whose scale has a relative error `share` by a cause.
+    def in_field(self, setup: Setup | None, name: str, energy: float) -> ErrorBudget:
+        """Return the budget of a field in SI units, which a relative error of the energy scales.
 
-        The cause, such as "energy, 5 %", is known to `size`.
+        The `name` is one of the setup's fields; without a setup it is the displacement.
         """
-        effects = {**self.effects, cause: ErrorEstimate(self.rms, self.peak).times(share)}
-        return replace(self, effects=effects, sizes={**self.sizes, cause: size})
+        share = 0.0 if setup is None else energy * abs(setup.sensitivity_to_beam(name))
+        if setup is None or not share:
+            return self
+        cause = f"{setup.beam_quantity().noun}, {percent(energy)}"
+        error = ErrorEstimate(self.rms, self.peak).times(share)
+        sampled = self.sampled and root_of(*(np.array([self.sampled, error]) ** 2).sum(axis=0))
+        effects, sizes = {**self.effects, cause: error}, {**self.sizes, cause: energy}
+        return replace(self, effects=effects, sizes=sizes, sampled=sampled)
 
     def rows(self, subject: str = "displacement", *, rough: float = 0.5) -> list[tuple[str, str]]:
         """Describe the budget of a subject in words: names and texts.
@@ -361,27 +437,32 @@ class ErrorBudget:
         A total above `rough`, as a share of it, is said to be rough.
         """
         of_subject = f" of the {subject}" if self.rms > 0 else ""
-        text = f"{self.share_text}{of_subject} (r.m.s.); crossing rays are not in it"
-        if self.rms > 0 and self.share > rough:
+        text = f"{self.share_text}{of_subject} (r.m.s.)"
+        if self.sampled is None:
+            text += "; crossing rays are not in it"
+        if self.sampled is None and self.rms > 0 and self.share > rough:
             text += "; errors this large are rough, as they are not proportional to their causes"
-        if math.isnan(self.discretisation.rms):
+        if self.sampled is None and self.discretisation is None:
             text += "; discretisation was not estimated, as only one level was solved"
         rows = [("errors", text), ("limited by", self.ranking)]
         if next_step := self.measure_next(self.share / 2):
             rows.append(("measure next", next_step))
-        basis = "exact" if self.beam is None else self._beam_name.removeprefix("beam ")
-        by_beam = (
-            f"{basis}; a source that differs from it by 1 % (r.m.s.) over {self._beam_length} of "
-            "the image's shorter side moves the displacement by "
-            f"{share_of(self.beam_sensitivity.rms, self.rms)} (r.m.s.), its peak by "
-            f"{share_of(self.beam_sensitivity.at_peak, self.peak)}"
-        )
-        effects = ", ".join(
-            f"{share_of(error.rms, self.rms)} ({name})"
-            for name, error in self.sensitivities.items()
-        )
-        by_instrument = f"the displacement would move by (r.m.s.): {effects}"
-        return [*rows, ("beam", by_beam), ("instrument", by_instrument)]
+        if (by_percent := self.beam_sensitivity) is not None:
+            basis = "exact" if self.beam is None else self._beam_name.removeprefix("beam ")
+            by_beam = (
+                f"{basis}; a source that differs from it by 1 % (r.m.s.) over {self._beam_length} "
+                "of the image's shorter side moves the displacement by "
+                f"{share_of(by_percent.rms, self.rms)} (r.m.s.), its peak by "
+                f"{share_of(by_percent.at_peak, self.peak)}"
+            )
+            rows.append(("beam", by_beam))
+        if self.sensitivities:
+            effects = ", ".join(
+                f"{share_of(error.rms, self.rms)} ({name})"
+                for name, error in self.sensitivities.items()
+            )
+            rows.append(("sensitivity", f"the displacement would move by (r.m.s.): {effects}"))
+        return rows
 
     def edge_caution(self, max_error: float) -> Caution | None:
         """Warn if an object beyond the edge may move the field by more than `max_error` of it."""
@@ -406,6 +487,16 @@ class ErrorBudget:
             f"by {share_of(self.beam.at_peak, self.peak)}; use a source of the same exposure, "
             "or fit the beam",
         )
+
+
+def per_pixel_of(errors: ErrorBudget | None) -> FloatArray | None:
+    """Return the standard deviation of the displacement in every pixel, if it is known."""
+    return None if errors is None else errors.per_pixel
+
+
+@cache
+def _schema() -> TypeAdapter[ErrorBudget]:
+    return TypeAdapter(ErrorBudget)
 
 
 def root_of(square: float, square_at_peak: float) -> ErrorEstimate:

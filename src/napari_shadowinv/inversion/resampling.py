@@ -1,7 +1,7 @@
 """Random samples of an inversion by its noise and its instrument.
 
-- the plan of the inversion's sites: `plan_of`; its noise and instrument: `noise_of_budget`,
-  `instrument_draws`; objects beyond its edge: `changes_by_edge`
+- what is drawn: noise, `noise_draw`; the instrument, `instrument_draws`; objects beyond the edge,
+  `changes_by_edge`
 - draw and invert samples, and sum them up: `Sampler`
 
 Each sample is the image with another draw of noise, inverted on the same sites. The scatter of the
@@ -53,12 +53,14 @@ from napari_shadowinv.inversion.error_budget import ErrorBudget
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.samples import (
+    Draw,
     FullResampling,
     LinearResampling,
     Pairs,
     Scatter,
     Seed,
     correct,
+    noise_of,
     stratified_numbers,
 )
 from napari_shadowinv.options import BeamPrior, Instrument, InversionOptions
@@ -256,28 +258,32 @@ def check_choices(n: Any, method: Any) -> None:
         raise InputError(f"method is {method!r}, expected 'linear' or 'resolve'")
 
 
-def noise_of_budget(
-    shot: RecordedShot, options: InversionOptions, correlation: float | None, flux_scale: float
-) -> Any:
-    """Return the noise of an image as the error budget takes it, for `noise_of`.
+def noise_draw(
+    shot: RecordedShot,
+    noise: Any,
+    errors: ErrorBudget,
+    options: InversionOptions,
+    correlation: float | None,
+    flux_scale: float,
+) -> tuple[Draw, str]:
+    """Return a function that draws a noisy image, and a text that describes the noise.
 
-    Counting noise if the options state units per quantum, else the deviation in each pixel.
+    Noise of None is as in the error budget: counting noise if the options state units per
+    quantum, else the deviation in each pixel, for a stated `correlation`, px, or the measured one.
+    Images are divided by `flux_scale` for the transport.
     """
-    if options.units_per_quantum is not None:
-        return "poisson"
-    image, mask = shot.image / flux_scale, shot.mask
-    prepared = prepare(shot.image, shot.source, options, mask, flux_scale=flux_scale)
-    noise = ImageNoise(prepared.in_units(), options, correlation)
-    mean = shot.source[mask].mean()
-    deviation = mean * np.sqrt(noise.variance(image / mean))
-    return flux_scale * np.maximum(deviation, 1e-9 * float(image.max()))
-
-
-def noise_width(errors: ErrorBudget, noise: Any) -> float:
-    """Return the width over which noise is drawn correlated, px."""
+    if noise is None and options.units_per_quantum is not None:
+        noise = "poisson"
+    if noise is None:
+        prepared = prepare(shot.image, shot.source, options, shot.mask, flux_scale=flux_scale)
+        of_image = ImageNoise(prepared.in_units(), options, correlation)
+        mean = shot.source[shot.mask].mean()
+        deviation = mean * np.sqrt(of_image.variance(prepared.image / mean))
+        noise = flux_scale * np.maximum(deviation, 1e-9 * float(prepared.image.max()))
     # Structure that hides the noise does not correlate noise that is stated.
     is_hidden = errors.noise_is_bound and np.ndim(noise) == 0
-    return 0.0 if is_hidden else errors.noise_correlation
+    width = 0.0 if is_hidden else errors.noise_correlation
+    return noise_of(shot.image, noise, options.units_per_quantum, shot.mask, width)
 
 
 def changes_by_edge(errors: ErrorBudget, fields: FloatArray, mask: BoolArray) -> FloatArray:

@@ -40,11 +40,10 @@ from napari_shadowinv.facts import (
 )
 from napari_shadowinv.instrument.effects import RecordedShot
 from napari_shadowinv.inversion.error_bars import Quantities
-from napari_shadowinv.inversion.error_budget import ErrorBudget
+from napari_shadowinv.inversion.error_budget import ErrorBudget, per_pixel_of
 from napari_shadowinv.inversion.normalise import lit_pixels
 from napari_shadowinv.inversion.solution_checks import DECISIVE
 from napari_shadowinv.inversion.variables import (
-    CELL_VARIABLES,
     DISPLACEMENT_STD,
     VARIABLES,
     dataset_from_field,
@@ -244,7 +243,7 @@ class Inversion(Summarised):
     def structures(self) -> Structures | None:
         """Regions where the displacement stands above its error; None without pixel errors."""
         element = self.displacement[0].size / len(self.cells.sites)
-        std = None if self.errors is None else self.errors.per_pixel
+        std = per_pixel_of(self.errors)
         return structures_of(self.displacement, std, self.mask, element=element)
 
     @property
@@ -269,8 +268,8 @@ class Inversion(Summarised):
 
     def variable(self, name: str) -> AnyArray:
         """Return the array of a variable of the dataset, one of `VARIABLES`."""
-        part = CELL_VARIABLES.get(name)
-        return np.asarray(getattr(self, name) if part is None else getattr(self.cells, part))
+        owner = self.cells if _is_of_cells(name) else self
+        return np.asarray(getattr(owner, name.removeprefix("site_")))
 
     def in_units(self, setup: Setup | None) -> InversionInUnits:
         """Return errors, assessment, headline and facts in the units of a setup.
@@ -288,11 +287,16 @@ class Inversion(Summarised):
         return InversionInUnits(self, setup)
 
     @property
-    def recorded_image(self) -> FloatArray:
-        """The image in its own units, (H, W): whole numbers if it was counts."""
+    def recorded(self) -> RecordedShot:
+        """The image in its own units, whole numbers if it was counts, with its source."""
         image = self.image * self.report.flux_scale
         counts = np.rint(image)
-        return counts if np.allclose(image, counts, rtol=1e-12, atol=0) else image
+        return RecordedShot(
+            image=counts if np.allclose(image, counts, rtol=1e-12, atol=0) else image,
+            source=self.source,
+            displacement=self.displacement,
+            mask=self.mask,
+        )
 
     def uncertainty(
         self,
@@ -385,28 +389,16 @@ class Inversion(Summarised):
                 "the inversion did not converge, so its errors are not known: invert the image "
                 "with more iterations or another source first"
             )
-        shot = RecordedShot(
-            image=self.recorded_image,
-            source=self.source,
-            displacement=self.displacement,
-            mask=self.mask,
-        )
-        scale, correlation = self.report.flux_scale, self.instrument.noise_correlation
-        if noise is None:
-            noise = resampling.noise_of_budget(shot, options, correlation, scale)
-        width = resampling.noise_width(errors, noise)
-        units = options.units_per_quantum
-        draw, described = samples.noise_of(shot.image, noise, units, self.mask, width)
+        shot, scale = self.recorded, self.report.flux_scale
+        correlation = self.instrument.noise_correlation
+        draw, described = resampling.noise_draw(shot, noise, errors, options, correlation, scale)
         draws = None
         if not noise_only:
             draws = resampling.instrument_draws(shot, self.instrument, errors, measured=measured)
-        usable = None if self.mask.all() else self.mask
         sites, weights = self.cells.sites, self.cells.weights
-        plan = samples.plan_of(sites, self.source, usable, options, measured=measured)
-        images = samples.FullResampling(
-            plan, weights, shot.image, draw, options, draws,
-            flux_scale=scale if options.flux == "fit" else None,
-        )  # fmt: skip
+        plan = samples.plan_of(sites, self.source, self.mask, options, measured=measured)
+        fitted = scale if options.flux == "fit" else None
+        images = samples.FullResampling(plan, weights, shot.image, draw, options, draws, fitted)
         fields = np.stack([self.potential, *self.displacement])
         by_edge = resampling.changes_by_edge(errors, fields, self.mask)
         sampler = resampling.Sampler.of(images, int(n), fields, by_edge, quantities)
@@ -472,9 +464,9 @@ class Inversion(Summarised):
         dataset = dataset_from_field(
             self.displacement, self.potential, setup, attributes=history | dict(attributes or {})
         )
-        if self.errors is not None and self.errors.per_pixel is not None:
+        if (std := per_pixel_of(self.errors)) is not None:
             dims, *words = DISPLACEMENT_STD
-            dataset["displacement_std"] = dims, self.errors.per_pixel, label(*words)
+            dataset["displacement_std"] = dims, std, label(*words)
         dataset = dataset.assign(
             {
                 name: (dims, self.variable(name), label(units, long_name))
@@ -506,13 +498,14 @@ class Inversion(Summarised):
                 "inversion"
             )
         arrays: dict[str, Any] = {name: numbers_of(dataset, name) for name in VARIABLES}
-        cells = Cells(**{part: arrays.pop(name) for name, part in CELL_VARIABLES.items()})
+        of_cells = filter(_is_of_cells, VARIABLES)
+        cells = Cells(**{name.removeprefix("site_"): arrays.pop(name) for name in of_cells})
         content = json.loads(dataset.attrs["report"])
         content["warnings"] = [Caution.from_json(caution) for caution in content["warnings"]]
         return cls(
             **arrays,
             cells=cells,
-            report=_schema(Report).validate_python(content),
+            report=_report_schema().validate_python(content),
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             instrument=Instrument.model_validate_json(dataset.attrs["instrument"]),
             provenance=Provenance.of(dataset.attrs, dataset.variables),
@@ -544,14 +537,9 @@ class InversionInUnits:
     @property
     def errors(self) -> ErrorBudget | None:
         """Error budget of the main field, px of displacement; None if it was not estimated."""
-        errors, setup, error = self.inversion.errors, self.setup, self.inversion.instrument.energy
-        if errors is None or setup is None or not error:
-            return errors
-        share = error * abs(setup.sensitivity_to_beam(setup.main_field.name))
-        if not share:
-            return errors
-        noun = setup.beam_quantity().noun
-        return errors.with_scale(f"{noun}, {percent(error)}", error, share)
+        errors, setup = self.inversion.errors, self.setup
+        name = "" if setup is None else setup.main_field.name
+        return errors and errors.in_field(setup, name, self.inversion.instrument.energy)
 
     @property
     def assessment(self) -> Assessment:
@@ -672,18 +660,20 @@ class InversionInUnits:
         return rows
 
 
+def _is_of_cells(name: str) -> bool:
+    return "site" in VARIABLES[name][0]
+
+
 @cache
-def _schema(kind: type[Any]) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
+def _report_schema() -> TypeAdapter[Report]:
+    return TypeAdapter(Report)
 
 
 def _errors_in(dataset: xarray.Dataset) -> ErrorBudget | None:
     if "errors" not in dataset.attrs:
         return None
-    errors: ErrorBudget = _schema(ErrorBudget).validate_json(dataset.attrs["errors"])
-    causes = json.loads(dataset.attrs.get("error_causes", "[]"))
-    std = _deviation(dataset, "displacement_std")
-    return replace(errors, per_pixel=std, causes=tuple(map(str, causes)))
+    content, causes = (json.loads(dataset.attrs[name]) for name in ("errors", "error_causes"))
+    return ErrorBudget.from_dict(content, causes, _deviation(dataset, "displacement_std"))
 
 
 def _deviation(dataset: xarray.Dataset, name: str) -> FloatArray | None:

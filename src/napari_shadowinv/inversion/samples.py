@@ -158,8 +158,8 @@ class FullResampling:
     draw: Draw
     options: InversionOptions
     instrument: InstrumentDraws | None = None
-    numbers: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # of all samples
     flux_scale: float | None = None  # divisor of images, if it was fitted
+    numbers: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # of all samples
 
     def sample(self, seeds: list[Seed], report: Reporter) -> tuple[FloatArray, LevelSolution]:
         """Return potential and displacement of the noisy image of one seed, (3, H, W)."""
@@ -179,7 +179,13 @@ class FullResampling:
             return self.plan, self.image(seed), 1.0
         noisy, numbers = self.random(seed)
         shot = self.instrument.shot(numbers)
-        plan = _with_source(self.plan, shot.source, self.options)
+        plan = _plan_on(
+            self.plan.levels[-1].triangulation,
+            shot.source,
+            self.plan.mask,
+            self.options,
+            measured=self.plan.measured,
+        )
         # Light is counted after it was changed, so the noise stays as it is.
         image = self.flooring(plan.source)(shot.image + (noisy - self.recorded))
         return plan, image, 1 + float(self.instrument.scale(numbers))
@@ -220,34 +226,36 @@ class FullResampling:
 def plan_of(
     sites: FloatArray,
     source: FloatArray,
-    mask: BoolArray | None,
+    mask: BoolArray,
     options: InversionOptions,
     *,
     measured: bool,
 ) -> SitePlan:
     """Return the plan of one level with given sites, (n, 2), px of the source.
 
-    A mask of None uses all pixels; a `measured` source was recorded.
+    A `measured` source was recorded.
     """
+    width = margin_around(source.shape, options) if options.boundary == "free" else 0
+    region = [(-0.5, -0.5), tuple(side + 2 * width - 0.5 for side in source.shape)]
+    triangulation = RegularTriangulation(sites + width, region=region)
+    return _plan_on(triangulation, source, mask, options, measured=measured)
+
+
+def _plan_on(
+    triangulation: RegularTriangulation,
+    source: FloatArray,
+    mask: BoolArray | None,
+    options: InversionOptions,
+    *,
+    measured: bool,
+) -> SitePlan:
     beam, unit, margin = _spread_beam(source, mask, options)
     density = Density.from_image(beam, threads=options.threads)
-    padded = sites + (0 if margin is None else margin.width)
-    triangulation = RegularTriangulation(padded, region=density.region)
     diagram = PowerDiagram(triangulation, density, with_moments=True, threads=options.threads)
-    level = SiteLevel(padded, diagram.masses, diagram.centroids, triangulation, beam.shape, 0)
+    sites, shape = triangulation.sites, beam.shape
+    level = SiteLevel(sites, diagram.masses, diagram.centroids, triangulation, shape, 0)
     levels = Levels((len(sites),), lambda count, report: level)
     return SitePlan(source, levels, mask, margin, unit, measured)
-
-
-def _with_source(plan: SitePlan, source: FloatArray, options: InversionOptions) -> SitePlan:
-    """Return the finest sites of a plan for another source."""
-    beam, unit, margin = _spread_beam(source, plan.mask, options)
-    level = plan.levels[-1]
-    density = Density.from_image(beam, threads=options.threads)
-    diagram = PowerDiagram(level.triangulation, density, with_moments=True, threads=options.threads)
-    changed = replace(level, mass=diagram.masses, centroids=diagram.centroids)
-    levels = Levels((len(level.sites),), lambda count, report: changed)
-    return replace(plan, source=source, levels=levels, margin=margin, unit=unit)
 
 
 def _spread_beam(

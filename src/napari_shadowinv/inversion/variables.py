@@ -47,15 +47,6 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "mask": (PLANE, "1", "Pixels that were used"),
 }
 
-CELL_VARIABLES = {
-    "sites": "sites",
-    "weights": "weights",
-    "site_mass": "mass",
-    "site_flux": "flux",
-    "site_displacement": "displacement",
-}
-"""Variables of the cells, and the attributes of `Cells` that they hold."""
-
 DISPLACEMENT_STD = (
     _VECTORS,
     PIXEL,

@@ -80,9 +80,13 @@ _of_fits = partial(ShotColumn, stores=(FITS,))
 
 
 def _error(part: str) -> Callable[[Any], float]:
-    """Return the reader of an error of an inversion, which may have no error budget."""
-    rms = attrgetter(f"errors.{part}.rms")
-    return lambda result: math.nan if result.errors is None else float(rms(result))
+    """Return the reader of an error of an inversion; NaN where it is not known."""
+
+    def rms(result: Any) -> float:
+        error = getattr(result.errors, part, None)
+        return math.nan if error is None else float(error.rms)
+
+    return rms
 
 
 # In the order of all tables.

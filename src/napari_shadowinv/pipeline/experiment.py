@@ -468,29 +468,22 @@ def _errors_made(displacement: FloatArray, truth: FloatArray) -> tuple[float, fl
 
 def _parts_of(errors: ErrorBudget) -> dict[str, float]:
     """Return the parts of a budget as shares of the field, by the causes' names."""
-    parts = {}
-    for name, part in errors.parts.items():
-        key = name.partition(",")[0].replace(" ", "_")
-        if part is errors.beam:
-            key = "beam"
-        elif part in errors.effects.values() and key in ("wavelength", "energy"):
-            key = "energy"
-        parts[key] = part.rms / errors.rms if errors.rms > 0 else np.inf
-    return parts
+    names = {"beam between energies": "beam_between", "wavelength": "energy"}
+    return {
+        names.get(title, title.replace(" ", "_")): share for title, share in errors.shares.items()
+    }
 
 
 def _fit_errors(result: Fit, inputs: ExperimentInputs) -> tuple[dict[str, float], float, Verdict]:
     """Return the parts of a fit's error, the total, and the verdict, with the energy's error."""
-    report = result.report
-    parts, total = dict(report.parts), report.total
     verdict, setup = result.verdict, inputs.setups[0]
-    if setup is not None and inputs.instrument.energy:
-        share = inputs.instrument.energy * abs(setup.sensitivity_to_beam(setup.main_field.name))
-        parts["energy"] = share
-        total = float(np.hypot(total, share))
-        if verdict is Verdict.DETERMINED and total > inputs.options.max_error:
-            verdict = Verdict.UNCERTAIN
-    return parts, total, verdict
+    if result.errors is None:
+        return {}, np.nan, verdict
+    name = "" if setup is None else setup.main_field.name
+    errors = result.errors.in_field(setup, name, inputs.instrument.energy)
+    if verdict is Verdict.DETERMINED and errors.share > inputs.options.max_error:
+        verdict = Verdict.UNCERTAIN
+    return _parts_of(errors), errors.share, verdict
 
 
 def _scales_of(result: Fit, inputs: ExperimentInputs) -> dict[str, float]:

@@ -15,6 +15,7 @@ import numpy as np
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Fact, Level
 from napari_shadowinv.fitting import Fit, FittedField, LeaveOneOut
+from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.significance import deviation_along
@@ -87,11 +88,11 @@ def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:
 
 def _draw_fitted(panels: list[Panel], fit: Fit, field: FittedField) -> None:
     """Fill a row of panels with a field; the potential comes first if there is room for it."""
-    deflector = deflector_titles()[field.name]
-    (in_units,) = shown_fields([field.displacement], fit.setup, deflector, mask=fit.used)
+    deflector, in_units = deflector_titles()[field.name], fit.shown(field)
     title = in_units.name if len(fit.fields) == 1 else f"{field.name}: {in_units.symbol}"
+    std = per_pixel_of(field.errors)
     contents = ["potential", "field", "error", "cuts"]
-    if field.uncertainty is None:
+    if std is None:
         contents.remove("error")
     contents = contents[-len(panels) :]
     for panel, content in zip(panels, contents, strict=False):
@@ -101,8 +102,8 @@ def _draw_fitted(panels: list[Panel], fit: Fit, field: FittedField) -> None:
             panel.draw_field(in_units, title)
             panel.hatch_insignificant(fit.structures(field))
             panel.outline_caustics(_crossed_rays(fit))
-        elif content == "error" and field.uncertainty is not None:
-            (error,) = shown_fields([field.uncertainty], fit.setup, deflector, mask=fit.used)
+        elif content == "error" and std is not None:
+            (error,) = shown_fields([std], fit.setup, deflector, mask=fit.used)
             limits = 0.0, error.largest or 1.0
             label = f"σ of {in_units.symbol} ({error.unit})"
             panel.show(error.magnitude, "Standard deviation", label, "cividis", limits)
@@ -121,10 +122,11 @@ def _crossed_rays(fit: Fit) -> BoolArray:
 
 def _magnitude_error(field: FittedField, in_units: ShownField) -> FloatArray | None:
     """Return the standard deviation of a field's magnitude in the unit in which it is shown."""
-    if field.uncertainty is None:
+    std = per_pixel_of(field.errors)
+    if std is None:
         return None
     length = np.sqrt((field.displacement**2).sum(axis=0))
-    pixels = deviation_along(field.displacement, field.uncertainty)
+    pixels = deviation_along(field.displacement, std)
     strongest = in_units.peak
     # Displacements become fields by a factor.
     return np.asarray(pixels * in_units.magnitude[strongest] / max(length[strongest], 1e-12))

@@ -196,7 +196,7 @@ def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qt
     factor = {"µT·m": 1e6, "mT·m": 1e3, "T·m": 1.0}[unit_of(field)]
     strength = factor * np.hypot(*SETUPS[0].path_integrated_b(result.fields[0].displacement))
     np.testing.assert_allclose(field.data, strength, rtol=1e-6, atol=1e-6 * strength.max())
-    sigma = factor * np.hypot(*SETUPS[0].path_integrated_b(result.fields[0].uncertainty))
+    sigma = factor * np.hypot(*SETUPS[0].path_integrated_b(result.fields[0].errors.per_pixel))
     uncertainty = layer_of(window, "uncertainty")
     np.testing.assert_allclose(uncertainty.data, sigma, rtol=1e-6)
     assert unit_of(uncertainty) == unit_of(field)
