@@ -382,7 +382,7 @@ def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
         (
             lambda: type_in(tool, 1, BEAM, "fast"),
             lambda: type_in(tool, 1, BEAM, "6"),
-            "'6.0 MeV': 'fast' is not a number",
+            "'6.0 MeV': received 'fast', expected a number in MeV",
         ),
         (
             lambda: type_in(tool, 1, BEAM, "-2"),

@@ -140,7 +140,7 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:
         assert words in messages[before]
 
     write(tool, 1, ENERGY, "much")
-    expect("'film1.npy': 'much' is not a number")
+    expect("'film1.npy': received 'much', expected a number")
     write(tool, 1, ENERGY, "")
     write(tool, 1, GAIN, "-1")
     expect("'film1.npy': 'Brightness' is -1.0: it must be greater than 0")

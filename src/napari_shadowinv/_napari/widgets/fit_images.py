@@ -317,8 +317,11 @@ class FitImages(ToolPanel):
         """Show the setup of a new reference; without a setup it gets the last one."""
         row = self.images.reference
         old_setup = self.setup.complete_setup()
-        self.source.follow(None if row is None else row.layer)
-        self.setup.follow(None if row is None else row.layer)
+        image = None if row is None else row.layer
+        # Other images show the same object: none of them is the beam of another.
+        has_beam = image is not None and about.result_of(image) is not None
+        self.source.follow(image if has_beam else None)
+        self.setup.follow(image)
         if row is not None:
             self.masks.follow(row.layer)
             base = row.setup or old_setup
