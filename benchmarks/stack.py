@@ -33,7 +33,7 @@ from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import Cache, RunOptions
 from napari_shadowinv.preprocessing import Bin
-from napari_shadowinv.stack import ShotOutcome, read_shot
+from napari_shadowinv.stack import ShotOutcome, read_pixels
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 
@@ -75,7 +75,7 @@ def night(folder: Path, count: int, shape: tuple[int, int], sites: int | None) -
     options = InversionOptions(n_sites=sites, threads=1)
     reference, shots = BURNER / "Image_00000.bmp", sorted(BURNER.glob("Image_2*.bmp"))[:count]
     if len(shots) == count and shape == (464, 576):
-        grey = partial(read_shot, channel="mean")
+        grey = partial(read_pixels, channel="mean")
         recipe = Recipe(steps=(Bin(factor=2),), options=options)
         return Night(shots, reference, grey, recipe, "burner, binned by 2")
     shots = [folder / f"shot_{number}.npy" for number in range(count)]
@@ -83,7 +83,7 @@ def night(folder: Path, count: int, shape: tuple[int, int], sites: int | None) -
         np.save(path, plume(shape, number))
     np.save(folder / "reference.npy", np.full(shape, 1000.0))
     recipe = Recipe(options=options)
-    return Night(shots, folder / "reference.npy", read_shot, recipe, "simulated plumes")
+    return Night(shots, folder / "reference.npy", read_pixels, recipe, "simulated plumes")
 
 
 def warm_up(shots: int, folder: Path, scheduler: Any) -> None:

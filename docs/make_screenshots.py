@@ -33,7 +33,7 @@ from qtpy.QtWidgets import QApplication
 import napari
 from napari_shadowinv import run_stack, synthetic_image
 from napari_shadowinv._napari.layer_metadata import metadata_for
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.preprocessing import Recipe
@@ -154,7 +154,7 @@ def stack_window(folder: Path) -> None:
     """A run over real shadowgrams with their reference: the widget, and a shot's field."""
     viewer = new_window("alcohol burner", height=840)
     reference, *shots = (
-        read_radiograph(path, channel="mean").bin_pixels(4).image
+        read_shot(path, channel="mean").bin_pixels(4).image
         for path in (folder / "Image_00000.bmp", *frames(folder))
     )
     viewer.add_image(reference, name="reference", visible=False)

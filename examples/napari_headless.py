@@ -14,13 +14,13 @@ from napari.components import ViewerModel
 from npe2 import PluginManager
 
 from napari_shadowinv import InversionOptions, add_to_viewer, invert
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import paper_setup, toroid
 
 setup = paper_setup()
 if len(sys.argv) > 1:
-    shot = read_radiograph(sys.argv[1]).image
+    shot = read_shot(sys.argv[1]).image
 else:
     shot = synthetic_image(toroid((100, 100), setup, peak=90, sigma=15e-6).displacement)
 

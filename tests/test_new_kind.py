@@ -15,7 +15,7 @@ import pytest
 from helpers.command_line import flat, shadowinv
 from napari_shadowinv import InputError, ProtonSetup, fit, invert, predict_image, run_stack
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.io import read, read_radiograph, write
+from napari_shadowinv.io import read, read_shot, write
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -142,9 +142,9 @@ def test_command_fits_a_table_of_a_new_kind(table):
 def test_text_image_states_a_new_kind(table, setups, images):
     head = "photon_energy: 8000 eV\nsource_object_distance: 10 cm\nobject_image_distance: 1 m\n"
     np.savetxt("shot.txt", images[0], header=f"{head}pixel_size: 1 um")
-    assert read_radiograph(Path("shot.txt")).setup == setups[0]
+    assert read_shot(Path("shot.txt")).setup == setups[0]
     Path("harder.toml").write_text("photon_energy = 12")
-    shot = read_radiograph(Path("shot.txt"))
+    shot = read_shot(Path("shot.txt"))
     assert setup_from(Path("harder.toml"), shot.metadata["geometry"]) == setups[1]
     assert "photon energy (keV) 8" in flat(shadowinv("info", "shot.txt").output)
 

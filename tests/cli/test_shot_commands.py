@@ -1219,13 +1219,13 @@ def test_ctrl_c_converted_by_a_library_still_cancels(folder: Path, shot: Path) -
 
         kept = HalfMade()
 
-        def read_radiograph(*arguments, **options):
+        def read_shot(*arguments, **options):
             try:
                 stall()
             except KeyboardInterrupt:
                 raise ImportError("a part of the library failed to import")
 
-        io.read_radiograph = read_radiograph
+        io.read_shot = read_shot
     """
     code, errors = interrupted(folder, half_imported, ["invert", "shot.npy"])
     assert (code, errors.strip()) == (130, "Cancelled")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read_shot
 
 RAMP = np.arange(6 * 9).reshape(6, 9)
 FOOTER = b'<SpeFormat version="3.0"><DataFormat><DataBlock type="Frame" count="1">%b</DataBlock>'
@@ -60,7 +60,7 @@ def save_spe(
 @pytest.mark.parametrize("name", ["shot.b16", "shot.tif"])
 def test_b16_comes_back(tmp_path: Path, name: str, comment: bytes) -> None:
     pixels = (RAMP * 1213).astype(np.uint16)
-    radiograph = read_radiograph(save_b16(tmp_path / name, pixels, comment))
+    radiograph = read_shot(save_b16(tmp_path / name, pixels, comment))
     np.testing.assert_array_equal(radiograph.image, pixels)
     assert radiograph.metadata["kind"] == "b16"
     assert radiograph.metadata["bits"] == 16
@@ -70,10 +70,10 @@ def test_b16_with_the_basic_header(tmp_path: Path) -> None:
     path = tmp_path / "shot.b16"
     header = b"PCO-" + struct.pack("<5i", 24 + 108, 24, 9, 6, 0)
     path.write_bytes(header + RAMP.astype("<u2").tobytes())
-    np.testing.assert_array_equal(read_radiograph(path).image, RAMP)
+    np.testing.assert_array_equal(read_shot(path).image, RAMP)
     # The first pixel stands where the extended header would tell a colour camera.
     path.write_bytes(header + (RAMP * 0 + [1, 0, 0] * 3).astype("<u2").tobytes())
-    assert read_radiograph(path).image[0, 0] == 1
+    assert read_shot(path).image[0, 0] == 1
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_b16_with_the_basic_header(tmp_path: Path) -> None:
 @pytest.mark.parametrize("footer", [b"", FOOTER % REGION])
 def test_spe_comes_back(tmp_path: Path, footer: bytes, code: int, dtype: str) -> None:
     pixels = (RAMP * 3 - (40 if dtype in ("<f4", "<i4", "<i2", "<f8") else 0)).astype(dtype)
-    radiograph = read_radiograph(save_spe(tmp_path / "shot.spe", pixels, code, footer))
+    radiograph = read_shot(save_spe(tmp_path / "shot.spe", pixels, code, footer))
     np.testing.assert_array_equal(radiograph.image, pixels)
     assert radiograph.metadata["kind"] == "spe"
     assert radiograph.metadata["version"] == (3.0 if footer else 2.5)
@@ -91,21 +91,21 @@ def test_spe_comes_back(tmp_path: Path, footer: bytes, code: int, dtype: str) ->
 
 def test_spe_is_known_by_its_marks_or_its_name(tmp_path: Path) -> None:
     pixels = RAMP.astype("<u2")
-    assert read_radiograph(save_spe(tmp_path / "shot.dat", pixels, 3)).image[1, 2] == 11
-    assert read_radiograph(save_spe(tmp_path / "a.SPE", pixels, 3, marked=False)).image[1, 2] == 11
+    assert read_shot(save_spe(tmp_path / "shot.dat", pixels, 3)).image[1, 2] == 11
+    assert read_shot(save_spe(tmp_path / "a.SPE", pixels, 3, marked=False)).image[1, 2] == 11
     with pytest.raises(FileFormatError, match="not in a recognised image format"):
-        read_radiograph(save_spe(tmp_path / "shot.xyz", pixels, 3, marked=False))
+        read_shot(save_spe(tmp_path / "shot.xyz", pixels, 3, marked=False))
 
 
 def test_several_frames_and_regions_are_refused(tmp_path: Path) -> None:
     pixels = np.ones((4, 6, 9), "<u2")
     with pytest.raises(FileFormatError, match="holds 4 frames: expected one"):
-        read_radiograph(save_spe(tmp_path / "a.spe", pixels, 3, frames=4))
+        read_shot(save_spe(tmp_path / "a.spe", pixels, 3, frames=4))
     with pytest.raises(FileFormatError, match="holds 2 regions"):
-        read_radiograph(save_spe(tmp_path / "b.spe", pixels[0], 3, FOOTER % (2 * REGION)))
+        read_shot(save_spe(tmp_path / "b.spe", pixels[0], 3, FOOTER % (2 * REGION)))
 
 
 def test_colour_camera_is_refused(tmp_path: Path) -> None:
     path = save_b16(tmp_path / "shot.b16", RAMP.astype(np.uint16), colour=1)
     with pytest.raises(FileFormatError, match="colour camera"):
-        read_radiograph(path)
+        read_shot(path)

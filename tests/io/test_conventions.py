@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 
 from napari_shadowinv import FileFormatError, InversionOptions, Recipe, invert_stack, read
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read_shot
 
 COUNTS = np.arange(15, dtype=np.int16).reshape(3, 5)
 
@@ -27,7 +27,7 @@ def shot_in(file: Any, name: str = "data") -> Any:
     """Return what is read from a file that is still open for writing."""
     path = Path(file.filename)
     file.close()
-    return read_radiograph(f"{path}::{name}")
+    return read_shot(f"{path}::{name}")
 
 
 def test_packed_values_of_netcdf_are_those_of_xarray(tmp_path: Path) -> None:
@@ -98,8 +98,8 @@ def test_pixel_mask_of_each_frame_is_its_own(file: Any) -> None:
     nexus(file, np.stack([COUNTS, COUNTS]))["pixel_mask"] = flags
     path = file.filename
     file.close()
-    assert read_radiograph(f"{path}::entry/data/data[0]").mask is None
-    assert not read_radiograph(f"{path}::entry/data/data[1]").mask[2, 0]
+    assert read_shot(f"{path}::entry/data/data[0]").mask is None
+    assert not read_shot(f"{path}::entry/data/data[1]").mask[2, 0]
 
 
 @pytest.mark.parametrize(("unit", "size"), [("um", 75.0), ("m", 75e-6)])
@@ -122,7 +122,7 @@ def test_flat_and_dark_frames_are_no_shots(file: Any, place: str) -> None:
     with pytest.raises(FileFormatError, match="1 flat, 1 dark among the 4 frames") as error:
         read(f"{path}::entry/data/image")
     assert "'/entry/data/image[2]'" in str(error.value)
-    shot = read_radiograph(f"{path}::entry/data/image[2]")
+    shot = read_shot(f"{path}::entry/data/image[2]")
     np.testing.assert_array_equal(shot.image, frames[2])
     with h5py.File(path, "a") as content:
         content[f"{place}/image_key"][:] = 0

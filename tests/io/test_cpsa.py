@@ -11,7 +11,7 @@ import pytest
 
 from helpers.command_line import flat, shadowinv
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io import read, read_radiograph, read_tracks
+from napari_shadowinv.io import read, read_shot, read_tracks
 from napari_shadowinv.pipeline.rerun import rerun
 
 PIXEL = 0.5  # µm; a frame of 800 × 400 px is 400 × 200 µm
@@ -100,7 +100,7 @@ def test_a_track_has_the_place_and_the_size_that_its_bytes_tell(tmp_path: Path) 
 
 def test_frames_lie_where_their_places_say(tmp_path: Path) -> None:
     frames = snake(4, 3, lambda c, r: [ROUND] * (1 + c + 10 * r))
-    shot = read_radiograph(save(tmp_path / "a.cpsa", (4, 3), frames), variable="bin=200")
+    shot = read_shot(save(tmp_path / "a.cpsa", (4, 3), frames), variable="bin=200")
     counts = shot.image.reshape(3, 1, 4, 2).sum(axis=(1, 3))
     np.testing.assert_array_equal(counts, 1 + np.arange(4) + 10 * np.arange(3)[:, None])
     # 100 px of 800 from the right edge.
@@ -110,25 +110,25 @@ def test_frames_lie_where_their_places_say(tmp_path: Path) -> None:
 
 
 def test_ranges_choose_tracks_and_are_kept(scan: Path) -> None:
-    assert read_radiograph(scan).image.sum() == 36 * 12
-    assert "all 432 tracks are counted" in read_radiograph(scan).warnings[0].text
+    assert read_shot(scan).image.sum() == 36 * 12
+    assert "all 432 tracks are counted" in read_shot(scan).warnings[0].text
     for ranges, share in (
         ("diameter=4:", 2 / 3),
         ("diameter=:3", 1 / 3),  # both ends count
         ("contrast=:40", 2 / 3),
         ("diameter=4:12 eccentricity=0:15", 1 / 3),
     ):
-        shot = read_radiograph(f"{scan}::{ranges} bin=200")
+        shot = read_shot(f"{scan}::{ranges} bin=200")
         assert shot.image.sum() == shot.metadata["tracks"] == 432 * share
         assert not shot.warnings
         # As the command and a result's provenance name them.
-        again = read_radiograph(scan, variable=shot.metadata["variable"])
+        again = read_shot(scan, variable=shot.metadata["variable"])
         np.testing.assert_array_equal(again.image, shot.image)
         assert again.metadata == shot.metadata
 
 
 def test_a_usual_bin_holds_fifty_tracks_on_average(scan: Path) -> None:
-    shot = read_radiograph(scan)
+    shot = read_shot(scan)
     assert shot.image.shape == (2, 4)
     assert shot.image.sum() == 432  # 54 in each
     assert shot.metadata["geometry"]["detector_pixel_size"] == pytest.approx(600e-6)
@@ -151,7 +151,7 @@ def test_impossible_ranges_are_refused(scan: Path, text: str) -> None:
 def test_gaps_between_frames_are_reported(tmp_path: Path) -> None:
     frames = snake(4, 4, lambda c, r: [ROUND])
     path = save(tmp_path / "a.cpsa", (4, 4), frames, pitch=1.2)
-    assert "overlap or leave gaps" in str(read_radiograph(path).warnings)
+    assert "overlap or leave gaps" in str(read_shot(path).warnings)
 
 
 @pytest.mark.parametrize(
@@ -225,7 +225,7 @@ def test_the_command_inverts_a_scan(scan: Path, monkeypatch: pytest.MonkeyPatch)
     chosen = "diameter=:12 contrast=:40 bin=100"
     done = shadowinv("invert", scan, "--variable", chosen, "--out", "a.shadowinv")
     assert done.exit_code == 0, done.output
-    image = read_radiograph(scan, variable=chosen).image
+    image = read_shot(scan, variable=chosen).image
     assert image.shape == (12, 24)
     np.testing.assert_allclose(read(Path("a.shadowinv"))["residual"].shape, image.shape)
     assert rerun("a.shadowinv").is_identical

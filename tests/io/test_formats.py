@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import napari_shadowinv
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io import formats, read, read_radiograph
+from napari_shadowinv.io import formats, read, read_shot
 from napari_shadowinv.io.formats import FORMATS, Format, format_of, function
 
 SOURCE = Path(napari_shadowinv.__file__).parent
@@ -99,7 +99,7 @@ def test_zarr_store_of_another_program_is_named(tmp_path: Path) -> None:
 def test_tiff_with_the_ending_of_raw_pixels_is_read(tmp_path: Path) -> None:
     for suffix in (".raw", ".img"):
         tifffile.imwrite(tmp_path / f"shot{suffix}", np.ones((4, 5), np.uint8))
-        assert read_radiograph(tmp_path / f"shot{suffix}").image.shape == (4, 5)
+        assert read_shot(tmp_path / f"shot{suffix}").image.shape == (4, 5)
 
 
 def test_a_format_is_added_by_its_reader_and_its_entry(
@@ -113,6 +113,6 @@ def test_a_format_is_added_by_its_reader_and_its_entry(
     monkeypatch.setattr(formats, "FORMATS", (new, *FORMATS))
     path = tmp_path / "shot.tif"  # the content counts
     path.write_bytes(b"NEW!" + np.arange(6, dtype="<u2").tobytes())
-    shot = read_radiograph(path)
+    shot = read_shot(path)
     np.testing.assert_array_equal(shot.image, [[0, 1, 2], [3, 4, 5]])
     assert (shot.metadata["kind"], shot.metadata["bits"]) == ("new", 12)

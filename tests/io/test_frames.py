@@ -12,7 +12,7 @@ import tifffile
 from scipy.io import savemat
 
 from napari_shadowinv import FileFormatError, InputError, read
-from napari_shadowinv.io import hdf5, read_radiograph
+from napari_shadowinv.io import hdf5, read_shot
 from napari_shadowinv.io.frames import FileFrame, find_frames, images_in, left_out_of
 from napari_shadowinv.io.read_write import read_frame
 
@@ -67,7 +67,7 @@ def test_index_selects_one_frame(nexus, loaded):
     np.testing.assert_array_equal(shot.image, CUBE[1, 2])
     assert shot.metadata["variable"] == "/entry/data/data[1,2]"
     assert loaded == [35]
-    again = read_radiograph(nexus, variable="/entry/data/data[1,2]")
+    again = read_shot(nexus, variable="/entry/data/data[1,2]")
     np.testing.assert_array_equal(again.image, CUBE[1, 2])
 
 
@@ -101,7 +101,7 @@ def test_wrong_name_or_index_is_refused(nexus, name, words):
 
 def test_many_images_are_no_radiograph(nexus):
     with pytest.raises(FileFormatError, match=r"6 frames: .* such as 'entry/data/data\[0,0\]'"):
-        read_radiograph(nexus, variable="entry/data/data")
+        read_shot(nexus, variable="entry/data/data")
 
 
 def test_frame_that_is_not_written_yet_is_refused(tmp_path):
@@ -213,7 +213,7 @@ def test_burst_in_one_file_is_a_stack(tmp_path, name):
     np.testing.assert_array_equal(frames.image, planes)
     assert str(frames.name[4].values) == f"{name}[4]"
     with pytest.raises(FileFormatError, match="holds 6 frames"):
-        read_radiograph(path)
+        read_shot(path)
 
 
 def test_frame_of_a_matlab_stack_has_an_address(tmp_path):

@@ -12,7 +12,7 @@ import pytest
 
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io import read, read_radiograph, write
+from napari_shadowinv.io import read, read_shot, write
 
 IMAGE = np.random.default_rng(0).normal(100, 10, (20, 24))
 
@@ -65,7 +65,7 @@ def test_pradformat_and_any_array_by_name(folder: Path, place: str) -> None:
             read(path, variable=variable)
         assert "image" in str(error.value)
     for variable in ("own", "again", "/own"):
-        np.testing.assert_array_equal(read_radiograph(path, variable=variable).image, IMAGE)
+        np.testing.assert_array_equal(read_shot(path, variable=variable).image, IMAGE)
 
 
 @pytest.mark.parametrize("place", ELSEWHERE)

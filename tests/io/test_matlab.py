@@ -8,7 +8,7 @@ import pytest
 from scipy.io import savemat
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.io.files import sha256
 
 RAMP = np.arange(6 * 9).reshape(6, 9)
@@ -40,7 +40,7 @@ def test_array_comes_back(tmp_path: Path, layout: str, dtype: str) -> None:
         save_73(path, {"shot": values})
     else:
         savemat(path, {"shot": values}, do_compression=layout == "7")
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     np.testing.assert_array_equal(radiograph.image, values)
     assert radiograph.image.dtype == np.float64
     assert radiograph.metadata["variable"] == "shot"
@@ -59,7 +59,7 @@ def test_scalars_vectors_and_colours_are_no_candidates(tmp_path: Path, layout: s
     else:
         foreign = {"note": "film 3", "s": {"x": RAMP}, "cell": np.array([1, "a"], dtype=object)}
         savemat(path, {**foreign, **arrays}, do_compression=layout == "7")
-    np.testing.assert_array_equal(read_radiograph(path).image, RAMP / 2)
+    np.testing.assert_array_equal(read_shot(path).image, RAMP / 2)
 
 
 @pytest.mark.parametrize("layout", ["5", "7", "7.3"])
@@ -71,24 +71,24 @@ def test_several_candidates_are_listed_and_chosen(tmp_path: Path, layout: str) -
     else:
         savemat(path, arrays, do_compression=layout == "7")
     with pytest.raises((InputError, FileFormatError), match="2 images: expected one, or") as error:
-        read_radiograph(path)
+        read_shot(path)
     assert f"'shot' (6×9 {'float64' if layout == '7.3' else 'double'})" in str(error.value)
     assert "'beam' (4×5 uint16)" in str(error.value)
-    np.testing.assert_array_equal(read_radiograph(path, variable="beam").image, np.ones((4, 5)))
+    np.testing.assert_array_equal(read_shot(path, variable="beam").image, np.ones((4, 5)))
     with pytest.raises(InputError, match=r"has no .* 'Shot': it holds "):
-        read_radiograph(path, variable="Shot")
+        read_shot(path, variable="Shot")
 
 
 def test_variables_beside_an_image_of_73_do_not_change_it(tmp_path: Path) -> None:
     offset = {name: np.full((1, 1), 7.0) for name in ("offset", "shot_scaling_factor")}
     path = save_73(tmp_path / "shot.mat", {"shot": RAMP * 0.5, **offset})
-    np.testing.assert_array_equal(read_radiograph(path).image, RAMP / 2)
+    np.testing.assert_array_equal(read_shot(path).image, RAMP / 2)
 
 
 def test_variable_of_another_kind_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", RAMP)
     with pytest.raises(InputError, match="is neither a MATLAB nor an HDF5 file"):
-        read_radiograph(tmp_path / "a.npy", variable="shot")
+        read_shot(tmp_path / "a.npy", variable="shot")
 
 
 def test_long_names_and_many_zeros_come_back(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_long_names_and_many_zeros_come_back(tmp_path: Path) -> None:
     name = "a" * 31
     savemat(path, {name: np.zeros((2000, 1000))}, do_compression=True)
     assert path.stat().st_size < 20_000
-    assert read_radiograph(path, variable=name).image.shape == (2000, 1000)
+    assert read_shot(path, variable=name).image.shape == (2000, 1000)
 
 
 def test_big_endian_file_comes_back(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_big_endian_file_comes_back(tmp_path: Path) -> None:
     body += struct.pack(">HH4s", 4, 1, b"shot") + element(4, RAMP.T.astype(">u2").tobytes())
     path = tmp_path / "shot.mat"
     path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI" + element(14, body))
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     np.testing.assert_array_equal(radiograph.image, RAMP)
     assert radiograph.metadata["bits"] == 64
 
@@ -117,12 +117,12 @@ def test_complex_values_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "shot.mat"
     savemat(path, {"shot": RAMP * 1j})
     with pytest.raises(FileFormatError, match=r"6×9 double\) as complex128 values"):
-        read_radiograph(path)
+        read_shot(path)
 
 
 def test_matlab_marks_turn_an_array_of_plain_hdf5(tmp_path: Path) -> None:
     path = save_73(tmp_path / "shot.h5", {"shot": RAMP.astype(float)}, userblock=0)
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     assert radiograph.metadata["kind"] == "hdf5"
     np.testing.assert_array_equal(radiograph.image, RAMP)
 
@@ -135,7 +135,7 @@ def test_pradformat_stays_pradformat(tmp_path: Path, userblock: int) -> None:
         file.attrs["object_type"] = "radiograph"
         file.attrs["pixel_width"] = 1e-4
     assert path.read_bytes()[:userblock] == head
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     assert radiograph.metadata["kind"] == "pradformat"
     # pradformat stores rows first.
     np.testing.assert_array_equal(radiograph.image, RAMP.T)

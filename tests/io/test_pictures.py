@@ -12,7 +12,7 @@ from PIL import Image, PngImagePlugin
 
 from napari_shadowinv import Recipe, run
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io import read, read_radiograph
+from napari_shadowinv.io import read, read_shot
 from napari_shadowinv.io.images import read_scan
 from napari_shadowinv.pipeline.inversion_run import picture_mask
 
@@ -27,7 +27,7 @@ def turned(orientation: int) -> Image.Exif:
 
 
 def codes(path: Path) -> list[str]:
-    return [caution.code for caution in read_radiograph(path).warnings]
+    return [caution.code for caution in read_shot(path).warnings]
 
 
 @pytest.mark.parametrize(
@@ -170,5 +170,5 @@ def test_size_of_a_pixel_is_offered_unless_it_may_be_a_default(
 ) -> None:
     path = tmp_path / f"shot{suffix}"
     Image.fromarray(SHOT).save(path, dpi=(dpi, dpi))
-    stated = read_radiograph(path).metadata.get("geometry", {}).get("detector_pixel_size")
+    stated = read_shot(path).metadata.get("geometry", {}).get("detector_pixel_size")
     assert stated == (None if size is None else pytest.approx(size, rel=1e-3))

@@ -10,7 +10,7 @@ from helpers.public_data import public_file
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
-from napari_shadowinv.io import read, read_radiograph, write
+from napari_shadowinv.io import read, read_shot, write
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
@@ -38,7 +38,7 @@ def radiograph_file(path: Path, **changes: object) -> Path:
 
 
 def test_complete_radiograph_brings_its_setup(tmp_path: Path) -> None:
-    radiograph = read_radiograph(radiograph_file(tmp_path / "shot.h5"))
+    radiograph = read_shot(radiograph_file(tmp_path / "shot.h5"))
     np.testing.assert_array_equal(radiograph.image, IMAGE)
     assert radiograph.setup == ProtonSetup(
         energy=14.7,
@@ -59,7 +59,7 @@ def test_distances_of_version_0_1_are_measured_from_the_image(tmp_path: Path) ->
         ROI_distance=0.3,
         spec_name=b"D 1+",
     )
-    setup = read_radiograph(path).setup
+    setup = read_shot(path).setup
     assert isinstance(setup, ProtonSetup)
     assert setup.source_object_distance == pytest.approx(0.01)
     assert setup.object_image_distance == 0.3
@@ -72,7 +72,7 @@ def test_distances_of_version_0_1_are_measured_from_the_image(tmp_path: Path) ->
 def test_an_incomplete_radiograph_keeps_its_geometry(
     tmp_path: Path, changes: dict[str, object]
 ) -> None:
-    radiograph = read_radiograph(radiograph_file(tmp_path / "shot.h5", **changes))
+    radiograph = read_shot(radiograph_file(tmp_path / "shot.h5", **changes))
     assert radiograph.setup is None
     assert radiograph.metadata["geometry"]["detector_pixel_size"] == 3.1e-4
     assert radiograph.metadata["geometry"]["object_image_distance"] == 0.3
@@ -98,7 +98,7 @@ def test_mistakes_in_the_file_are_named(tmp_path: Path) -> None:
     ],
 )
 def test_published_examples(name: str, side: int, width: float, mean: float) -> None:
-    radiograph = read_radiograph(public_file(f"pradformat/{name}"))
+    radiograph = read_shot(public_file(f"pradformat/{name}"))
     geometry = radiograph.metadata["geometry"]
     assert radiograph.image.shape == (side, side)
     assert radiograph.image.mean() == pytest.approx(mean, rel=0.01)

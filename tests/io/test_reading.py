@@ -13,7 +13,7 @@ from helpers.public_data import load_donut, public_file, public_names
 from helpers.toroid import noisy_toroid_image, toroid_image
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io import read, read_dataset, read_radiograph, read_toml
+from napari_shadowinv.io import read, read_dataset, read_shot, read_toml
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.images import film_warnings
 from napari_shadowinv.shot import Shot
@@ -31,7 +31,7 @@ def test_values_of_any_depth_come_back(tmp_path: Path, dtype: str, suffix: str) 
     values = (RAMP * 3 - (20 if np.dtype(dtype).kind in "if" else 0)).astype(dtype)
     path = tmp_path / f"shot{suffix}"
     tifffile.imwrite(path, values) if suffix == ".tif" else np.save(path, values)
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     assert radiograph.image.dtype == np.float64
     np.testing.assert_array_equal(radiograph.image, values)
     assert radiograph.metadata["bits"] == 8 * np.dtype(dtype).itemsize
@@ -50,7 +50,7 @@ def test_grey_pictures_come_back(tmp_path: Path, suffix: str, dtype: Any) -> Non
     values = (RAMP * (1000 if dtype == np.uint16 else 4)).astype(dtype)
     path = tmp_path / f"shot{suffix}"
     iio.imwrite(path, values)
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     np.testing.assert_array_equal(radiograph.image, values)
     assert radiograph.metadata["bits"] == 8 * np.dtype(dtype).itemsize
 
@@ -58,7 +58,7 @@ def test_grey_pictures_come_back(tmp_path: Path, suffix: str, dtype: Any) -> Non
 def test_uniform_jpeg_comes_back(tmp_path: Path) -> None:
     path = tmp_path / "shot.jpg"
     iio.imwrite(path, np.full((16, 24), 77, np.uint8))
-    np.testing.assert_array_equal(read_radiograph(path).image, np.full((16, 24), 77.0))
+    np.testing.assert_array_equal(read_shot(path).image, np.full((16, 24), 77.0))
 
 
 @pytest.mark.parametrize(
@@ -78,14 +78,14 @@ def test_channel_of_colour_image(
 ) -> None:
     path = tmp_path / f"film{suffix}"
     iio.imwrite(path, colours())
-    np.testing.assert_array_equal(read_radiograph(path, channel=channel).image, expected)
+    np.testing.assert_array_equal(read_shot(path, channel=channel).image, expected)
 
 
 def test_planar_colour_tiff(tmp_path: Path) -> None:
     path = tmp_path / "film.tif"
     planes = np.moveaxis(colours(), -1, 0)
     tifffile.imwrite(path, planes, photometric="rgb", planarconfig="separate")
-    np.testing.assert_array_equal(read_radiograph(path, channel="blue").image, 3 * RAMP)
+    np.testing.assert_array_equal(read_shot(path, channel="blue").image, 3 * RAMP)
 
 
 def test_colour_needs_a_choice_that_exists(tmp_path: Path) -> None:
@@ -105,13 +105,13 @@ def test_equal_channels_are_grey(tmp_path: Path, alpha: bool) -> None:
     planes = [RAMP] * 3 + [np.full_like(RAMP, 200)] * alpha
     path = tmp_path / "grey.png"
     iio.imwrite(path, np.stack(planes, axis=-1).astype(np.uint8))
-    np.testing.assert_array_equal(read_radiograph(path).image, RAMP)
+    np.testing.assert_array_equal(read_shot(path).image, RAMP)
 
 
 def test_name_may_lie(tmp_path: Path) -> None:
     path = tmp_path / "shot.png"
     tifffile.imwrite(path, RAMP.astype(np.uint16))
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     assert radiograph.metadata["kind"] == "tiff"
     np.testing.assert_array_equal(radiograph.image, RAMP)
 
@@ -192,7 +192,7 @@ def test_any_hdf5_gives_the_array_that_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"with 3 images: .* 'shots/beam' \(6×9 uint16\)"):
         read(path)
     for name, expected in (("shots/3/image", RAMP), ("shots/beam", RAMP + 1)):
-        radiograph = read_radiograph(path, variable=name)
+        radiograph = read_shot(path, variable=name)
         np.testing.assert_array_equal(radiograph.image, expected)
         assert radiograph.metadata["variable"] == name
     for wrong, nearest in (("shots/bean", "shots/beam"), ("shots/3/imag", "shots/3/image")):
@@ -201,7 +201,7 @@ def test_any_hdf5_gives_the_array_that_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="holds 'note' as text"):
         read(path, variable="note")
     with pytest.raises(FileFormatError, match=r"holds 2 frames: expected one image"):
-        read_radiograph(path, variable="stack")
+        read_shot(path, variable="stack")
     path.write_bytes(path.read_bytes()[:-2000])
     with pytest.raises(FileFormatError, match="could not be read"):
         read(path, variable="shots/3/image")
@@ -264,7 +264,7 @@ def test_real_film_scan() -> None:
     path = public_file("rcf/RCF_18H.tif")
     with pytest.raises(InputError, match="colour image with 3 channels"):
         read(path)
-    red = read_radiograph(path, channel="red")
+    red = read_shot(path, channel="red")
     assert red.image.shape == (548, 1022)
     assert red.metadata["bits"] == 16
     np.testing.assert_array_equal(red.image, tifffile.imread(path)[..., 0])
@@ -293,8 +293,8 @@ def test_the_donut_gets_no_film_warning() -> None:
 
 
 def test_real_shadowgram(burner: list[Path]) -> None:
-    assert not any(read_radiograph(path).warnings for path in burner)
-    radiograph = read_radiograph(burner[0])
+    assert not any(read_shot(path).warnings for path in burner)
+    radiograph = read_shot(burner[0])
     assert radiograph.image.shape == (928, 1152)
     assert np.percentile(radiograph.image, 0.1) >= 54
     assert abs(radiograph.image.mean() - 76.5) < 0.1

@@ -6,7 +6,7 @@ import pytest
 from helpers.public_data import public_file
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io import read, read_radiograph
+from napari_shadowinv.io import read, read_shot
 from napari_shadowinv.io.formats import kind_of
 from napari_shadowinv.physics.setup import ProtonSetup
 
@@ -24,7 +24,7 @@ def lines(path: Path, *rows: str) -> Path:
 def test_savetxt_comes_back(tmp_path: Path, suffix: str, newline: str, delimiter: str) -> None:
     path = tmp_path / f"shot{suffix}"
     np.savetxt(path, VALUES, delimiter=delimiter, newline=newline, fmt="%.17g", header="a shot")
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     np.testing.assert_array_equal(radiograph.image, VALUES)
     assert radiograph.metadata["kind"] == "text"
     assert radiograph.setup is None
@@ -39,7 +39,7 @@ def test_semicolons_separate_numbers_with_a_decimal_comma(tmp_path: Path) -> Non
 def test_byte_order_mark_blank_lines_and_last_commas(tmp_path: Path) -> None:
     path = tmp_path / "shot.csv"
     path.write_bytes(b"\xef\xbb\xbf1,2,\r\n\r\n3,4e1,\r\n\r\n")
-    np.testing.assert_array_equal(read_radiograph(path).image, [[1, 2], [3, 40]])
+    np.testing.assert_array_equal(read_shot(path).image, [[1, 2], [3, 40]])
 
 
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ def test_byte_order_mark_blank_lines_and_last_commas(tmp_path: Path) -> None:
 )
 def test_comments_tell_the_setup(tmp_path: Path, comments: tuple[str, ...]) -> None:
     path = lines(tmp_path / "shot.txt", "# PROBLEM, run 3: 2019-05-01", *comments, "1 2", "3 4")
-    setup = read_radiograph(path).setup
+    setup = read_shot(path).setup
     assert isinstance(setup, ProtonSetup)
     assert setup.energy == pytest.approx(14.7)
     assert setup.source_object_distance == pytest.approx(0.014)
@@ -73,7 +73,7 @@ def test_comments_tell_the_setup(tmp_path: Path, comments: tuple[str, ...]) -> N
 def test_latin_comment_and_part_of_a_setup(tmp_path: Path) -> None:
     path = tmp_path / "shot.txt"
     path.write_bytes("# pixel_size = 25 µm\n1 2\n3 4\n".encode("latin-1"))
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     assert radiograph.setup is None
     assert radiograph.metadata["geometry"] == {"pixel_size": pytest.approx(25e-6)}
 
@@ -81,7 +81,7 @@ def test_latin_comment_and_part_of_a_setup(tmp_path: Path) -> None:
 def test_comments_in_prose_tell_nothing(tmp_path: Path) -> None:
     comments = ("# energy 3 of 5 shots", "# bin 4", "# shot 17", "# taken: 12:30", "#" * 3_000_000)
     path = lines(tmp_path / "shot.txt", *comments, "1 2", "3 4")
-    assert read_radiograph(path).metadata["geometry"] == {}
+    assert read_shot(path).metadata["geometry"] == {}
 
 
 def test_pradreader_stacks_image_and_reference(tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_pradreader_stacks_image_and_reference(tmp_path: Path) -> None:
         file.write("# flux2D (5, 7)\n# flux2D_ref (5, 7)\n# x-mask 0 % - 100 %\n")
         np.savetxt(file, VALUES, delimiter=",", fmt="%.17g")
         np.savetxt(file, VALUES + 1, delimiter=",", fmt="%.17g")
-    radiograph = read_radiograph(path)
+    radiograph = read_shot(path)
     np.testing.assert_array_equal(radiograph.image, VALUES)
     assert radiograph.source is not None
     np.testing.assert_array_equal(radiograph.source, VALUES + 1)
@@ -115,7 +115,7 @@ SELECTED = ("x-mask 0.0 % - 100.0 %", "y-mask 0.0 % - 100.0 %")
     "header", [ALL, (*ALL[:2], *SELECTED), ("flux2D (5, 7)", "flux2D_ref", "mask")]
 )
 def test_pradreader_stacks_a_mask_too(tmp_path: Path, header: tuple[str, ...]) -> None:
-    radiograph = read_radiograph(pradreader(tmp_path / "input.txt", *header))
+    radiograph = read_shot(pradreader(tmp_path / "input.txt", *header))
     np.testing.assert_array_equal(radiograph.image, VALUES)
     assert radiograph.source is not None
     np.testing.assert_array_equal(radiograph.source, VALUES + 1)
@@ -125,10 +125,10 @@ def test_pradreader_stacks_a_mask_too(tmp_path: Path, header: tuple[str, ...]) -
 
 def test_pradreader_selects_rows_and_columns_by_their_share(tmp_path: Path) -> None:
     header = (*ALL[:2], "x-mask 20 % - 80 %", "y-mask 0.0 % - 100.0 %")
-    mask = read_radiograph(pradreader(tmp_path / "input.txt", *header, blocks=2)).mask
+    mask = read_shot(pradreader(tmp_path / "input.txt", *header, blocks=2)).mask
     assert mask is not None
     np.testing.assert_array_equal(mask.all(axis=1), [False, True, True, True, False])
-    assert read_radiograph(pradreader(tmp_path / "all.txt", *ALL[:2], blocks=2)).mask is None
+    assert read_shot(pradreader(tmp_path / "all.txt", *ALL[:2], blocks=2)).mask is None
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_blocks_unlike_the_header_are_refused(
     tmp_path: Path, header: tuple[str, ...], blocks: int
 ) -> None:
     with pytest.raises(FileFormatError, match=r"rows of 7 numbers, but its header gives flux2D"):
-        read_radiograph(pradreader(tmp_path / "input.txt", *header, blocks=blocks))
+        read_shot(pradreader(tmp_path / "input.txt", *header, blocks=blocks))
 
 
 def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
         file.write("# flux2D (5, 7)\n# mask (5, 7)\n")
         np.savetxt(file, np.vstack([VALUES, VALUES]))
     with pytest.raises(FileFormatError, match="numbers other than 0"):
-        read_radiograph(path)
+        read_shot(path)
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
 )
 def test_mistakes_are_named(tmp_path: Path, rows: tuple[str, ...], message: str) -> None:
     with pytest.raises(FileFormatError, match=message):
-        read_radiograph(lines(tmp_path / "shot.csv", *rows))
+        read_shot(lines(tmp_path / "shot.csv", *rows))
 
 
 def test_impossible_setup_is_named(tmp_path: Path) -> None:
@@ -190,7 +190,7 @@ def test_impossible_setup_is_named(tmp_path: Path) -> None:
         "3 4",
     )
     with pytest.raises(InputError, match=r"shot\.txt: 'energy' is 0"):
-        read_radiograph(path)
+        read_shot(path)
 
 
 def test_text_with_the_ending_of_a_picture_is_refused(tmp_path: Path) -> None:
@@ -200,7 +200,7 @@ def test_text_with_the_ending_of_a_picture_is_refused(tmp_path: Path) -> None:
 
 def test_published_example() -> None:
     path = public_file("prns/target-example.txt")
-    image = read_radiograph(path).image
+    image = read_shot(path).image
     assert image.shape == (128, 128)
     assert image.mean() == pytest.approx(1, rel=1e-3)
     np.testing.assert_array_equal(image, np.loadtxt(path))

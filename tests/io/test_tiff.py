@@ -12,7 +12,7 @@ import tifffile
 from PIL import Image, TiffImagePlugin
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io import read, read_radiograph
+from napari_shadowinv.io import read, read_shot
 from napari_shadowinv.io.images import read_scan
 
 SHOT = np.random.default_rng(0).integers(1, 4000, (24, 32)).astype(np.uint16)
@@ -357,7 +357,7 @@ def test_pixels_that_are_not_square_are_a_caution(
 
 
 def size_in(path: Path) -> float | None:
-    return read_radiograph(path).metadata.get("geometry", {}).get("detector_pixel_size")
+    return read_shot(path).metadata.get("geometry", {}).get("detector_pixel_size")
 
 
 @pytest.mark.parametrize(

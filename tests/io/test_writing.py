@@ -9,7 +9,7 @@ import tifffile
 
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io import read_radiograph, write
+from napari_shadowinv.io import read_shot, write
 from napari_shadowinv.physics.setup import ProtonSetup
 
 Disk = tuple[Path, Callable[[str], bool]]
@@ -19,7 +19,7 @@ IMAGE = np.linspace(0, 7, 30).reshape(5, 6)
 
 def test_image_formats_keep_their_promise(tmp_path: Path) -> None:
     for name, tolerance in (("a.npy", 0), ("a.tif", 1e-7 * 7), ("a.png", 0.5 / 65535 * 7)):
-        values = read_radiograph(write(tmp_path / name, IMAGE)).image
+        values = read_shot(write(tmp_path / name, IMAGE)).image
         scale = 7 / 65535 if name == "a.png" else 1
         np.testing.assert_allclose(values * scale, IMAGE, rtol=0, atol=tolerance)
     assert tifffile.imread(tmp_path / "a.tif").dtype == np.float32

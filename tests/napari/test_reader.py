@@ -38,7 +38,7 @@ def shot() -> np.ndarray:
     return np.random.default_rng(0).uniform(1, 9, (12, 17))
 
 
-def write_radiograph(path: Path, image: np.ndarray, **changes: Any) -> Path:
+def write_shot(path: Path, image: np.ndarray, **changes: Any) -> Path:
     with h5py.File(path, "w") as file:
         file["image"] = image
         file.attrs.update(
@@ -60,7 +60,7 @@ def write_radiograph(path: Path, image: np.ndarray, **changes: Any) -> Path:
 def test_pradformat_opens_with_its_pixels_and_setup(
     viewer: ViewerModel, shot: np.ndarray, tmp_path: Path
 ) -> None:
-    (layer,) = viewer.open(write_radiograph(tmp_path / "d3he.h5", shot), plugin=PLUGIN)
+    (layer,) = viewer.open(write_shot(tmp_path / "d3he.h5", shot), plugin=PLUGIN)
     setup = setup_of(layer)
     assert isinstance(setup, ProtonSetup)
     assert setup.energy == 14.7
@@ -74,7 +74,7 @@ def test_pradformat_opens_with_its_pixels_and_setup(
 def test_pixels_stay_pixels_where_the_magnification_is_unknown(
     viewer: ViewerModel, shot: np.ndarray, tmp_path: Path
 ) -> None:
-    path = write_radiograph(tmp_path / "a.h5", shot)
+    path = write_shot(tmp_path / "a.h5", shot)
     with h5py.File(path, "a") as file:
         del file.attrs["source_object_dist"]
     (layer,) = viewer.open(path, plugin=PLUGIN)
@@ -159,13 +159,13 @@ def test_only_the_first_shot_is_read(
 ) -> None:
     import napari_shadowinv.io
 
-    read, names = napari_shadowinv.io.read_radiograph, []
+    read, names = napari_shadowinv.io.read_shot, []
 
     def watched(path: Path, **keywords: Any) -> Any:
         names.append(path.name)
         return read(path, **keywords)
 
-    monkeypatch.setattr(napari_shadowinv.io, "read_radiograph", watched)
+    monkeypatch.setattr(napari_shadowinv.io, "read_shot", watched)
     ((data, keywords, _),) = read_paths(str(run))
     assert names == ["shot1.tif"]
     viewer.add_image(data, **keywords)  # shows the middle one

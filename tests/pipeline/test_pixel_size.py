@@ -11,7 +11,7 @@ import tifffile
 
 from napari_shadowinv import ProtonSetup, Recipe, run
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import read_radiograph, write
+from napari_shadowinv.io import read_shot, write
 from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.preprocessing import Bin
 
@@ -55,7 +55,7 @@ def toml(path: Path, **entries: Any) -> Path:
 
 
 def test_setup_is_completed_by_the_file_unless_it_states_a_size(path: Path, tmp_path: Path) -> None:
-    geometry = read_radiograph(path).metadata["geometry"]
+    geometry = read_shot(path).metadata["geometry"]
     setup = setup_from(toml(tmp_path / "a.toml", kind="proton", **LENGTHS), geometry)
     assert setup.object_pixel_size == pytest.approx(2e-6)
     own = toml(tmp_path / "b.toml", kind="proton", pixel_size=7e-6, **LENGTHS)
@@ -63,7 +63,7 @@ def test_setup_is_completed_by_the_file_unless_it_states_a_size(path: Path, tmp_
 
 
 def test_size_of_a_pixel_does_not_name_the_beam(path: Path, tmp_path: Path) -> None:
-    geometry = read_radiograph(path).metadata["geometry"]
+    geometry = read_shot(path).metadata["geometry"]
     with pytest.raises(InputError, match="'kind' is missing"):
         setup_from(toml(tmp_path / "a.toml", object_image_distance=0.09), geometry)
 
@@ -71,5 +71,5 @@ def test_size_of_a_pixel_does_not_name_the_beam(path: Path, tmp_path: Path) -> N
 def test_own_images_state_the_pixels_at_the_object(path: Path) -> None:
     setup = ProtonSetup(**LENGTHS, detector_pixel_size=20e-6)
     write(path, SHOT.astype(float), setup=setup, overwrite=True)
-    stated = read_radiograph(path).metadata["geometry"]
+    stated = read_shot(path).metadata["geometry"]
     assert stated == {"pixel_size": pytest.approx(setup.object_pixel_size)}

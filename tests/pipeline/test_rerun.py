@@ -18,7 +18,7 @@ from napari_shadowinv import FitOptions, InputError, InversionOptions, ProtonSet
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InversionCancelled
 from napari_shadowinv.film_doses import FilmDoses
-from napari_shadowinv.io import read_dataset, read_radiograph, write
+from napari_shadowinv.io import read_dataset, read_shot, write
 from napari_shadowinv.io.store import read_stack
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.forward import synthetic_image
@@ -255,7 +255,7 @@ def test_a_mask_in_a_file_that_was_not_used_is_not_used_again(tmp_path: Path) ->
     hidden = np.zeros(SHAPE)
     hidden[:, :20] = 1
     path = pradreader(tmp_path / "shot.txt", np.load(record(tmp_path)[0]), hidden)
-    recorded = read_radiograph(path)
+    recorded = read_shot(path)
     np.testing.assert_array_equal(recorded.mask, hidden == 0)
     first = run(Recipe(options=InversionOptions(n_sites=150)), replace(recorded, mask=None))
     assert first.mask.all()

@@ -29,8 +29,8 @@ from napari_shadowinv.cli._settings import (
 )
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import number_of_sites
-from napari_shadowinv.io import read_radiograph
-from napari_shadowinv.io.pradformat import write_radiograph
+from napari_shadowinv.io import read_shot
+from napari_shadowinv.io.pradformat import write_shot
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline import Cache, read_recipe, run, write_recipe
@@ -359,7 +359,7 @@ def test_run_refuses_inputs_that_do_not_match(
 def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: FloatArray) -> None:
     beam = np.full_like(image, 90)
     savemat(tmp_path / "shots.mat", {"shot": image, "beam": beam})
-    shot = read_radiograph(tmp_path / "shots.mat", variable="shot")
+    shot = read_shot(tmp_path / "shots.mat", variable="shot")
     recipe = Recipe(source=MeasuredSource(variable="beam"), options=OPTIONS)
     assert_same(run(recipe, shot), invert(image, source=beam, options=OPTIONS))
     with pytest.raises(InputError, match="but names no file"):
@@ -408,8 +408,8 @@ def test_a_setup_of_the_shot_precedes_the_recipe_and_that_of_its_file_does_not(
     ours, file, theirs = (
         paper_setup().model_copy(update={"energy": energy}) for energy in (3.0, 9.0, 15.0)
     )
-    write_radiograph(tmp_path / "shot.h5", image, file, "shot")
-    recorded = read_radiograph(tmp_path / "shot.h5")
+    write_shot(tmp_path / "shot.h5", image, file, "shot")
+    recorded = read_shot(tmp_path / "shot.h5")
     recipe, shot = Recipe(setup=theirs, options=OPTIONS), Shot(image, ours)
     assert collect_inputs(recipe, shot).shot.setup == ours
     fits = collect_fit_inputs(recipe.model_copy(update={"source": None}), [shot])

@@ -33,7 +33,7 @@ from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.preprocessing import Bin
-from napari_shadowinv.stack import read_shot
+from napari_shadowinv.stack import read_pixels
 from napari_shadowinv.stack._shots import reader_text
 
 OPTIONS = InversionOptions(n_sites=100)
@@ -322,9 +322,9 @@ def test_store_with_truncated_names_is_refused(night, out):
 
 
 def test_reader_text_has_module_and_choices():
-    assert reader_text(read_shot) == "napari_shadowinv.read_shot"
-    chosen = partial(read_shot, factor=2, channel="red")
-    assert reader_text(chosen) == "napari_shadowinv.read_shot(channel='red', factor=2)"
+    assert reader_text(read_pixels) == "napari_shadowinv.read_pixels"
+    chosen = partial(read_pixels, factor=2, channel="red")
+    assert reader_text(chosen) == "napari_shadowinv.read_pixels(channel='red', factor=2)"
     assert reader_text(np.load) == "numpy.load"
 
 

@@ -20,7 +20,7 @@ from napari_shadowinv._system.safety import LIMIT_VARIABLE, as_file_errors, size
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 from napari_shadowinv.film import Calibration
 from napari_shadowinv.io import read, read_toml
-from napari_shadowinv.io.read_write import read_radiograph
+from napari_shadowinv.io.read_write import read_shot
 
 IMAGE = np.random.default_rng(0).poisson(300, (40, 50)).astype(np.uint16)
 
@@ -131,7 +131,7 @@ def test_oversized_content_is_refused_with_a_way_to_allow_it(
     with pytest.raises(FileFormatError, match=f"expands to {size} GB .* {LIMIT_VARIABLE}"):
         read(path)
     monkeypatch.setenv(LIMIT_VARIABLE, "1")
-    assert read_radiograph(path).image.shape == IMAGE.shape
+    assert read_shot(path).image.shape == IMAGE.shape
 
 
 def test_a_chunk_larger_than_its_array_counts(tmp_path: Path) -> None:

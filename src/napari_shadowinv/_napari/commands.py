@@ -19,7 +19,7 @@ from napari_shadowinv._napari.events import without_proxy
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, main_layers
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.preferences import use_preferred_threads
-from napari_shadowinv._napari.shots import radiograph_of, shot_layer
+from napari_shadowinv._napari.shots import shot_layer, shot_of_layer
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
@@ -290,7 +290,7 @@ def _select_image(
         steps = [0] * data.ndim if viewer is None else viewer.dims.current_step
         index = tuple(int(step) for step in steps[-data.ndim : -2])
         data, name = data[index], f"{name} {','.join(map(str, index))}"
-    shot, frame = radiograph_of(layer, np.asarray(data)), frame_of(layer)
+    shot, frame = shot_of_layer(layer, np.asarray(data)), frame_of(layer)
     setup, origin = about.setup_of(layer), about.setup_origin_of(layer)
     return _Selection(shot, name, frame, setup, origin, about.role_of(layer))
 

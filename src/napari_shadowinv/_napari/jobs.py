@@ -17,7 +17,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.layer_metadata import KEY, Frame, Result, frame_of, result_of, role_of
 from napari_shadowinv._napari.layers import LayerData, result_layers
-from napari_shadowinv._napari.shots import load_radiograph
+from napari_shadowinv._napari.shots import shot_in_memory
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
@@ -210,7 +210,7 @@ class InversionJob(ImageJob):
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Inversion:
         return run(
             self.recipe,
-            load_radiograph(self.shot, "the image", "the source"),
+            shot_in_memory(self.shot, "the image", "the source"),
             on_progress=on_progress,
             should_stop=should_stop,
             cache=self.cache,
@@ -283,7 +283,7 @@ class FitJob(ImageJob):
         """Load the images, apply the recipe's steps, and fit."""
         names = [f"'{name}'" for name in self.names]
         shots = [
-            replace(load_radiograph(shot, name, f"the source of {name}"), name=name)
+            replace(shot_in_memory(shot, name, f"the source of {name}"), name=name)
             for shot, name in zip(self.shots, names, strict=True)
         ]
         return run_fit(self.recipe, shots, on_progress=on_progress, should_stop=should_stop)

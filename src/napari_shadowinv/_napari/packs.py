@@ -28,7 +28,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.film import Pack, read_corners, write_corners
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.film_doses import FilmDoses
-from napari_shadowinv.io import read_radiograph, replacing, write
+from napari_shadowinv.io import read_shot, replacing, write
 from napari_shadowinv.io.formats import TIFF
 from napari_shadowinv.pipeline import run_film
 
@@ -228,7 +228,7 @@ class PackJob(Job):
                 usable = ~by_hand[k]
                 mask_file = layers[k].mask
                 if mask_file is not None:
-                    mask = read_radiograph(mask_file).image > 0
+                    mask = read_shot(mask_file).image > 0
                     if mask.shape != usable.shape:
                         continue  # `run_film` reports it
                     usable &= mask

@@ -16,7 +16,7 @@ from napari_shadowinv._napari.viewer_sync import (
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import join_address, split_address
-from napari_shadowinv.io.formats import HDF5, RADIOGRAPH_SUFFIXES, RESULT, STORE, format_of
+from napari_shadowinv.io.formats import HDF5, IMAGE_SUFFIXES, RESULT, STORE, format_of
 from napari_shadowinv.io.frames import images_in, is_pattern, left_out_of, matching_files
 
 _MAX_IMAGES = 8  # of one file that are opened as layers
@@ -47,7 +47,7 @@ def _can_read(path: Path) -> bool:
 
 
 def _is_image_name(path: Path) -> bool:
-    return path.suffix.lower() in RADIOGRAPH_SUFFIXES
+    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 @notify_errors(otherwise=lambda: [(None,)])  # napari then adds no layer
@@ -99,7 +99,7 @@ def _read_file(file: Path, variable: str | None) -> list[Any]:
 
 def _read_content(path: Path, array: str) -> list[Any]:
     from napari_shadowinv._napari.result_files import layers_of_dataset
-    from napari_shadowinv._napari.shots import frame_layers, radiograph_layers
+    from napari_shadowinv._napari.shots import frame_layers, layers_of_shot
     from napari_shadowinv.io import read
     from napari_shadowinv.io.frames import FRAMES_FORMAT
     from napari_shadowinv.shot import Shot
@@ -108,7 +108,7 @@ def _read_content(path: Path, array: str) -> list[Any]:
     if isinstance(content, Shot):
         for caution in content.warnings:
             show_caution(f"{path.name}: {caution.text}")
-        return radiograph_layers(content, array)
+        return layers_of_shot(content, array)
     if content.attrs.get("format") == FRAMES_FORMAT:
         return frame_layers(content, array or split_address(path)[0].stem)
     layers = layers_of_dataset(content, path.stem)

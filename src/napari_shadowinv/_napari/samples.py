@@ -10,7 +10,7 @@ import numpy as np
 from napari_shadowinv import io
 from napari_shadowinv._napari.layer_metadata import CAME_WITH, SOURCE
 from napari_shadowinv._napari.layers import LayerData
-from napari_shadowinv._napari.shots import lazy_stack, radiograph_layers, shot_layer
+from napari_shadowinv._napari.shots import layers_of_shot, lazy_stack, shot_layer
 from napari_shadowinv._napari.viewer_sync import notify_errors
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.io.public_images import fetch_burner
@@ -71,7 +71,7 @@ def two_energies() -> LayerData:
     for seed, (setup, level) in enumerate(zip(setups, _FILMS.values(), strict=True)):
         # Fields displace in inverse proportion to the momentum.
         image = _counts_image(truth * first.momentum / setup.momentum, level * beam, seed)
-        layers += radiograph_layers(Shot(image, setup=setup), f"{setup.energy:g} MeV")
+        layers += layers_of_shot(Shot(image, setup=setup), f"{setup.energy:g} MeV")
     return layers
 
 
@@ -93,8 +93,8 @@ def wakefield_run() -> LayerData:
 @notify_errors(otherwise=lambda: [(np.empty((0, 1, 1)), {"channel_axis": 0}, "image")])
 def burner() -> LayerData:
     """Shadowgram of an alcohol burner's plume with its reference beam, downloaded once."""
-    reference, frame = (io.read_radiograph(path) for path in fetch_burner())
-    return radiograph_layers(replace(frame, source=reference.image), "burner")
+    reference, frame = (io.read_shot(path) for path in fetch_burner())
+    return layers_of_shot(replace(frame, source=reference.image), "burner")
 
 
 def _toroid_of(peak: float) -> phantoms.Phantom:
@@ -114,7 +114,7 @@ def _proton_shot(
     lit = (light > 0) | (synthetic_image(phantom.displacement, light) > 0)
     mask = None if lit.all() else lit
     shot = Shot(image, setup=phantoms.paper_setup(), source=source, mask=mask)
-    return radiograph_layers(shot, name)
+    return layers_of_shot(shot, name)
 
 
 def _counts_image(displacement: FloatArray, source: FloatArray, seed: int) -> FloatArray:

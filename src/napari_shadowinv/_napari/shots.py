@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 
-def radiograph_layers(shot: Shot, name: str = "") -> LayerData:
+def layers_of_shot(shot: Shot, name: str = "") -> LayerData:
     """Describe an image, above its undisturbed beam and its mask of unusable pixels."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
     limits = intensity_limits(shot.image)
@@ -102,7 +102,7 @@ def _frame(shot: Shot) -> Frame:
     return frame_for(shot.image.shape, shot.setup, pixel_size=side)
 
 
-def radiograph_of(layer: Any, image: Any, plane: int | None = None) -> Shot:
+def shot_of_layer(layer: Any, image: Any, plane: int | None = None) -> Shot:
     """Return a layer's image or a plane of a stack, perhaps lazy, as a radiograph with its file."""
     metadata = metadata_of(layer)
     path = metadata.get("path") or layer.source.path
@@ -126,19 +126,19 @@ def source_of_shot(
     `plane` is the image's in its stack, `of` the source's. A file of another shot, or of more
     pixels than the image has, is not the source's.
     """
-    beam = radiograph_of(layer, data, of)
+    beam = shot_of_layer(layer, data, of)
     if image is None:
         return beam
     on_image = source_on(layer, data, image)
     is_whole = tuple(on_image.shape) == tuple(data.shape)
-    with_shot = radiograph_of(image, image.data, plane).path
+    with_shot = shot_of_layer(image, image.data, plane).path
     is_own_file = about.role_of(layer) != about.SOURCE or beam.path == with_shot
     if is_whole and is_own_file:
         return beam
     return replace(beam, image=on_image, path=None, metadata={})
 
 
-def load_radiograph(shot: Shot, name: str, source_name: str = "") -> Shot:
+def shot_in_memory(shot: Shot, name: str, source_name: str = "") -> Shot:
     """Return a shot with its image and source in memory, and the checksums of their files."""
     from napari_shadowinv.pipeline.inversion_run import plane_of
 
@@ -147,7 +147,7 @@ def load_radiograph(shot: Shot, name: str, source_name: str = "") -> Shot:
         metadata["sha256"] = sha256(shot.path)
     source = shot.source
     if isinstance(source, Shot):
-        source = load_radiograph(source, source_name)
+        source = shot_in_memory(source, source_name)
     return replace(shot, image=plane_of(shot.image, name), source=source, metadata=metadata)
 
 
@@ -207,7 +207,7 @@ def _first_readable(paths: Sequence[Path]) -> tuple[Shot, int]:
     messages: list[str] = []
     for index, path in enumerate(paths):
         try:
-            return io.read_radiograph(path), index
+            return io.read_shot(path), index
         except (FileFormatError, InputError) as error:
             messages.append(str(error))
     raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {messages[0]}")
@@ -216,7 +216,7 @@ def _first_readable(paths: Sequence[Path]) -> tuple[Shot, int]:
 def _plane_of(path: Path, shape: tuple[int, int]) -> FloatArray:
     """Read a shot of a stack; return zeros for a stray file."""
     try:
-        image = io.read_radiograph(path).image
+        image = io.read_shot(path).image
         if image.shape != shape:
             raise InputError(
                 f"{path} has {image.shape[0]}×{image.shape[1]} pixels, but the first shot has "

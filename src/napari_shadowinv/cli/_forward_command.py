@@ -77,7 +77,7 @@ def forward(
 
     The source is the result's own if the setup is the same, else uniform.
     """
-    from napari_shadowinv.io import is_field_grid, read_radiograph, replacing, write
+    from napari_shadowinv.io import is_field_grid, read_shot, replacing, write
 
     outputs = Outputs(overwrite, quiet)
     path = Path(f"{field.stem}_image{TIFF.suffix}") if out is None else out
@@ -89,7 +89,7 @@ def forward(
     setup = read_setup(flags.setup)
     beam = None
     if flags.source is not None:
-        beam = read_radiograph(flags.source, channel=flags.channel).image
+        beam = read_shot(flags.source, channel=flags.channel).image
     if is_field_grid(field):
         with work_callbacks(quiet) as callbacks:
             traced = _trace(field, setup, beam, flags, chosen, callbacks)
@@ -193,7 +193,7 @@ class Field:
 
 def field_from(path: Path, variable: str | None = None) -> Field:
     """Read a displacement from a result, or from an array in px or px²."""
-    from napari_shadowinv.io import read_dataset, read_radiograph
+    from napari_shadowinv.io import read_dataset, read_shot
     from napari_shadowinv.io.arrays import read_npy
     from napari_shadowinv.io.files import split_address
     from napari_shadowinv.io.hdf5_arrays import read_hdf5
@@ -203,7 +203,7 @@ def field_from(path: Path, variable: str | None = None) -> Field:
     if variable is not None and kind in ("hdf5", "pradformat", "shadowinv"):
         return Field(_displacement(path, read_hdf5(path, variable)))
     if variable is not None or kind == "mat":
-        return Field(_displacement(path, read_radiograph(path, variable=variable).image))
+        return Field(_displacement(path, read_shot(path, variable=variable).image))
     if kind in ("pradformat", "shadowinv"):
         return _field_of_result(path, read_dataset(path))
     if kind == "npy":

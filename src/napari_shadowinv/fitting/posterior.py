@@ -453,8 +453,6 @@ class Posterior:
         return size * float((eigenvectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
 
 
-
-
 def draw_variations(
     scene: Scene, length: float, count: int, rng: np.random.Generator, waves: int = 60
 ) -> FloatArray:

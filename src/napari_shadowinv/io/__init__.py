@@ -1,6 +1,6 @@
 """Files: radiographs in, results out, a module for each family of formats.
 
-- read an image or a result: `read`; only one of them: `read_radiograph`, `read_dataset`
+- read an image or a result: `read`; only one of them: `read_shot`, `read_dataset`
 - the tracks of a scan of CR-39: `read_tracks`
 - an image with its metadata: `Shot`; sum its pixels: `Shot.bin_pixels`
 - write a result or an image: `write`; check the path beforehand: `check_output`

@@ -1,7 +1,7 @@
 from .cpsa import read_tracks
 from .field_grids import is_field_grid, read_field_grid
 from .files import check_output, replacing
-from .read_write import read, read_dataset, read_radiograph, read_toml, write
+from .read_write import read, read_dataset, read_shot, read_toml, write
 from .store import is_stack, read_stack
 
 __all__ = [
@@ -11,7 +11,7 @@ __all__ = [
     "read",
     "read_dataset",
     "read_field_grid",
-    "read_radiograph",
+    "read_shot",
     "read_stack",
     "read_toml",
     "read_tracks",

@@ -194,7 +194,7 @@ def suffixes_for(kind: ResultKind) -> tuple[str, ...]:
 
 READABLE = _join_titles(each.title for each in FORMATS)
 IMAGE_TITLES = _join_titles(each.title for each in FORMATS if "image" in each.holds)
-RADIOGRAPH_SUFFIXES = _collect_suffixes(each for each in FORMATS if "image" in each.holds)
+IMAGE_SUFFIXES = _collect_suffixes(each for each in FORMATS if "image" in each.holds)
 SCAN_SUFFIXES = _collect_suffixes(each for each in FORMATS if each.is_scan)
 # Endings that napari opens itself: the manifest leaves them out, so that nobody has to choose.
 OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}

@@ -28,7 +28,7 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order, split_address, text_of
-from napari_shadowinv.io.formats import FORMATS, RADIOGRAPH_SUFFIXES, format_of
+from napari_shadowinv.io.formats import FORMATS, IMAGE_SUFFIXES, format_of
 
 if TYPE_CHECKING:
     import xarray
@@ -91,7 +91,7 @@ def images_in(folder: Path) -> list[Path]:
     # A table of settings next to a run of TIFFs is not a shot.
     files = _files_in(folder)
     kinds = Counter(spellings(path.suffix) for path in files)
-    images = [kind for kind in kinds if RADIOGRAPH_SUFFIXES.issuperset(kind)]
+    images = [kind for kind in kinds if IMAGE_SUFFIXES.issuperset(kind)]
     most_frequent = max(sorted(images), key=lambda kind: kinds[kind], default=())
     return in_counting_order(path for path in files if path.suffix.lower() in most_frequent)
 

@@ -189,7 +189,7 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
     _write_object(path, datasets, attributes)
 
 
-def write_radiograph(path: Path, image: AnyArray, setup: Setup, description: str) -> None:
+def write_shot(path: Path, image: AnyArray, setup: Setup, description: str) -> None:
     """Write an image, proportional to the fluence, as a pradformat radiograph."""
     proton_setup = check_pradformat_setup(setup)
     attributes = {

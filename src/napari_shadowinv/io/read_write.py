@@ -1,7 +1,7 @@
 """Read any file, and write results and images.
 
 - any file: `read`, whose content decides on the format, not its name; where only one kind makes
-  sense: `read_radiograph`, `read_dataset`
+  sense: `read_shot`, `read_dataset`
 - one frame of many: `read_frame`
 - a file with options or a setup: `read_toml`
 - a result or an image, whole or not at all: `write`; a result becomes one NetCDF4 file,
@@ -104,9 +104,9 @@ def _read(path: Path, channel: str | int | None, variable: str | None) -> Shot |
 
 
 def read_frame(frame: FileFrame, *, channel: str | int | None = None) -> Shot:
-    """Read one of the frames that a path stands for, with the errors of `read_radiograph`."""
+    """Read one of the frames that a path stands for, with the errors of `read_shot`."""
     if frame.number is None:
-        return read_radiograph(frame.path, channel=channel, variable=frame.variable)
+        return read_shot(frame.path, channel=channel, variable=frame.variable)
     content = _read_file(frame.path, channel, frame.variable, frame.number)
     assert isinstance(content, Shot)
     return content
@@ -177,7 +177,7 @@ def _complete_setup(path: Path, geometry: dict[str, Any]) -> Setup | None:
     return setup_from_dict({"kind": kinds[0], **entries}, str(path))
 
 
-def read_radiograph(
+def read_shot(
     path: str | Path, *, channel: str | int | None = None, variable: str | None = None
 ) -> Shot:
     """Read one image, as by `read`; a result or many images raise a `FileFormatError`, too."""

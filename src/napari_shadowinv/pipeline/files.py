@@ -15,7 +15,7 @@ from typing import Any
 
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv._system.validation import map_paths, validate
-from napari_shadowinv.io import read_radiograph, read_toml
+from napari_shadowinv.io import read_shot, read_toml
 from napari_shadowinv.io.files import write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
 from napari_shadowinv.preprocessing import Recipe
@@ -52,7 +52,7 @@ def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None
 
 def read_part(path: Path, channel: str | None = None, variable: str | None = None) -> Shot:
     """Read an image, and record the part of its file that it comes from."""
-    shot = read_radiograph(path, channel=channel, variable=variable)
+    shot = read_shot(path, channel=channel, variable=variable)
     parts = (("channel", channel), ("variable", variable))
     part = {name: choice for name, choice in parts if choice}
     return replace(shot, metadata={**shot.metadata, **part})

@@ -25,7 +25,7 @@ from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_toml, replacing, write
 from napari_shadowinv.io.files import in_counting_order, make_folder, write_toml
 from napari_shadowinv.io.formats import PRADFORMAT, SCAN_SUFFIXES, SITES, TIFF
-from napari_shadowinv.io.pradformat import write_radiograph
+from napari_shadowinv.io.pradformat import write_shot
 
 LAYERS_TABLE = f"layers{SITES.suffix}"
 _COLUMNS = ("file", "mask", "setup", "energy", "strength", "exclude")
@@ -105,7 +105,7 @@ def write_layers(
             row["file"] = f"{name}{PRADFORMAT.suffix}"
             description = f"Film {k + 1} of a pack, fluence in protons per m² and MeV"
             with replacing(folder / row["file"], overwrite) as temporary:
-                write_radiograph(temporary, fluence, setups[k], description)
+                write_shot(temporary, fluence, setups[k], description)
         else:
             row["file"] = f"{name}{TIFF.suffix}"
             write(folder / row["file"], fluence, overwrite=overwrite)

@@ -36,7 +36,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.inversion.normalise import check_source, mask_unlit, prepare
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.io.files import join_address, sha256, split_address, text_of
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import deflection_warnings, setup_warnings
@@ -465,7 +465,7 @@ def load_shot(shot: AnyShot, name: str) -> Shot:
     """Return a shot with its image in memory, and with the other contents of its file."""
     entered = shot if isinstance(shot, Shot) else Shot(shot)
     if isinstance(entered.image, (str, Path)):
-        return entered.completed_by(read_radiograph(Path(entered.image)))
+        return entered.completed_by(read_shot(Path(entered.image)))
     values, usable = unpack_array(entered.image, name)
     mask = entered.mask if usable is None else join_masks(_pixels(entered.mask, "mask"), usable)
     return replace(entered, image=plane_of(values, name), mask=mask)
@@ -481,7 +481,7 @@ def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
     if shot.source is not None and not shot.has_own_source:
         return load_shot(shot.source, "the source")
     if isinstance(kind, MeasuredSource) and (file := _source_file(kind, shot)) is not None:
-        return read_radiograph(file, variable=kind.variable)
+        return read_shot(file, variable=kind.variable)
     if shot.source is not None and recipe.estimate is None:
         return replace(shot, image=shot.source, source=None, mask=None)
     return None
@@ -497,7 +497,7 @@ def _dark_frame(recipe: Recipe, shot: Shot) -> Shot | None:
         )
     if file is None:
         return None
-    frame = read_radiograph(file)
+    frame = read_shot(file)
     check_shape(f"{file}: the dark frame", frame.shape, shot.shape)
     bad = int((~np.isfinite(frame.image)).sum())
     if bad:
@@ -560,7 +560,7 @@ def _without_gaps(
 
 def picture_mask(path: Path, name: str = "mask", variable: str | None = None) -> BoolArray:
     """Read a mask from a picture that is 0, or transparent, at unusable pixels."""
-    image = read_radiograph(path, channel="mean", variable=variable).image
+    image = read_shot(path, channel="mean", variable=variable).image
     mask: BoolArray = np.nan_to_num(image) != 0
     check_usable(mask, f"{path}: {name}")
     return mask

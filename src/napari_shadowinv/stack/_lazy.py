@@ -27,7 +27,7 @@ from napari_shadowinv.stack._plan import (
     describe_stack,
     dtype_of,
 )
-from napari_shadowinv.stack._shots import ArrayExposure, Exposure, Reader, read_shot
+from napari_shadowinv.stack._shots import ArrayExposure, Exposure, Reader, read_pixels
 from napari_shadowinv.stack._worker import AnyTask
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def invert_stack(
     shots: Any,
     recipe: Recipe | None = None,
     *,
-    reader: Reader = read_shot,
+    reader: Reader = read_pixels,
     variables: Collection[str] | None = None,
 ) -> xarray.Dataset:
     """Describe the inversion of many shots, which dask computes on demand.
@@ -135,7 +135,7 @@ def invert_stack(
         Variables to compute. Default: all.
     reader : callable, optional
         Returns the image of a path; with a keyword ``page`` it also reads multi-page TIFFs.
-        `functools.partial(read_shot, channel="red")` reads one channel of colour images.
+        `functools.partial(read_pixels, channel="red")` reads one channel of colour images.
 
     Returns
     -------

@@ -44,7 +44,7 @@ from napari_shadowinv.stack._shots import (
     find_shots,
     find_source,
     first_image,
-    read_shot,
+    read_pixels,
     reader_text,
     table_shots,
     usual_shape,
@@ -274,7 +274,7 @@ def _reader_of_source(source: Any, measured: MeasuredSource, reader: Reader) -> 
     if measured.variable is not None:
         return partial(reader, variable=measured.variable)
     is_file = isinstance(source, (str, Path)) and os.path.isfile(source)
-    if is_file and getattr(reader, "func", reader) is read_shot:
+    if is_file and getattr(reader, "func", reader) is read_pixels:
         return reader if format_of(Path(source)).named_reader else partial(reader, variable=None)
     return reader
 
@@ -292,7 +292,7 @@ def _describe_table(
     table: Path | Sequence[ShotRow], recipe: Recipe, reader: Reader, shape: tuple[int, int] | None
 ) -> tuple[Shots, Setup | None]:
     """Return the shots of a table, and the setup of the first image."""
-    if getattr(reader, "func", reader) is not read_shot:
+    if getattr(reader, "func", reader) is not read_pixels:
         raise InputError(
             f"received a reader for the table {table}, which names files: leave the reader out"
         )

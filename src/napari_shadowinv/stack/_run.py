@@ -62,7 +62,7 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
 )
 from napari_shadowinv.stack._schedulers import Scheduler, is_local, scheduler_for
-from napari_shadowinv.stack._shots import Exposure, Reader, differences, read_shot
+from napari_shadowinv.stack._shots import Exposure, Reader, differences, read_pixels
 from napari_shadowinv.stack._worker import AnyTask, ShotOutcome, TaskContext
 
 if TYPE_CHECKING:
@@ -155,7 +155,7 @@ def run_stack(
     out: str | Path,
     recipe: Recipe | None = None,
     *,
-    reader: Reader = read_shot,
+    reader: Reader = read_pixels,
     run: RunOptions | None = None,
     scheduler: Any = None,
     on_progress: OnStatus | None = None,

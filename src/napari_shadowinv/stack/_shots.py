@@ -270,7 +270,7 @@ def reader_text(reader: Reader) -> str:
     return f"{package}.{name}" if module.startswith(f"{package}.") else f"{module}.{name}"
 
 
-def read_shot(
+def read_pixels(
     path: Path,
     *,
     page: int | None = None,
@@ -283,7 +283,7 @@ def read_shot(
     Parameters
     ----------
     path, channel, variable
-        As for `napari_shadowinv.io.read_radiograph`, whose errors this raises.
+        As for `napari_shadowinv.io.read_shot`, whose errors this raises.
     page : int, optional
         Of a TIFF with many pages, or frame of the array `variable` in an HDF5 file, from 0.
     warnings : list of Caution, optional
@@ -351,7 +351,7 @@ class Shots:
 
 
 def find_shots(
-    shots: Any, *, reader: Reader = read_shot, shape: tuple[int, int] | None = None
+    shots: Any, *, reader: Reader = read_pixels, shape: tuple[int, int] | None = None
 ) -> Shots:
     """Return references to the shots of an array, of files or of a list."""
     if isinstance(shots, Shots):
@@ -537,7 +537,7 @@ def _common_mask(shots: Any) -> BoolArray | None:
     return common
 
 
-def find_source(source: Any, *, reader: Reader = read_shot) -> AnyArray | Shots | None:
+def find_source(source: Any, *, reader: Reader = read_pixels) -> AnyArray | Shots | None:
     """Return the undisturbed beam as one image, or as many."""
     if source is None:
         return None

@@ -54,7 +54,7 @@ from napari_shadowinv.stack._shots import (
     NoShotError,
     Reader,
     Shots,
-    read_shot,
+    read_pixels,
 )
 from napari_shadowinv.stack._status_file import status_file
 from napari_shadowinv.stack._worker import ShotOutcome
@@ -297,7 +297,7 @@ def watch_stack(
     out: str | Path,
     recipe: Recipe | None = None,
     *,
-    reader: Reader = read_shot,
+    reader: Reader = read_pixels,
     watch: WatchOptions | None = None,
     on_progress: OnStatus | None = None,
     should_stop: ShouldStop | None = None,

@@ -7,7 +7,7 @@ import pytest
 from napari.layers import Image
 
 from napari_shadowinv._napari.widgets._inputs import SetupPicker
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.physics.setup import ProtonSetup
 
 
@@ -27,7 +27,7 @@ def test_sizes_in_the_file_begin_a_setup(tmp_path, qtbot, is_by_us):
     """`dr` of a text image is its pixel at the detector; napari itself knows nothing of it."""
     path = tmp_path / "shot.txt"
     np.savetxt(path, np.ones((8, 9)), header="pixel_width: 2.5e-05\nobject_image_dist: 0.1")
-    geometry = read_radiograph(path).metadata["geometry"]
+    geometry = read_shot(path).metadata["geometry"]
     assert geometry["detector_pixel_size"] == 2.5e-5
     layer = Image(np.ones((8, 9)), name="shot")
     if is_by_us:

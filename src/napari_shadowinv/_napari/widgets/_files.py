@@ -20,7 +20,7 @@ from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import dataset_to_save, layers_of_result, missing_layers
 from napari_shadowinv._napari.run import Outcome
-from napari_shadowinv._napari.shots import radiograph_layers
+from napari_shadowinv._napari.shots import layers_of_shot
 from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._layers import new_crop, new_mask
@@ -238,7 +238,7 @@ class FitRecipeButton(RecipeButton):
         tool.instrument.restore(recipe.instrument.model_dump())
         tool.show_choices(choices)
         if beam is not None:
-            (tool.source.layers.layer,) = add_layers(tool.viewer, radiograph_layers(beam)[-1:])
+            (tool.source.layers.layer,) = add_layers(tool.viewer, layers_of_shot(beam)[-1:])
         tool.source.show(recipe.source, choices.beam)
         _show_mask(tool.masks, usable, tool.viewer, image)
 

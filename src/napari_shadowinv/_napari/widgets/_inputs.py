@@ -16,7 +16,7 @@ from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.preferences import preference
-from napari_shadowinv._napari.shots import radiograph_of, source_of_shot
+from napari_shadowinv._napari.shots import shot_of_layer, source_of_shot
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import RecipeButton
@@ -24,7 +24,7 @@ from napari_shadowinv._napari.widgets._results import describe_inputs
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import read_radiograph
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.options import (
     ASSUMED_BEAM,
     BEAM_SOURCES,
@@ -265,7 +265,7 @@ class SetupPicker(QWidget):
         path = self._layer.source.path
         if metadata is None and path is not None and self._layer.ndim == 2:
             with suppress(InputError, OSError):
-                metadata = read_radiograph(path).metadata
+                metadata = read_shot(path).metadata
         return dict((metadata or {}).get("geometry", {}))
 
     def _fill_in(self, form: forms.ModelForm) -> bool:
@@ -395,7 +395,7 @@ class SourcePicker(forms.ModelPicker):
             raise InputError(
                 f"no source was supplied with '{image.name}': choose another kind of source"
             )
-        return radiograph_of(image, supplied)
+        return shot_of_layer(image, supplied)
 
     def measured_for_each(self, images: Sequence[tuple[Any, int | None]]) -> list[Shot | None]:
         """Return the measured sources of a fit's images, each a layer and its plane; or None."""

@@ -12,7 +12,7 @@ from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, FitJob, TimeEstimate
 from napari_shadowinv._napari.run import Run
-from napari_shadowinv._napari.shots import radiograph_of
+from napari_shadowinv._napari.shots import shot_of_layer
 from napari_shadowinv._napari.widgets import _inputs as inputs
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._files import FitRecipeButton, result_buttons
@@ -234,7 +234,7 @@ class FitImages(ToolPanel):
 
     def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[Shot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
-        images = [radiograph_of(row.layer, row.data, row.plane) for row in rows]
+        images = [shot_of_layer(row.layer, row.data, row.plane) for row in rows]
         sources = self.source.measured_for_each([(row.layer, row.plane) for row in rows])
         factors = self._known_brightness(rows)
         return tuple(

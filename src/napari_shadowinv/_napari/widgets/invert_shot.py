@@ -14,7 +14,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.run import Run
-from napari_shadowinv._napari.shots import load_radiograph, radiograph_of
+from napari_shadowinv._napari.shots import shot_in_memory, shot_of_layer
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS, show_caution
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _panels as panels
@@ -163,7 +163,7 @@ class InvertShot(InversionInputs, panels.ToolPanel):
         self.source.check(mask)
         warnings, hidden = layers.warnings_of(layer), self.hidden_from_source(layer)
         shot = replace(
-            radiograph_of(layer, image),
+            shot_of_layer(layer, image),
             warnings=warnings,
             mask=mask,
             source_mask=hidden,
@@ -383,7 +383,7 @@ class SourceJob(jobs.Job):
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FloatArray:
         report = Reporter(on_progress, should_stop)
         report("source", 0, None, self.estimate.title)
-        shot = load_radiograph(self.shot, "the image")
+        shot = shot_in_memory(self.shot, "the image")
         source = estimate_source(self.estimate, shot, should_stop)
         report("source", 1, 1)
         return source
