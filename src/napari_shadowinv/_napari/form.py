@@ -187,7 +187,7 @@ class Entry:
         self._kinds = _kinds_in(field.annotation)
         self.widget = self._make(str(field.title))
         self._stated: Any = None
-        self._shown = self.line.value
+        self._entry = self.line.value
         if self._is_text:
             self.line.native.editingFinished.connect(self._read)
         else:
@@ -201,14 +201,14 @@ class Entry:
     @property
     def value(self) -> Any:
         """The stated value exactly, or text that only the model can read."""
-        shown = self.line.value
-        if shown == self._shown:
+        entry = self.line.value
+        if entry == self._entry:
             return self._stated
         if isinstance(self.line, magic.FloatSlider):
-            shown = round(shown, 5)  # it cuts off the sixth decimal
+            entry = round(entry, 5)  # it cuts off the sixth decimal
         if not self._is_text:
-            return None if shown == self._default else shown
-        return self._number_in(shown.strip()) if shown.strip() else None
+            return None if entry == self._default else entry
+        return self._number_in(entry.strip()) if entry.strip() else None
 
     @value.setter
     def value(self, value: Any) -> None:
@@ -217,16 +217,16 @@ class Entry:
 
     def _show(self, value: Any) -> None:
         self._stated = value
-        shown = self._default if value is None else value
+        entry = self._default if value is None else value
         if self._is_text:
             self.line.value = "" if value is None else _text_of(value, self._unit)
         elif isinstance(self.line, magic.Slider | magic.FloatSlider):
-            self._show_on_slider(shown)
-        elif not isinstance(self.line, magic.ComboBox) or shown in self.line.choices:
-            self.line.value = shown
+            self._show_on_slider(entry)
+        elif not isinstance(self.line, magic.ComboBox) or entry in self.line.choices:
+            self.line.value = entry
         else:
             self._stated = None
-        self._shown = self.line.value
+        self._entry = self.line.value
 
     def _plain(self, value: Any) -> Any:
         """Return paths and ranges as text, which files and settings can hold."""
@@ -245,24 +245,24 @@ class Entry:
         ends = extra.get("slider") if isinstance(extra, dict) else None
         # Qt wraps rich text only.
         tip = f"<qt>{self._field.description}</qt>" if self._field.description else ""
-        named = {"label": title, "tooltip": tip}
+        texts = {"label": title, "tooltip": tip}
         if self._kinds == {bool}:
-            box = magic.CheckBox(value=bool(self._default), **named)
+            box = magic.CheckBox(value=bool(self._default), **texts)
             box.text = ""  # its label stands before it
             return box
         if choices := _choices_in(self._field.annotation):
-            widget: Any = magic.ComboBox(choices=[(str(c or ""), c) for c in choices], **named)
+            widget: Any = magic.ComboBox(choices=[(str(c or ""), c) for c in choices], **texts)
             widget.value = self._default
         elif isinstance(ends, list | tuple):
             kind = magic.FloatSlider if float in self._kinds else magic.Slider
-            widget = kind(min=ends[0], max=ends[1], value=self._default, **named)
+            widget = kind(min=ends[0], max=ends[1], value=self._default, **texts)
         else:
-            named["label"] = title.removesuffix(f" ({self._unit})")
-            return self._make_line(named)
+            texts["label"] = title.removesuffix(f" ({self._unit})")
+            return self._make_line(texts)
         steady(widget.native)
         return widget
 
-    def _make_line(self, named: dict[str, str]) -> Any:
+    def _make_line(self, texts: dict[str, str]) -> Any:
         in_unit = f"in {self._unit}" if self._unit else "a number"
         hint = in_unit if self._field.is_required() else f"not set ({in_unit})"
         if tuple in self._kinds:
@@ -270,7 +270,7 @@ class Entry:
         elif self._default is not None:
             hint = _text_of(self._default, self._unit)
         is_file = Path in self._kinds
-        line = magic.LineEdit(**named)
+        line = magic.LineEdit(**texts)
         line.native.setPlaceholderText("a number, or a file" if is_file else hint)
         line.native.setMinimumWidth(_ENTRY_WIDTH_PX)
         if not is_file:
@@ -278,7 +278,7 @@ class Entry:
         button = magic.PushButton(text="…", tooltip="Choose a file.")
         button.native.setMaximumWidth(30)
         button.changed.connect(self._choose_file)
-        row = magic.Container(widgets=[line, button], layout="horizontal", labels=False, **named)
+        row = magic.Container(widgets=[line, button], layout="horizontal", labels=False, **texts)
         row.margins = (0, 0, 0, 0)
         return row
 
@@ -307,7 +307,7 @@ class Entry:
 
     def _read(self) -> None:
         """Read what the user has entered, and show a number with its unit."""
-        if self.line.value != self._shown:
+        if self.line.value != self._entry:
             self._show(self.value)
             self._on_change()
 

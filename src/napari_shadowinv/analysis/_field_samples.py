@@ -72,7 +72,7 @@ class SampledField:
     def at_points(
         self, potential: FloatArray, displacement: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what was read out as potential and displacement at the middles of pixels."""
+        """Return potential and displacement at the middles of pixels."""
         return potential, displacement
 
     def within_pixels(self) -> tuple[FloatArray, FloatArray]:

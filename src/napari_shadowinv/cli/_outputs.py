@@ -43,7 +43,7 @@ Output = tuple[Path | None, tuple[str, ...]]
 
 @dataclass
 class Outputs:
-    """Files of a command, with what it has printed.
+    """Files of a command, with the cautions that it has printed.
 
     Attributes
     ----------

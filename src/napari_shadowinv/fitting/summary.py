@@ -211,13 +211,13 @@ def error_budget(
         others = [part for part in (noise, by_beam, *parts.values()) if part is not None]
         edge = root_of(*(np.array([edge, *others]) ** 2).sum(axis=0))
     # Shares of no displacement are large, not infinite.
-    whole = ErrorEstimate(max(_length(displacement), 1e-6), max(float(length.max()), 1e-6))
+    field = ErrorEstimate(max(_length(displacement), 1e-6), max(float(length.max()), 1e-6))
     assumed = [each for each in EFFECTS if each.key in openness.assumed]
     sizes = {each.name(each.tested): each.tested for each in assumed}
     names = TITLES | {each.key: each.name(each.tested) for each in assumed}
     budget = ErrorBudget(
-        peak=whole.at_peak,
-        rms=whole.rms,
+        peak=field.at_peak,
+        rms=field.rms,
         noise=noise,
         effects={names[key]: part for key, part in parts.items()},
         edge=edge,
@@ -227,7 +227,7 @@ def error_budget(
         if openness.by_beam is None
         else estimate(openness.by_beam.by_percent[number]),
         sensitivities={
-            each.name(each.tested): whole.times(float(openness.sensitivities[each.key][number]))
+            each.name(each.tested): field.times(float(openness.sensitivities[each.key][number]))
             for each in EFFECTS
             if each.key in openness.sensitivities.keys() - errors.by_part.keys()
         },

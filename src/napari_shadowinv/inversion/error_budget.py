@@ -145,7 +145,7 @@ class ErrorBudget:
     samples: ErrorSamples | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return all but what belongs to pixels, for JSON."""
+        """Return all but the values of pixels, for JSON."""
         content = asdict(replace(self, per_pixel=None, causes=(), samples=None))
         for name in ("per_pixel", "causes", "samples"):
             del content[name]
@@ -155,7 +155,7 @@ class ErrorBudget:
     def from_dict(
         content: Mapping[str, Any], causes: Iterable[str], per_pixel: FloatArray | None
     ) -> ErrorBudget:
-        """Return the budget of what `to_dict` returned, with what belongs to pixels."""
+        """Return the budget of a dict by `to_dict`, with the values of pixels."""
         budget = _schema().validate_python(content)
         return replace(budget, per_pixel=per_pixel, causes=tuple(map(str, causes)))
 

@@ -223,7 +223,7 @@ class Sampler:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """Causes of the scatter: the noise, what is drawn of the instrument, and the edge."""
+        """Causes of the scatter: the noise, parts of the instrument that are drawn, the edge."""
         draws = self.resampling.instrument
         return (
             "noise",

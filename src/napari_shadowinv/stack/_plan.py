@@ -124,9 +124,9 @@ def describe_stack(
     """Describe a stack, and check everything that can be checked before a shot is read."""
     common = shots if isinstance(shots, Shot) else Shot(shots)
     of_one = ("dark", "strength", "brightness", "psf", "noise", "fiducials", "start")
-    if given := [name for name in of_one if getattr(common, name) is not None]:
+    if needless := [name for name in of_one if getattr(common, name) is not None]:
         raise InputError(
-            f"the shot of a stack has {', '.join(given)}, expected its source, masks and setup: "
+            f"the shot of a stack has {', '.join(needless)}, expected its source, masks and setup: "
             "describe the shots in a table"
         )
     if isinstance(common.source, (Estimate, Shot)) or common.beam_unknown:
@@ -150,7 +150,7 @@ def describe_stack(
                 "for each shot"
             )
         pairs = zip(stack_shots.items, sources.items, strict=True)
-        items = [replace(shot, source=own) for shot, own in pairs]
+        items = [replace(shot, source=source) for shot, source in pairs]
         stack_shots = replace(stack_shots, items=items)
     task: AnyTask
     if resolved.fit is None:
