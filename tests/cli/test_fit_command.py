@@ -319,7 +319,7 @@ TABLES = {
         "and 'proportional' in others",
     ),
     "file,strength\na.tif,1 2\nb.tif,2\n": (
-        "strengths are (1.0, 2.0), (2.0,): expected one number for each",
+        "strengths are (1.0, 2.0), (2.0,) for 1 field: expected one number for each",
     ),
 }
 

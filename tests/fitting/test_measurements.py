@@ -78,7 +78,7 @@ def nearly_all_masked() -> FloatArray:
             "strength is nan: expected a finite number",
         ),
         ({"strength": [0, 1]}, r"strengths of the first image are \[0.0\]: all fields must act"),
-        ({"strength": [(1, 1), (0.5, 0.5)]}, "and 1 fields are fitted: expected one number for"),
+        ({"strength": [(1, 1), (0.5, 0.5)]}, "for 1 field: expected one number for"),
         (
             {"strength": [(1, 1), (0.5, 0.5)], "fields": ("B", "E")},
             "2 fields cannot be distinguished by images",
@@ -116,7 +116,7 @@ def nearly_all_masked() -> FloatArray:
         ({"psf": np.ones((2, 3))}, r"psf of image \d has shape \(2, 3\): expected a kernel"),
         ({"psf": [1.0, "wide"]}, r"psf of image \d is 'wide': expected numbers"),
         ({"strength": "strong"}, "strength is 'strong': expected numbers"),
-        ({"strength": [[1, 2], [3]]}, r"strengths are \(1.0, 2.0\), \(3.0,\), and 1 fields"),
+        ({"strength": [[1, 2], [3]]}, r"strengths are \(1.0, 2.0\), \(3.0,\) for 1 field"),
         ({"source": "beam.tif"}, "source is the file beam.tif, expected an array"),
         ({"noise": [0.1, [1, [2]]]}, "noise of image 2 is .*: expected numbers"),
         ({"fiducials": [[1, 2, 3], [4]]}, "fiducials is .*: expected numbers"),

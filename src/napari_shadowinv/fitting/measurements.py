@@ -167,7 +167,7 @@ def collect_data(
         weights=np.pad(np.where(used, 1 / np.maximum(deviations, _LEAST_NOISE) ** 2, 0.0), fill),
         strengths=matrix,
         beams=np.pad(in_units, ((0, 0), *around), mode="edge"),
-        psf=[_checked_point_spread(shot.psf, shape) for shot in shots],
+        psf=[_checked_point_spread(names[k], shot.psf, shape) for k, shot in enumerate(shots)],
         smoothness=np.tile(smoothness, (matrix.shape[1], 1)),
         **strip,
         free_brightness=free_brightness or unknown or is_dimmed,
@@ -324,12 +324,12 @@ def _relative_noise(
     left in a pixel of each beam, as recorded.
     """
     # Differences of image and beam contain the noise of both.
-    deviations = _deviations(noise, data - recorded if noise is None else data, used)
+    deviations = _deviations(noise, data - recorded if noise is None else data, used, names)
     floors = _LEAST_NOISE * _means(recorded, used)[:, None, None]
     beams, shares = smooth_references(recorded, data, np.maximum(deviations, floors), used)
     remaining = shares[:, None, None] * deviations
     if noise is None:
-        deviations = _deviations(None, data - beams, used)
+        deviations = _deviations(None, data - beams, used, names)
     elif not remaining.any():
         remaining += np.array(list(map(estimated_noise, beams, used)))[:, None, None]
     units = _means(beams, used)[:, None, None]
@@ -480,7 +480,7 @@ def _checked_strengths(strengths: Sequence[tuple[float, ...]], count: int) -> Fl
     """Return strengths of images that have one for each field, shape (L, M)."""
     if set(map(len, strengths)) != {count}:
         raise InputError(
-            f"strengths are {', '.join(map(str, strengths))}, and {count} fields are fitted: "
+            f"strengths are {', '.join(map(str, strengths))} for {count} field{'s' * (count > 1)}: "
             "expected one number for each field in all images"
         )
     return np.array(strengths)
@@ -578,7 +578,7 @@ def _refuse_other_units(brightness: FloatArray, names: Sequence[str], most: floa
             )
 
 
-def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
+def _deviations(noise: Any, data: FloatArray, used: BoolArray, names: Sequence[str]) -> FloatArray:
     """Standard deviation of each pixel's noise."""
     if isinstance(noise, str):
         if noise not in KINDS_OF_NOISE:
@@ -596,15 +596,18 @@ def _deviations(noise: Any, data: FloatArray, used: BoolArray) -> FloatArray:
     if noise is None:
         levels = np.array(list(map(estimated_noise, data, used)))
         return np.asarray(np.ones(data.shape) * levels[:, None, None])
-    sigmas = [as_numbers("noise", each) for each in noise]
-    for sigma in sigmas:
+    planes = []
+    for name, each in zip(names, noise, strict=True):
+        sigma = as_numbers(f"noise of {name}", each)
         if not sigma.size or not np.isfinite(sigma).all() or sigma.min() <= 0:
-            raise InputError("noise is not positive everywhere: expected standard deviations")
+            raise InputError(f"noise of {name} is not positive: expected standard deviations")
         if sigma.shape not in ((), data.shape[1:]):
             raise InputError(
-                f"noise has shape {sigma.shape}: expected one number, or an array like the image"
+                f"noise of {name} has shape {sigma.shape}: expected one number, or an array like "
+                "the image"
             )
-    return np.array([np.broadcast_to(sigma, data.shape[1:]) for sigma in sigmas])
+        planes.append(np.broadcast_to(sigma, data.shape[1:]))
+    return np.array(planes)
 
 
 def _refuse_hopeless_noise(
@@ -676,15 +679,19 @@ def _checked_fiducials(
     return Fiducials(places + 0.5, displacements, errors)
 
 
-def _checked_point_spread(psf: Any, size: tuple[int, int]) -> float | FloatArray:
+def _checked_point_spread(name: str, psf: Any, size: tuple[int, int]) -> float | FloatArray:
     """Return a standard deviation in px, 0 for None, or a normalised kernel."""
-    values = as_numbers("psf", 0.0 if psf is None else psf)
+    values = as_numbers(f"psf of {name}", 0.0 if psf is None else psf)
     if not values.size or not np.isfinite(values).all() or values.min() < 0:
-        raise InputError(f"psf is {psf}: expected a standard deviation in px or a kernel")
+        raise InputError(f"psf of {name} is {psf}: expected a standard deviation in px or a kernel")
     if values.ndim == 0:
         if float(values) > min(size) / 8:
-            raise InputError(f"psf is {float(values):g} px: expected less than an eighth of a side")
+            raise InputError(
+                f"psf of {name} is {float(values):g} px: expected less than an eighth of a side"
+            )
         return float(values)
     if values.ndim != 2 or not all(side % 2 for side in values.shape) or not values.sum() > 0:
-        raise InputError(f"psf has shape {values.shape}: expected a kernel with odd sides")
+        raise InputError(
+            f"psf of {name} has shape {values.shape}: expected a kernel with odd sides"
+        )
     return np.asarray(values / values.sum())

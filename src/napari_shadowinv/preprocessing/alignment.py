@@ -149,9 +149,10 @@ def _is_white(
     plane: FloatArray, usable: BoolArray, *, deviations: float = 5.0, least: int = 50
 ) -> bool:
     """Return whether means over blocks, of a least number, scatter as for white noise."""
-    variance, side = float(plane[usable].var()), 2
+    relative, side = plane / plane[usable].mean(), 2
+    variance = float(relative[usable].var())
     while (full := complete_blocks(usable, side)).sum() > least:
-        share = float(complete_block_means(plane, side)[full].var()) * side**2 / variance
+        share = float(complete_block_means(relative, side)[full].var()) * side**2 / variance
         if abs(share - 1) > deviations * np.sqrt(2 / full.sum()):
             return False
         side *= 2
