@@ -707,7 +707,7 @@ def test_an_estimated_source_is_described(shot: Path) -> None:
         saved["source"], sources.polynomial_source(np.load(shot), degree=3)
     )
     text = flat(shadowinv("info", "shot.shadowinv").stdout)
-    assert "source polynomial" in text
+    assert f"source {sources.PolynomialEstimate(degree=3).summary}" in text
     assert "beam assumed" in text
 
 
