@@ -219,14 +219,6 @@ def test_tiff_whose_strip_unpacks_to_far_more_is_refused(here: Path) -> None:
         read("bomb.tif")
 
 
-def test_png_larger_than_pillow_allows_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    iio.imwrite("large.png", SHOT.astype(np.uint16))
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 100)
-
-    assert np.array_equal(read("large.png").image, SHOT)
-    assert Image.MAX_IMAGE_PIXELS == 100
-
-
 def test_pipe_has_no_checksum(here: Path) -> None:
     os.mkfifo("pipe.csv")
     np.save("shot.npy", SHOT)

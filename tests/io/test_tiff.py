@@ -207,6 +207,15 @@ def test_orientation_of_frames_and_scans(path: Path) -> None:
 # Values
 
 
+def test_pixels_without_data_are_left_out(path: Path) -> None:
+    stored = SHOT.copy()
+    stored[2:5, 7] = 65535
+    tifffile.imwrite(path, stored, extratags=[(42113, "s", 0, "65535", True)], metadata=None)
+    shot = read(path)
+    np.testing.assert_array_equal(shot.usable, stored != 65535)
+    assert any("3 pixels" in note for note in shot.notes)
+
+
 def test_white_is_zero_is_turned_round(path: Path) -> None:
     usable = SHOT > 2000
     tifffile.imwrite(path, ~usable, photometric="miniswhite")

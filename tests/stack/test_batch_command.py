@@ -323,7 +323,7 @@ def test_progress_of_a_batch_fits_80_columns(folder, monkeypatch):
     )  # fmt: skip
     with progress_bars() as show:
         _Printer(quiet=True, show=show).update(status)
-    lines = re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", text.getvalue()).split("\n")
+    lines = re.split(r"[\r\n]+", re.sub(r"\x1b\[[\d;?]*[a-zA-Z]", "", text.getvalue()))
     assert max(map(len, lines)) <= 80
     assert any("4 threads" in line and "121 of 500 done" in line for line in lines)
 

@@ -278,7 +278,7 @@ def test_batch_command_fits_reports_and_exports(folder: Path) -> None:
     assert "verdicts" in result.stdout
     output = flat(shadowinv("info", out).stdout)
     assert "noise = 0.02" in output
-    assert "fields = ['B']" in output
+    assert "beam = known" in output
     assert f"{verdicts.count('determined')} determined" in output
     table = flat(shadowinv("info", out, "--all").stdout)
     assert "verdict" in table

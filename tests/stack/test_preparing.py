@@ -215,7 +215,7 @@ def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
     stack, single = read("n.shadowinv.zarr"), read("one.shadowinv")
     np.testing.assert_array_equal(stack.potential[1], single.potential.astype(np.float32))
     output = " ".join(CliRunner().invoke(app, ["info", "n.shadowinv.zarr"]).output.split())
-    assert 'estimated from each shot: {"method":"polynomial","degree":1}' in output
+    assert "source fitted polynomial, degree 1" in output
     assert "low-pass (smooth), width 0.8" in output
     refused = CliRunner().invoke(
         app, ["batch", night.glob, "--source", shot, "--source-from", "gaussian", *out]

@@ -137,7 +137,7 @@ def test_a_row_is_inverted_as_alone(pack: Path, out: Path) -> None:
         assert provenance.image.file == f"film{k}.npy"
     assert provenance.image.source is not None
     assert provenance.image.source.file == "other.npy"
-    assert "source other.npy" in flat(shadowinv("info", out).stdout)
+    assert "sources other.npy" in flat(shadowinv("info", out).stdout)
     first = StackStore(out).report(0)["provenance"]
     assert first["images"][0]["brightness"] == 1.25
     assert first["masks"][0]["file"] == "mask.npy"
@@ -350,9 +350,7 @@ def test_a_row_is_repeated_from_its_provenance(pack: Path) -> None:
     inversion = stack.task.run(images, workers=1)
     write("film0.shadowinv", inversion)
     assert rerun("film0.shadowinv").is_identical
-    assert "brightness 1.25 (the image was divided by it)" in flat(
-        shadowinv("info", "film0.shadowinv").stdout
-    )
+    assert "brightness 1.25" in flat(shadowinv("info", "film0.shadowinv").stdout)
 
 
 def test_rows_may_be_given_in_python(pack: Path, out: Path) -> None:

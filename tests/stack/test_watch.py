@@ -298,7 +298,7 @@ def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkey
     assert "of the displacement (r.m.s.) rests on what lies beyond the image" in warning
     assert all("  reaches the edge  " in line for line in shot_lines)
     assert failure.startswith("failed: shot_2.npy: ")
-    assert lines[-1].startswith("Stopped: 2 done, 1 failed; repeat the command to continue")
+    assert lines[-1].startswith("Stopped: 2 done, 1 failed, 2 with warnings; repeat the command")
     assert shadowinv(*command, "--quiet").stdout == ""
 
 

@@ -67,7 +67,7 @@ def test_latest_shot_is_next_and_the_others_are_skipped(folder, out):
 
     listed = flat(shadowinv("info", out).output)
     assert "3 done, 0 failed, 0 pending, 2 skipped" in listed
-    assert "shot_2.npy, shot_3.npy; a watch without --latest inverts them" in listed
+    assert "shot_2.npy, shot_3.npy: a watch without --latest inverts them" in listed
 
     again = watched_once(folder, out, reader=gate, instrument=EXACT)
     assert numbers_of(again) == [(name, DONE) for name, _ in expected]

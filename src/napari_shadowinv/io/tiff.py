@@ -4,7 +4,8 @@
 - a plane as TIFF: `write_tiff`
 
 Thumbnails, pyramids and masks are no frames. Values are turned from white-is-zero, colour tables,
-ImageJ's calibrations and the roots of gel scanners into light; transparent pixels become NaN.
+ImageJ's calibrations and the roots of gel scanners into light; pixels that are
+transparent or without data become NaN.
 """
 
 from __future__ import annotations
@@ -168,7 +169,7 @@ def read_tiff(path: Path, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
             array = page.asarray()
         if "S" in page.axes:
             array = np.moveaxis(array, page.axes.index("S"), -1)
-        missing = _transparent_pixels(page, array)
+        missing = _missing_pixels(page, array)
         array, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
         check_picture(path, "TIFF", array)
         array, turned = _turn_upright(without_pixels(array, missing), _tag(tiff, page, 274))
@@ -237,10 +238,14 @@ def _without_alpha(page: Any, array: AnyArray) -> AnyArray:
     return array[..., 0] if array.shape[-1] == 2 else array[..., :-1]
 
 
-def _transparent_pixels(page: Any, array: AnyArray) -> BoolArray:
+def _missing_pixels(page: Any, array: AnyArray) -> BoolArray:
+    """Return where a frame is transparent, or has no data as GDAL states it."""
     if array.ndim == 3 and _without_alpha(page, array) is not array:
         return np.asarray(array[..., -1] == 0)
-    return np.zeros(array.shape[:2], bool)
+    is_missing = np.zeros(array.shape[:2], bool)
+    if 42113 in page.tags:
+        is_missing |= (array == page.nodata).reshape(*array.shape[:2], -1).all(axis=-1)
+    return is_missing
 
 
 def _convert_values(
