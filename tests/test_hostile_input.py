@@ -12,11 +12,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image
 from pydantic import ValidationError
 
 from helpers.command_line import flat, shadowinv

@@ -66,6 +66,8 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
         if image.brightness is not None:
             rows.append((f"brightness{of_image}", f"{image.brightness:g}"))
     recipe, table = provenance.recipe, provenance.fiducials
+    if recipe.steps and not any(image.notes for image in provenance.images):  # of many shots
+        rows.append(("steps", "; ".join(step.summary for step in recipe.steps)))
     if recipe.estimate is not None:
         rows.append(("source", recipe.estimate.summary))
     if recipe.fit is not None:
