@@ -130,7 +130,7 @@ def test_the_field_of_two_energies_is_found_and_written(folder: Path) -> None:
     assert "image 2 b.tif, 5 MeV proton, χ²" in output
     assert "MG·µm)" in output
     assert "displacement B peak |d|" in output
-    assert "a beam that differs by 1 %" in output
+    assert "a source that differs from it by 1 %" in output
 
     description = flat(shadowinv("info", "a_fit.shadowinv").stdout)
     for words in ("kind fit of shadowinv", "determined peak |∫B", "image 1 a.tif, 14.7 MeV proton"):
