@@ -168,7 +168,7 @@ def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
         (("1,2", ",3"), r"could not convert string ''"),
         (("1,5 2,5", "3,5 4,5"), r"string '5 2' .*: expected .* numbers with a decimal point"),
         (("x,y,z", "1,2,3"), r"could not convert string 'x'"),
-        (("1 2 3",), r"holds 1 rows of numbers: expected at least two"),
+        (("1 2 3",), r"holds 1 row of numbers: expected at least two"),
         (("# nothing", ""), r"holds 0 rows of numbers"),
         (("# energy = 14.7 cm", "1 2"), r"line 1 has '14.7 cm' for energy: .* converted to MeV"),
         (("# pixel size: 3 apples", "1 2"), r"line 1 has '3 apples' for pixel_size"),

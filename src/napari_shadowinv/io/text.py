@@ -175,8 +175,8 @@ def _decode_comment(raw: bytes) -> str:
 def _parse_rows(path: Path, rows: list[bytes]) -> FloatArray:
     if len(rows) < 2:
         raise FileFormatError(
-            f"{path} holds {len(rows)} rows of numbers: expected at least two, one row of pixels "
-            "per line; export the image again"
+            f"{path} holds {len(rows)} row{'s' * (len(rows) != 1)} of numbers: expected at least "
+            "two, one row of pixels per line; export the image again"
         )
     # Numbers look the same in every encoding.
     lines = [row.removeprefix(BOM_UTF8).decode("latin-1").strip() for row in rows]
