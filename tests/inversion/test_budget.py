@@ -24,7 +24,7 @@ from napari_shadowinv.facts import Verdict
 from napari_shadowinv.instrument.effects import motions
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.budget import Budget, discretisation_share
-from napari_shadowinv.inversion.error_budget import ErrorEstimate
+from napari_shadowinv.inversion.error_budget import ErrorBudget, ErrorEstimate
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import LinearResponse
@@ -147,6 +147,18 @@ def test_noise_at_the_peak_is_the_scatter_there(repeats, image, noise):
     estimated = np.mean([inversion.errors.noise.at_peak for inversion in inversions])
     # At one pixel, 50 repeats determine the scatter to 10 %.
     assert estimated == pytest.approx(at_peak, rel=0.4)
+
+
+def test_parts_of_samples_that_miss_their_total_are_described():
+    part, total = ErrorEstimate(0.1, 0.1), ErrorEstimate(0.2, 0.2)
+    none = ErrorEstimate(0.0, 0.0)
+    budget = ErrorBudget(
+        peak=1.0, rms=1.0, noise=part, effects={"blur": part, "gamma": none}, sampled=total
+    )
+    rows = dict(budget.rows())
+    assert rows["errors"].startswith("20 %")
+    assert "measure next" not in rows
+    assert budget.times(3.0).total.rms == pytest.approx(0.6)
 
 
 def test_given_noise_is_used_and_scales(image):

@@ -156,8 +156,12 @@ class ResampledInversion(SampledField):
         if count < 16:
             return None
         changes: dict[str, Any] = {"n_sites": count}
-        if inversion.options.flux == "fit":  # the image of a result is scaled by it
+        # The image of a result is scaled to the flux of its source.
+        if inversion.options.flux == "fit":
             changes["flux"] = "known"
+        for name in ("noise_level", "units_per_quantum"):
+            if (stated := getattr(inversion.options, name)) is not None:
+                changes[name] = stated / inversion.report.flux_scale
         coarse = invert(
             inversion.image,
             source=inversion.source,

@@ -97,7 +97,7 @@ _REPORT = "verdict", "errors", "error_limited_by", "error_measure_next", "residu
 _MEASURE = "measure the {}, or add an image at another energy"
 _REMEDIES = {
     "noise": "average shots, or take images at energies that differ more",
-    "other_field": "fit both fields, with images at more energies",
+    "other field": "fit both fields, with images at more energies",
     "registration": "align the images by marks on each of them",
     "edge": LARGER_FIELD,
     "beam": "record a reference",
@@ -337,7 +337,7 @@ class Fit(Summarised):
         if self.errors is None:
             return
         is_condition = self.verdict.level is Level.CONDITIONAL
-        rows = dict(self.errors.rows())
+        rows = {"errors": "", "limited by": "", "measure next": ""} | dict(self.errors.rows())
         rows["measure next"] = self.explanation if is_condition else self.next_step
         if numbers := self.report.numbers:
             rows["instrument"] = "; ".join(number_text(*each) for each in numbers.items())

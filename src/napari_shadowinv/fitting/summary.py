@@ -254,6 +254,8 @@ def _beam_basis(data: FitData) -> str:
         return "unknown"
     if data.instrument.beam_rms is not None:
         return "stated"
+    if data.beam.components is not None:
+        return data.beam.components.basis
     return "assumed" if data.assumed else "reference"
 
 

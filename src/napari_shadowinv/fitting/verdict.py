@@ -349,7 +349,8 @@ def _conditional(case: Evidence) -> Answer:
     condition, fit = case.condition, case.fit
     if not condition or not case.is_too_uncertain:
         return None
-    return fit.shown(fit.fields[0]).conditional(condition)
+    (worst, *_) = (field for field in fit.fields if field.errors is fit.errors)
+    return fit.shown(worst).conditional(condition)
 
 
 _RULES = (

@@ -408,8 +408,10 @@ class ErrorBudget:
         )
 
     def times(self, factor: float) -> ErrorBudget:
-        """Return the budget in another unit; 1 px of displacement is `factor` of it."""
+        """Return the budget in another unit, without samples; 1 px is `factor` of it."""
         lengths: dict[str, Any] = {"peak": factor * self.peak, "rms": factor * self.rms}
+        if self.per_pixel is not None:
+            lengths |= {"per_pixel": factor * self.per_pixel, "samples": None}
         for name, value in vars(self).items():
             if isinstance(value, ErrorEstimate):
                 lengths[name] = value.times(factor)
@@ -445,7 +447,8 @@ class ErrorBudget:
         if self.sampled is None and self.discretisation is None:
             text += "; discretisation was not estimated, as only one level was solved"
         rows = [("errors", text), ("limited by", self.ranking)]
-        if next_step := self.measure_next(self.share / 2):
+        # Parts of samples need not add up to their total.
+        if self.sampled is None and (next_step := self.measure_next(self.share / 2)):
             rows.append(("measure next", next_step))
         if (by_percent := self.beam_sensitivity) is not None:
             basis = "exact" if self.beam is None else self._beam_name.removeprefix("beam ")

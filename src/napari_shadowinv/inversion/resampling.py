@@ -118,7 +118,7 @@ class Sampler:
             rng = np.random.default_rng([options.seed, *b"instrument"])
             numbers = stratified_numbers(rng, n, resampling.instrument.count)
             resampling = replace(resampling, numbers=numbers)
-        choose = _quantity_choice(quantities) if quantities else None
+        choose = None if quantities is None else _quantity_choice(quantities)
         return cls(resampling, fields, by_edge, seeds, workers, options.threads, choose)
 
     def measure(self, change: FloatArray, seed: Seed) -> dict[str, FloatArray]:
@@ -310,18 +310,17 @@ def instrument_draws(
 
 
 def _quantity_choice(
-    quantities: Quantities | None,
+    quantities: Quantities,
 ) -> Callable[[FloatArray], Mapping[str, QuantityOf]]:
     """Return a function that chooses the quantities by changes of the potential."""
     if callable(quantities):
         return quantities
-    functions = {} if quantities is None else quantities
-    if not isinstance(functions, Mapping) or not all(map(callable, functions.values())):
+    if not isinstance(quantities, Mapping) or not all(map(callable, quantities.values())):
         raise InputError(
             f"quantities is {quantities!r}, expected a dictionary of functions of potential and "
             "displacement"
         )
-    return lambda _: functions
+    return lambda _: quantities
 
 
 def _measure(

@@ -405,7 +405,9 @@ class Inversion(Summarised):
         drawn = sampler.draw(method, described, Reporter(on_progress, should_stop))
         std, causes = drawn.displacement_std, sampler.causes
         errors = replace(errors, per_pixel=std, causes=causes, samples=drawn)
-        return replace(self, errors=errors).with_warnings(sampler.cautions(drawn))
+        earlier = (each for each in self.report.warnings if each.code != "samples")
+        report = replace(self.report, warnings=(*earlier, *sampler.cautions(drawn)))
+        return replace(self, errors=errors, report=report)
 
     def with_warnings(self, cautions: Iterable[Caution]) -> Inversion:
         """Return the same inversion with more warnings in its report.
