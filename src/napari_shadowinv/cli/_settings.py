@@ -203,6 +203,8 @@ def numbers_of(flag: str, text: str) -> list[float]:
 
 def _parse_choice(flag: str, text: str, choices: Mapping[str, Any]) -> tuple[Any, dict[str, str]]:
     """Return the choice that a text names, and its parameters; quotes keep a space in one."""
+    if len(text) > 10_000:
+        raise InputError(f"{flag} has {len(text):,} characters: expected a name and parameters")
     lexer = shlex.shlex(text, posix=True)
     lexer.whitespace_split, lexer.commenters, lexer.escape = True, "", ""
     try:

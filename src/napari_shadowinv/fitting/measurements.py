@@ -350,7 +350,7 @@ def _relative_noise(
     )
     more = np.maximum(before**2 - after**2, 0.0)
     pixels = match.factors * np.median(deviations**2, axis=(1, 2))
-    match = match.with_long_waves(more / pixels)
+    match = match.with_long_waves(more / np.maximum(pixels, np.finfo(float).tiny))
     deviations = deviations * np.sqrt(match.factors)[:, None, None]
     return beams, deviations, match, np.median(remaining, axis=(1, 2))
 

@@ -92,7 +92,7 @@ class BeamPrior(CheckedModel, allow_inf_nan=False):
     """
 
     rms: Share = 0.0
-    length: float = Field(default=0.25, gt=0, le=1)
+    length: float = Field(default=0.25, ge=1e-6, le=1)
     between: Share = 0.0
     _components: BeamComponents | None = PrivateAttr(default=None)
 

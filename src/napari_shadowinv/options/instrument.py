@@ -101,7 +101,7 @@ class Instrument(CheckedModel, allow_inf_nan=False):
     )
     beam_length: float = Field(
         default=0.25,
-        gt=0,
+        ge=1e-6,
         le=1,
         description="Length over which the true beam differs from the source, as a share of the "
         "image's shorter side.",
