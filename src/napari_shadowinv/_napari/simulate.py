@@ -100,6 +100,7 @@ class Simulate(panels.ToolPanel):
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Trace the beam through the object, or invert shots with random imperfections."
         super().__init__(napari_viewer, "simulate", Run("Simulate", "Run", tip))
+        self._predicted: Any = None  # layers of the last image; plans have others
         self._build_object()
         self._build_plan()
         self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
@@ -303,9 +304,9 @@ class Simulate(panels.ToolPanel):
         )
 
     def _image_to_save(self) -> Savable:
-        if not self.results.layers:
+        if self._predicted is None or not self._predicted.layers:
             raise InputError("there is no predicted image yet: press Run first")
-        (layer,) = self.results.layers
+        (layer,) = self._predicted.layers
         return Savable(layer.name, np.asarray(layer.data), IMAGE_FORMATS, about.setup_of(layer))
 
     def forget(self) -> None:
@@ -320,6 +321,7 @@ class Simulate(panels.ToolPanel):
         self.results = self._last.layers_for_next(subject)
         self.results.show(finished.layer_data)
         if isinstance(job, ForwardJob):
+            self._predicted = self.results
             self.viewer.reset_view()
             self.warning.show_text(content.warning)
             return

@@ -135,8 +135,8 @@ def validate(
         raise InputError(
             f"{where}: received {_shorten(mapping)}, expected a table of keys and values"
         )
-    if others := [key for key in mapping if not isinstance(key, str)]:
-        raise InputError(f"{where}: received the key {others[0]!r}, expected names as keys")
+    if keys := [key for key in mapping if not isinstance(key, str)]:
+        raise InputError(f"{where}: received the key {keys[0]!r}, expected names as keys")
     try:
         return model_class.model_validate(mapping)
     except ValidationError as error:

@@ -76,7 +76,7 @@ class SampledField:
         return potential, displacement
 
     def within_pixels(self) -> tuple[FloatArray, FloatArray]:
-        """Return another potential and displacement, as far off as pixels hide."""
+        """Return potential and displacement with the most that means over pixels can hide."""
         return finer_field(self.potential, self.displacement)
 
 

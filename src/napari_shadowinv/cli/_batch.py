@@ -158,7 +158,10 @@ def run_batch(
     from napari_shadowinv.stack import run_stack
 
     if resume and run.overwrite:
-        raise InputError("got --resume and --overwrite, expected one of them")
+        raise InputError(
+            "received --overwrite with --resume or run.redo_failed, which continue a store: use "
+            "one of them"
+        )
     if check_store_path(out).exists() and not (resume or run.overwrite):
         raise InputError(
             f"{out} exists ({_counts_text(StackStore(out))}): use --resume to continue, "
@@ -185,7 +188,8 @@ def run_batch(
     folders = [Path(path) for path in shots if os.path.isdir(path)]
     store, status, text = StackStore(out), printer.status, "nothing to do"
     if status is not None and status.ended:
-        text = f"{status.ended} shots in {status.seconds:.1f} s, {_rate_text(status)}"
+        shots_text = f"{status.ended} shot{'s' * (status.ended != 1)}"
+        text = f"{shots_text} in {status.seconds:.1f} s, {_rate_text(status)}"
     if not quiet:
         rows = [
             ("shots", _counts_text(store)),
@@ -361,9 +365,12 @@ def _column_table(store: StackStore, columns: Sequence[ShotColumn]) -> Table:
 
 def _store_rows(store: StackStore) -> Rows:
     """Describe a store."""
-    attributes = store.attributes
+    attributes, count = store.attributes, len(store.names)
     return [
-        ("kind", f"stack of {len(store.names)} shots, shadowinv {attributes['package_version']}"),
+        (
+            "kind",
+            f"stack of {count} shot{'s' * (count != 1)}, shadowinv {attributes['package_version']}",
+        ),
         ("created", str(attributes["created"])),
         ("shots", _counts_text(store)),
         ("size", str(attributes["image_size"])),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,8 +35,8 @@ HELP = {
     "field": "Result, displacement (2, H, W) in px, potential (H, W) in px², or 3-D field "
     "(openPMD, NetCDF).",
     "truth": "NetCDF file of line integrals.",
-    "setup": "TOML file of the prediction's geometry.",
-    "recorded_with": "TOML file of the measurement's.",
+    "setup": "TOML file of the geometry to predict for.",
+    "recorded_with": "TOML file of the geometry in which the field was measured.",
     "dispersion": "New ln η / old ln η of an index.",
     "out": "Image: .tif, .npy or .png.",
 }
@@ -87,6 +88,7 @@ def forward(
     )
     chosen = settings_of(settings or (), SECTIONS, {})
     setup = read_setup(flags.setup)
+    outputs.warn_of_setups([(setup, None)])
     beam = None
     if flags.source is not None:
         beam = read_shot(flags.source, channel=flags.channel).image
@@ -99,10 +101,11 @@ def forward(
         raise InputError(f"received {names}, but {field} is no 3-D field: leave them out")
     else:
         image, setup, rows = _predict(field, setup, beam, flags)
-    write(path, image, setup=setup, overwrite=overwrite)
-    if truth is not None:
-        with replacing(truth, overwrite) as temporary:
+    with ExitStack() as both:  # files, or none
+        if truth is not None:
+            temporary = both.enter_context(replacing(truth, overwrite))
             traced.to_dataset().to_netcdf(temporary, engine="h5netcdf")
+        write(path, image, setup=setup, overwrite=overwrite)
     outputs.show(size_text(image.shape), [("setup", setup_text(setup, shape=image.shape)), *rows])
 
 

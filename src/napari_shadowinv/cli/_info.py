@@ -164,7 +164,7 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
     rows: _summary.Rows = [
         *([_summary.headline_row(result.headline)] if has_verdict else []),
         ("kind", kind),
-        *[("created", str(dataset.attrs[name])) for name in ("created",) if name in dataset.attrs],
+        *([("created", str(dataset.attrs["created"]))] if "created" in dataset.attrs else []),
         ("image", _summary.size_text(shape)),
         ("setup", _summary.setup_text(setup, shape=shape)),
         *_summary.fact_rows(facts, details=True),

@@ -57,17 +57,13 @@ def shots_recipe_from(flags: InversionFlags, settings: Settings) -> Recipe:
     return recipe
 
 
-def read_setup(path: Path | None) -> Setup | None:
-    """Read a setup from its file, if there is one."""
+def read_setup(path: Path | None, geometry: Any = None) -> Setup | None:
+    """Read a setup from its file, if there is one; complete it with a geometry."""
     from napari_shadowinv.pipeline.files import setup_from
 
-    return None if path is None else setup_from(path)
+    return None if path is None else setup_from(path, geometry)
 
 
 def setup_for(path: Path | None, shot: Shot, recipe: Recipe) -> Setup | None:
-    """Read a setup, and complete it with the geometry in the image's file."""
-    from napari_shadowinv.pipeline.files import setup_from
-
-    if path is None:
-        return recipe.setup or shot.setup
-    return setup_from(path, shot.metadata.get("geometry"))
+    """Read a setup, completed with the geometry in the image's file; else the recipe's."""
+    return read_setup(path, shot.metadata.get("geometry")) or recipe.setup or shot.setup

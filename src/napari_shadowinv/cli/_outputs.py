@@ -50,9 +50,11 @@ class Outputs:
     overwrite, quiet : bool
         As the command received them.
     files : list of Path
-        Files to be written; those that could not be are removed.
+        Files to write; a figure that fails is taken off the list.
     printed : list of str
         Cautions about setups, which are printed before the work.
+    undrawn : list of Path
+        Figures that could not be drawn.
     """
 
     overwrite: bool
@@ -151,13 +153,13 @@ class Outputs:
                 self.files.remove(path)
                 self.undrawn.append(path)
                 reason = str(error) or type(error).__name__
-                text = f"the figure {path} could not be drawn, everything else is written: {reason}"
+                text = f"the figure {path} could not be drawn: {reason}"
                 say_on_stderr(text, "yellow")
 
     def show(self, title: str, rows: Rows) -> None:
         """Print facts, and below them the files that were written."""
         if not self.quiet:
-            written = [("written", str(path)) for path in dict.fromkeys(self.files)]
+            written = [("written", str(path)) for path in self.files]
             say(two_columns(title, [*rows, *written]))
 
     def exit_unless_drawn(self) -> None:

@@ -96,7 +96,7 @@ def invert(
         # In its own file or in the image's; the channel is that of both.
         beam = read_part(measured.file or image, flags.channel, measured.variable)
         shot = replace(shot, source=beam)
-    outputs.warn_of_setups([(recipe.setup or shot.setup, shot.shape)])
+    outputs.warn_of_setups([(recipe.setup, shot.shape)])
     with work_callbacks(quiet) as callbacks:
         inversion = run(recipe, shot, **callbacks)
     outputs.write_result(inversion, [str(image)], result, figure)

@@ -193,4 +193,4 @@ def movie(
     frames = stack_frames(open_shots(store, shots), variable, limits=limits)
     count = write_film(out, frames, rate, overwrite=overwrite)
     if not quiet:
-        say(f"Wrote {out}: {count} shots, {count / rate:.1f} s")
+        say(f"Wrote {out}: {count} shot{'s' * (count != 1)}, {count / rate:.1f} s")

@@ -194,7 +194,8 @@ class _Work:
     ) -> list[int]:
         """Images that one field explains, after removing the worst one by one.
 
-        In pixels of two, where a misfit counts four times, χ² is `worse` than alone by less.
+        An image is explained if its χ², in pixels of two, where a misfit counts four times, is
+        less than `worse` times the χ² of a field of its own.
         """
         least = np.array([self._chi2_in_middle(alone[k], [k])[0] for k in self._all])
         together = self._settle_members(self.common, left, "all images")
@@ -351,7 +352,8 @@ class _Work:
     def _fit_alone(self, k: int, most_fitted: float = 0.9) -> tuple[float, float]:
         """χ² of an image with a field of its own, and of the noise in it.
 
-        Of few pixels in use the field fits `most_fitted` of the noise, as a share.
+        Where few pixels are in use, the field is taken to fit at most a share `most_fitted` of
+        the noise.
         """
         fit = self._sample_fit([k])
         unknowns = fit.unknowns.only([k])

@@ -120,8 +120,9 @@ class Posterior:
         """Return λ and κ nearer to the likeliest, shape (M, 2), and by how much they have changed.
 
         Each holds as much against the field as there are coefficients that the data determine and
-        it would. The change is the logarithm's, weighted with that number. It is taken `overshoot`
-        times, as it approaches its end too slowly, but is a factor of `most_change` before.
+        it would. The change is the logarithm's, weighted with that number. The step is `overshoot`
+        times as long, since that alone approaches its end too slowly, and before that limited to
+        a factor of `most_change`.
         """
         prior, smoothness = self.scene.prior, self.scene.smoothness
         determined, energy = np.empty(smoothness.shape), np.empty(smoothness.shape)

@@ -269,7 +269,8 @@ def noise_draw(
     """Return a function that draws a noisy image, and a text that describes the noise.
 
     Noise of None is as in the error budget: counting noise if the options state units per
-    quantum, else the deviation in each pixel, for a stated `correlation`, px, or the measured one.
+    quantum, else the deviation in each pixel, as `ImageNoise` estimates it for a stated
+    `correlation`, px, or None. Gaussian noise is correlated as in the budget.
     Images are divided by `flux_scale` for the transport.
     """
     if noise is None and options.units_per_quantum is not None:

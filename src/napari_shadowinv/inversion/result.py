@@ -380,7 +380,7 @@ class Inversion(Summarised):
         >>> bool(low < high)
         True
         """
-        from napari_shadowinv.inversion import resampling, samples  # import the solver
+        from napari_shadowinv.inversion import resampling, samples  # here, as they load the solver
 
         resampling.check_choices(n, method)
         errors, options, measured = self.errors, self.options, self.report.measured

@@ -94,7 +94,7 @@ def text_in_unit(value: float, unit: str) -> str:
 
 
 def _power_of_ratio(unit: str, other: str) -> int | None:
-    """Return the power of ten by which a unit exceeds another; None if they measure no common."""
+    """Return the power of ten by which a unit exceeds another; None for different quantities."""
     first, second = (_UNIT.fullmatch(each.translate(_SUPERSCRIPTS)) for each in (unit, other))
     if first is None or second is None or first.groups()[1:] != second.groups()[1:]:
         return None

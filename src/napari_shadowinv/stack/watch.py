@@ -133,20 +133,28 @@ class Watch:
                 while not self._is_over():
                     self._arrivals.look()
                     if self._arrivals.left_out.keys() - self._left_out.keys():
-                        self._left_out = self._arrivals.left_out
-                        counts = counts_text(self._left_out)
-                        note = f"Left out: {counts}; choose others by a pattern of names"
-                        self.report(note=note)
+                        self._report_left_out()
                     if files := self._next():
                         self._invert(files, scheduler)
                     else:
                         time.sleep(self._arrivals.poll_s)
+            if self._arrivals.left_out != self._left_out:
+                self._report_left_out()
         except InversionCancelled:
             pass
-        finally:
-            with suppress(OSError):
+        except BaseException:
+            with suppress(OSError):  # the first error is the one to report
                 self._close()
             self.report()
+            raise
+        self._close()
+        self.report()
+
+    def _report_left_out(self) -> None:
+        """Count the files that are no shots in a sentence."""
+        self._left_out = self._arrivals.left_out
+        counts = counts_text(self._left_out) or "none"
+        self.report(note=f"Left out: {counts}; choose others by a pattern of names")
 
     def _close(self) -> None:
         """Note what was skipped, and the shots that were still running."""
