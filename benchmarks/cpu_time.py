@@ -3,12 +3,11 @@
     git worktree add ../before COMMIT
     python benchmarks/cpu_time.py ../before/src [--pairs 4] [--only fit …]
 
-Each measurement is a process on one thread, with kernels compiled beforehand; of inversions, it is
-the second call. The versions take turns, and the order is reversed in every second pair. A row for
-each work: user CPU seconds of the call in both versions (least), the ratios of the least and the
-median ratio of the pairs, the ratio of the least for whole processes with all imports, and the
-largest change of the displacement relative to its peak. Other work on the machine moves single
-figures by some 10 %.
+Each measurement is the second call in a process on one thread, with kernels compiled. The versions
+take turns, and the order is reversed in every second pair. A row for each work: user CPU seconds of
+the call in both versions (least), the ratios of the least and the median ratio of the pairs, the
+ratio of the least for whole processes of both calls, and the largest change of the displacement
+relative to its peak. Other work on the machine moves single figures by some 10 %.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -88,40 +88,49 @@ def user_seconds(who: int = resource.RUSAGE_SELF) -> float:
     return resource.getrusage(who).ru_utime
 
 
-def worker(work: Work) -> None:
-    """Do the work once, after all that is the same in any call; print its seconds."""
+def call(work: Work) -> Callable[[], FloatArray]:
+    """Return a function that does the work and returns the displacement."""
     from napari_shadowinv import fit, invert
 
+    fit_images: Callable[..., Any] = fit  # its parameters differ between versions
     folder = Path(work["folder"])
-    begun = user_seconds()
-    if "fit" in work:
-        images = np.load(folder / f"{work['fit']}.npy")
-        source = np.full(images.shape[1:], work["flat"]) if "flat" in work else None
-        strengths = work["strengths"] if len(images) > 1 else None
-        if "strengths" in signature(fit).parameters:  # of versions without shots
-            result = fit(images, strengths=strengths, source=source, noise=0.05)
-        else:
-            from napari_shadowinv.shot import shots_of
-
-            shots = shots_of(images, strength=strengths, source=source, noise=0.05)
-            result = fit(shots)
-        displacement = result.fields[0].displacement
-    else:
+    if "invert" in work:
         names = {"image": work["invert"]}
         if "source" in work:
             names["source"] = work["source"]
         arrays = {key: np.load(folder / f"{name}.npy") for key, name in names.items()}
-        invert(**arrays)  # what the first call imports counts in the whole process
-        begun = user_seconds()
-        displacement = invert(**arrays).displacement
+        return lambda: invert(**arrays).displacement
+    images = np.load(folder / f"{work['fit']}.npy")
+    source = np.full(images.shape[1:], work["flat"]) if "flat" in work else None
+    stated: Work = {"source": source, "noise": 0.05}
+    strengths = work["strengths"] if len(images) > 1 else None
+    if "strengths" in signature(fit).parameters:  # of versions without shots
+        return lambda: fit_images(images, strengths=strengths, **stated).fields[0].displacement
+    from napari_shadowinv.shot import shots_of
+
+    shots = shots_of(images, strength=strengths, **stated)
+    return lambda: fit_images(shots).fields[0].displacement
+
+
+def worker(work: Work) -> None:
+    """Do the work twice; print the seconds of the second time, when all is imported."""
+    do = call(work)
+    do()
+    begun = user_seconds()
+    displacement = do()
     seconds = user_seconds() - begun
-    np.save(folder / f"{work['result']}.npy", displacement)
+    np.save(Path(work["folder"]) / f"{work['result']}.npy", displacement)
     print(json.dumps(seconds))
 
 
 def measure(source: Path, work: Work) -> tuple[float, float]:
     """User CPU seconds of the call and of its process."""
-    environment = {**os.environ, "PYTHONPATH": str(source), "NUMBA_NUM_THREADS": "1"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(source),
+        "NUMBA_NUM_THREADS": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
     command = [sys.executable, __file__, "--worker", json.dumps(work)]
     begun = user_seconds(resource.RUSAGE_CHILDREN)
     ended = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)

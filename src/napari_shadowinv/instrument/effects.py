@@ -359,18 +359,30 @@ def motion(places: FloatArray, shape: tuple[int, ...], numbers: FloatArray) -> F
 
     By shifts along y and x, a turn and a change of scale, in px, the latter two at the corners.
     """
-    height, width = shape
-    corner = np.hypot(height, width) / 2
-    y, x = (places[0] - (height - 1) / 2) / corner, (places[1] - (width - 1) / 2) / corner
+    y, x = _from_centre(places[0], places[1], shape)
     down, right, turn, scale = numbers
     return np.stack([down + turn * x + scale * y, right - turn * y + scale * x])
 
 
+def _from_centre(
+    rows: FloatArray, columns: FloatArray, shape: tuple[int, ...]
+) -> tuple[FloatArray, FloatArray]:
+    """Return places relative to the centre of an image, in units of the corners' distance."""
+    height, width = shape
+    corner = np.hypot(height, width) / 2
+    return (rows - (height - 1) / 2) / corner, (columns - (width - 1) / 2) / corner
+
+
 def motions(image: FloatArray) -> FloatArray:
     """Return changes of an image by each number of `motion`, 1 px each, (4, H, W)."""
-    places, slopes = np.indices(image.shape, np.float64), np.array(np.gradient(image))
-    moves = (motion(places, image.shape, unit) for unit in np.eye(4))
-    return np.stack([(slopes * move).sum(axis=0) for move in moves])
+    down, right = np.gradient(image)
+    height, width = image.shape
+    y, x = _from_centre(
+        np.arange(height, dtype=np.float64)[:, None],
+        np.arange(width, dtype=np.float64),
+        image.shape,
+    )
+    return np.stack([down, right, down * x - right * y, down * y + right * x])
 
 
 EFFECTS: tuple[Effect, ...] = (Background(), Gamma(), Blur(), Absorption(), Registration())

@@ -62,7 +62,7 @@ _NOISE_SAMPLES, _BEAM_SAMPLES = 16, 8
 _NEAR = 2.5  # site spacings
 _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 
-_EDGE_PLACES = 200  # along the shorter side, where the error by the edge is computed
+_EDGE_PLACES = 200  # along the shorter side at most, where the error by the edge is computed
 
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 
@@ -441,7 +441,7 @@ def _error_by_edge(
     potential: FloatArray, displacement: FloatArray, mask: BoolArray, peak: IntArray
 ) -> tuple[ErrorEstimate, tuple[str, ...]]:
     """Return the error of a field by what may lie beyond the edge, and the sides it comes from."""
-    step = max(1, min(mask.shape) // _EDGE_PLACES)
+    step = -(-min(mask.shape) // _EDGE_PLACES)
     plane, down, right, used = (
         block_means(values, step) for values in (potential, *displacement, mask)
     )
