@@ -115,8 +115,7 @@ def table_of_counts(draws: int, side: int) -> None:
     counts = [100, 400, 1600, 6400]
     sweep = sweep_experiment(
         BlobRecipe(amplitude=15, sigma=side / 12),
-        quantity="counts",
-        values=counts,
+        vary={"counts": counts},
         shape=(side, side),
         instrument=Instrument(beam_rms=0.0),
         options=ExperimentOptions(draws=draws),

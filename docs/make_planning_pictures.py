@@ -27,7 +27,7 @@ def main() -> None:
     print("\n".join(f"{fact.title}: {fact.text}" for fact in plan.facts))
     save_figure(FOLDER / "planning.png", plan_figure(plan), overwrite=True)
     values = [0.002, 0.005, 0.01, 0.02, 0.05]
-    sweep = sweep_experiment(OBJECT, paper_setup(), quantity="beam_rms", values=values, **choices)
+    sweep = sweep_experiment(OBJECT, paper_setup(), vary={"beam_rms": values}, **choices)
     print("\n".join(f"{fact.title}: {fact.text}" for fact in sweep.facts))
     save_figure(FOLDER / "planning-sweep.png", sweep_figure(sweep), overwrite=True)
 

@@ -261,8 +261,7 @@ def small_plan(**choices) -> ExperimentPlan:
 def test_more_counts_lower_the_error_by_their_root():
     sweep = sweep_experiment(
         BlobRecipe(amplitude=10, sigma=6),
-        quantity="counts",
-        values=[100, 1600],
+        vary={"counts": [100, 1600]},
         shape=(64, 64),
         instrument=EXACT,
         options=ExperimentOptions(draws=8),
@@ -325,8 +324,7 @@ def test_progress_counts_the_draws_of_a_whole_sweep():
     steps = []
     sweep_experiment(
         BlobRecipe(amplitude=15, sigma=6),
-        quantity="counts",
-        values=[100, 200],
+        vary={"counts": [100, 200]},
         shape=(48, 48),
         options=ExperimentOptions(draws=2, threads=1),
         on_progress=lambda progress: steps.append((progress.step, progress.total)),
@@ -369,17 +367,18 @@ def test_wrong_options_are_refused_in_a_sentence(choices, message):
 
 
 @pytest.mark.parametrize(
-    ("quantity", "values", "message"),
+    ("vary", "message"),
     [
-        ("count", [1, 2], "did you mean 'counts'"),
-        ("counts", [100], "two or more"),
-        ("counts", [100, -5], "must be greater than 0"),
-        ("energy", [3, 5], "without a setup"),
+        ({"count": [1, 2]}, "did you mean 'counts'"),
+        ({"counts": [100]}, "two or more"),
+        ({"counts": [100, -5]}, "must be greater than 0"),
+        ({"energy": [3, 5]}, "without a setup"),
+        ({"counts": [1, 2], "blur": [0, 1]}, "2 quantities"),
     ],
 )
-def test_a_wrong_sweep_is_refused_in_a_sentence(quantity, values, message):
+def test_a_wrong_sweep_is_refused_in_a_sentence(vary, message):
     with pytest.raises(InputError, match=message):
-        sweep_experiment(BlobRecipe(), quantity=quantity, values=values, shape=(64, 64))
+        sweep_experiment(BlobRecipe(), vary=vary, shape=(64, 64))
 
 
 # Results

@@ -278,8 +278,7 @@ class PlanJob(Job):
         keywords: Any = {**choices, "on_progress": on_progress, "should_stop": should_stop}
         setups, target = self.setups or None, self._object(on_progress, should_stop)
         if self.quantity:
-            keywords |= {"quantity": self.quantity, "values": self.values}
-            return sweep_experiment(target, setups, **keywords)
+            return sweep_experiment(target, setups, vary={self.quantity: self.values}, **keywords)
         return plan_experiment(target, setups, **keywords)
 
     def _object(self, *callbacks: Any) -> PhantomRecipe | PlannedObject:

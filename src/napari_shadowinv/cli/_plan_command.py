@@ -102,9 +102,8 @@ def plan(
         if flags.sweep is None:
             result, draw = plan_experiment(target, setups, **choices), plan_figure
         else:
-            quantity, values = _sweep(flags.sweep)
-            choices |= {"quantity": quantity, "values": values}
-            result, draw = sweep_experiment(target, setups, **choices), sweep_figure
+            vary = _sweep(flags.sweep)
+            result, draw = sweep_experiment(target, setups, vary=vary, **choices), sweep_figure
     with replacing(out, overwrite) as temporary:
         cells = [
             {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
@@ -174,8 +173,8 @@ def _setups(setup: Setup | None, energies: str | None) -> list[Setup] | None:
     ]
 
 
-def _sweep(text: str) -> tuple[str, list[float]]:
+def _sweep(text: str) -> dict[str, list[float]]:
     name, equals, values = text.partition("=")
     if not equals:
         raise InputError(f"--sweep is '{text}': expected NAME=VALUES, such as counts=100,300,1000")
-    return name.strip().replace("-", "_"), numbers_of("--sweep", values)
+    return {name.strip().replace("-", "_"): numbers_of("--sweep", values)}

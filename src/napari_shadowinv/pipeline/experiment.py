@@ -10,7 +10,7 @@ be determined, what limits it, and what a change buys.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -116,8 +116,7 @@ def sweep_experiment(
     object: PlannedObject | PhantomRecipe,
     setups: Setup | Sequence[Setup] | None = None,
     *,
-    quantity: str,
-    values: Sequence[float],
+    vary: Mapping[str, Sequence[float]],
     shape: tuple[int, int] | None = None,
     instrument: Instrument | None = None,
     options: ExperimentOptions | None = None,
@@ -130,11 +129,10 @@ def sweep_experiment(
     ----------
     object, setups, shape, instrument, options, on_progress, should_stop
         As for `plan_experiment`. The object stays the same.
-    quantity : str
-        Key of the quantity that is varied, one of `SWEPT`: "counts", "energy" of the last image,
-        "object_image_distance", a number of the instrument such as "beam_rms" or "blur".
-    values : sequence of float
-        Its values, two or more, in the unit of that field.
+    vary : mapping of str to sequence of float
+        The quantity that is varied, one of `SWEPT`: "counts", "energy" of the last image,
+        "object_image_distance", a number of the instrument such as "beam_rms" or "blur"; with its
+        values, two or more, in the unit of that field.
 
     Returns
     -------
@@ -149,6 +147,9 @@ def sweep_experiment(
     InversionCancelled
         If `should_stop` returned true.
     """
+    if len(vary) != 1:
+        raise InputError(f"received {len(vary)} quantities to vary: expected one with its values")
+    ((quantity, values),) = vary.items()
     if quantity not in SWEPT:
         raise InputError(f"the quantity to vary is '{quantity}': {suggestion(quantity, SWEPT)}")
     numbers = [float(value) for value in values]
