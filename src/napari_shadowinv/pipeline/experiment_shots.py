@@ -3,7 +3,8 @@
 - the object and the stated quality of the experiment: `ExperimentInputs`
 
 The chain from the beam to the counts has its own imperfections, drawn from the stated instrument.
-Of the models by which inversions and fits judge them it has only how places move, and the exponent.
+Of the models by which inversions and fits judge them it has only how places move, the exponent, and
+smooth fields.
 Rays start at nine samples a pixel, and each sample is cut into nine tiles; light that enters from
 beyond the edge is in it.
 
@@ -23,6 +24,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.shots import point_spread
 from napari_shadowinv.instrument.effects import Gamma, motion
+from napari_shadowinv.instrument.shapes import Shapes
 from napari_shadowinv.options import BeamPrior, Instrument
 from napari_shadowinv.physics.projection import displacement_ratio
 from napari_shadowinv.physics.setup import Setup
@@ -30,7 +32,6 @@ from napari_shadowinv.pipeline.experiment_object import Grid, PlannedObject
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 
 _FINER = 3  # samples along a side of a pixel
-_NEGLIGIBLE = 1e-12  # of the largest variance
 _BEYOND_PX = 4  # more than rays are displaced
 _DIMMEST = 0.02  # of the mean, for a beam or a transmission
 _EDGE = 0.1  # of the largest displacement, where the object ends
@@ -114,7 +115,7 @@ class ShotSimulator:
     def __init__(self, inputs: ExperimentInputs) -> None:
         self.inputs = inputs
         self._object, self._setups, self._beam = inputs.object, inputs.setups, inputs.beam
-        self._roots_by_length: dict[float, list[tuple[FloatArray, float]]] = {}
+        self._shapes: dict[float, Shapes] = {}  # by their length, px
         shape = inputs.shape
         coarse = [self._object.displacement(setup, Grid(shape)) for setup in self._setups]
         reach = max(float(np.abs(moved).max()) for moved in coarse)
@@ -191,34 +192,17 @@ class ShotSimulator:
         self, rng: np.random.Generator, rms: float, length: float | None = None
     ) -> FloatArray:
         """Smooth noise at the samples, with a mean of 0 over the image and an expected r.m.s."""
+        grid = self._grid
         if not rms:
-            return np.zeros(self._grid.sizes)
+            return np.zeros(grid.sizes)
         if length is None:
-            length = self._beam.length * min(self._grid.shape)
-        (along_y, mean_y), (along_x, mean_x) = self._roots(length)
-        field = along_y @ rng.normal(size=(along_y.shape[1], along_x.shape[1])) @ along_x.T
-        # The mean over the image takes a share of the variance.
-        size = rms / math.sqrt(max(1 - mean_y * mean_x, 1e-12))
-        return np.asarray(size * (field - self._inner_samples(field).mean()))
-
-    def _roots(self, length: float) -> list[tuple[FloatArray, float]]:
-        """Roots of the correlation along y and x, and its mean over pairs inside the image."""
-        if length not in self._roots_by_length:
-            edge = self._grid.margin * self._grid.factor
-            roots = []
-            for places in self._grid.lines():
-                correlation = np.exp(-((places[:, None] - places) ** 2) / (2 * length**2))
-                inner = slice(edge, len(places) - edge)
-                variances, vectors = np.linalg.eigh(correlation)
-                is_notable = variances > _NEGLIGIBLE * variances[-1]
-                root = vectors[:, is_notable] * np.sqrt(variances[is_notable])
-                roots.append((root, float(correlation[inner, inner].mean())))
-            self._roots_by_length[length] = roots
-        return self._roots_by_length[length]
-
-    def _inner_samples(self, field: FloatArray) -> FloatArray:
-        edge = self._grid.margin * self._grid.factor
-        return field[edge : field.shape[0] - edge, edge : field.shape[1] - edge]
+            length = self._beam.length * min(grid.shape)
+        if length not in self._shapes:
+            edge = grid.margin * grid.factor
+            image = np.pad(np.ones([grid.factor * side for side in grid.shape]), edge)
+            self._shapes[length] = Shapes.of_length("beam", grid.factor * length, image)
+        shapes = self._shapes[length]
+        return rms * shapes.sum(rng.normal(size=len(shapes)))
 
     def _absorption(self, rng: np.random.Generator) -> FloatArray:
         """Smooth noise of the object's size inside the object."""
@@ -228,8 +212,8 @@ class ShotSimulator:
         size = np.hypot(*self._nominal[0])
         depth = size / max(float(size.max()), 1e-12)
         steep = _STEEPNESS * (np.log(np.maximum(depth, 1e-9)) - math.log(_EDGE))
-        inside = self._inner_samples(depth) > _EDGE
-        radius = math.sqrt(inside.sum() / np.pi) / self._grid.factor
+        inside = self._grid.inner(self._grid.in_pixels(depth)) > _EDGE
+        radius = math.sqrt(inside.sum() / np.pi)
         return np.asarray(self._wave(rng, rms, max(radius, 1.0)) / (1 + np.exp(-steep)))
 
     def _moved(self, reference: FloatArray, rng: np.random.Generator) -> FloatArray:

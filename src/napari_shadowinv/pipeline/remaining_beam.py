@@ -14,10 +14,10 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, map_coordinates
 
 from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.instrument.shapes import Shapes
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot
@@ -129,15 +129,7 @@ def _change(first: FloatArray, second: FloatArray) -> FloatArray:
 
 def _random_beams(shape: tuple[int, int], beam: BeamPrior) -> list[FloatArray]:
     """Return random smooth variations of a prior's length and r.m.s."""
-    rng, block = np.random.default_rng(0), -(-max(shape) // _BLOCKS)
-    width = beam.length * min(shape) / block / np.sqrt(2)
-    around = int(4 * width) + 1
-    places = (np.indices(shape) + 0.5) / block - 0.5 + around
-    size = [-(-side // block) + 2 * around for side in shape]
-    fields = []
-    for _ in range(_BEAMS):
-        smooth = gaussian_filter(rng.normal(size=size), width)
-        field = map_coordinates(smooth, places, order=1)
-        field -= field.mean()
-        fields.append(beam.rms * field / field.std())
-    return fields
+    rng = np.random.default_rng(0)
+    shapes = Shapes.of_length("beam", beam.length * min(shape), np.ones(shape))
+    fields = [shapes.sum(rng.normal(size=len(shapes))) for _ in range(_BEAMS)]
+    return [beam.rms * field / field.std() for field in fields]
