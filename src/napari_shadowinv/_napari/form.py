@@ -270,8 +270,10 @@ class Entry:
         elif self._default is not None:
             hint = _text_of(self._default, self._unit)
         is_file = Path in self._kinds
+        if is_file:
+            hint = "path of a file" if self._kinds == {Path} else "a number, or a file"
         line = magic.LineEdit(**texts)
-        line.native.setPlaceholderText("a number, or a file" if is_file else hint)
+        line.native.setPlaceholderText(hint)
         line.native.setMinimumWidth(_ENTRY_WIDTH_PX)
         if not is_file:
             return line

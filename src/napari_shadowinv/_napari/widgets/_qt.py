@@ -286,6 +286,8 @@ class Plot(QWidget):
         for axis in axes:
             axis.set_facecolor(self.paper)
             axis.tick_params(colors=self.ink, which="both", labelsize=8)
+            for label in (axis.xaxis.label, axis.yaxis.label):
+                label.set(color=self.ink, fontsize=8)
             for spine in axis.spines.values():
                 spine.set_color(self.ink)
             axis.grid(color=self.ink, alpha=0.15)
@@ -367,7 +369,7 @@ class ObjectiveCurve(Plot):
             colour = colours.setdefault(stage, COLOURS[len(colours) % len(COLOURS)])
             axis.plot(numbers, objectives, "-", color=colour, label=label)
         axis.set_yscale("log")
-        axis.set_ylabel("objective", color=self.ink, fontsize=8)
-        axis.set_xlabel("step", color=self.ink, fontsize=8)
+        axis.set_ylabel("objective")
+        axis.set_xlabel("step")
         self.add_legend(self.figure, 7, loc="outside upper center", ncols=3, frameon=False)
         self.draw()
