@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import napari_shadowinv
+from napari_shadowinv.io import formats
 
 ROOT = Path(napari_shadowinv.__file__).parent
 
@@ -20,14 +21,16 @@ def test_it_is_valid_and_each_command_can_be_imported(manifest: Any) -> None:
     assert manifest.name == "napari-shadowinv"
 
 
-def test_its_readers_and_writers_are_those_of_the_registry(manifest: Any) -> None:
-    from napari_shadowinv.io import formats
+# The manifest leaves them out, so that nobody has to choose a reader.
+OPENED_BY_NAPARI = formats.SCAN_SUFFIXES | {".npy", formats.SITES.suffix}
 
+
+def test_its_readers_and_writers_are_those_of_the_registry(manifest: Any) -> None:
     contributions = manifest.contributions
     (reader,) = contributions.readers
     readable = {end for each in formats.FORMATS if each.title for end in each.suffixes}
     # The last stands for arrays in files, run.h5::/entry/data.
-    patterns = {*(f"*{suffix}" for suffix in readable - formats.OPENED_BY_NAPARI), "*::*"}
+    patterns = {*(f"*{suffix}" for suffix in readable - OPENED_BY_NAPARI), "*::*"}
     assert sorted(reader.filename_patterns) == sorted(patterns)
     # A store is a folder, and folders are offered whatever their name.
     assert reader.accepts_directories
@@ -39,8 +42,6 @@ def test_its_readers_and_writers_are_those_of_the_registry(manifest: Any) -> Non
 def test_napari_itself_opens_what_is_left_to_it() -> None:
     import napari_builtins
     from npe2 import PluginManifest
-
-    from napari_shadowinv.io.formats import OPENED_BY_NAPARI
 
     builtins = PluginManifest.from_file(Path(napari_builtins.__file__).with_name("builtins.yaml"))
     patterns = {
@@ -140,6 +141,7 @@ def test_the_public_function_does_not_import_napari(alone: Any) -> None:
         """
 import sys
 import napari_shadowinv
+from napari_shadowinv.io import formats
 napari_shadowinv.add_to_viewer
 print([m for m in sys.modules if m in ("napari", "qtpy", "dask")])
 """

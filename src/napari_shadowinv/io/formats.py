@@ -196,8 +196,6 @@ READABLE = _join_titles(each.title for each in FORMATS)
 IMAGE_TITLES = _join_titles(each.title for each in FORMATS if "image" in each.holds)
 IMAGE_SUFFIXES = _collect_suffixes(each for each in FORMATS if "image" in each.holds)
 SCAN_SUFFIXES = _collect_suffixes(each for each in FORMATS if each.is_scan)
-# Endings that napari opens itself: the manifest leaves them out, so that nobody has to choose.
-OPENED_BY_NAPARI = SCAN_SUFFIXES | {".npy", SITES.suffix}
 # By the ending.
 IMAGE_WRITERS = {
     suffix: each.image_writer for each in FORMATS if each.image_writer for suffix in each.suffixes

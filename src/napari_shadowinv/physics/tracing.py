@@ -90,7 +90,6 @@ class TracedImage(Summarised):
         Those that did not reach the detector.
     setup : ProtonSetup
     options : TraceOptions
-    seed : int
     length : float
         Length of the grid along the beam in m.
     edge_share : float
@@ -113,7 +112,6 @@ class TracedImage(Summarised):
     lost: int
     setup: ProtonSetup
     options: TraceOptions
-    seed: int
     length: float
     edge_share: float
     steps: int
@@ -199,7 +197,6 @@ class TracedImage(Summarised):
             "setup": self.setup.model_dump_json(),
             "trace_options": self.options.model_dump_json(),
             **{name: getattr(self, name) for name in ("launched", "landed", "outside", "lost")},
-            "seed": self.seed,
             "length_m": self.length,
             "edge_share": self.edge_share,
         }
@@ -297,7 +294,6 @@ def trace(
         outside=exposure.launched - exposure.landed - exposure.lost,
         setup=setup,
         options=options,
-        seed=options.seed,
         length=grid.length,
         edge_share=grid.edge_share,
     )
