@@ -15,6 +15,7 @@ and J. Tshimanga, SIAM J. Optim. 21, 912 (2011).
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.linalg import eigh_tridiagonal
@@ -27,44 +28,39 @@ def product(first: FloatArray, second: FloatArray) -> float:
     return float(np.einsum("i,i", first, second))
 
 
+@dataclass(eq=False)
 class SoftModes:
     """Directions in which a matrix is small or large, for systems with nearly the same matrix.
 
     `solve` uses them, and adds those that have cost it many steps. What they are changes the number
     of steps, not the solution beyond its tolerance.
 
-    Parameters
+    Attributes
     ----------
-    most : int, default 120
+    most : int
         Modes that are kept.
-    soft, stiff : float, default 0.5 and 4
+    soft, stiff : float
         Eigenvalues below and above which directions are modes; most are about 1.
-    worth : int, default 12
+    worth : int
         Least steps of a solution from which modes are taken.
-    outdated : int, default 100
+    outdated : int
         Steps of a solution with as many modes as are kept, from which they belong to another
         matrix.
-    found : float, default 0.5
+    found : float
         Largest residual of an eigenvector over its eigenvalue.
-    independent : float, default 1e-4
+    independent : float
         Least eigenvalue of the vectors' products; rounding makes copies of some.
     """
 
-    def __init__(
-        self,
-        most: int = 120,
-        *,
-        soft: float = 0.5,
-        stiff: float = 4.0,
-        worth: int = 12,
-        outdated: int = 100,
-        found: float = 0.5,
-        independent: float = 1e-4,
-    ) -> None:
-        self.worth, self._most, self._outdated = worth, most, outdated
-        self._soft, self._stiff, self._found, self._independent = soft, stiff, found, independent
-        self._vectors = np.empty((0, 0))
-        self._weights = np.empty(0)
+    most: int = 120
+    soft: float = 0.5
+    stiff: float = 4.0
+    worth: int = 12
+    outdated: int = 100
+    found: float = 0.5
+    independent: float = 1e-4
+    _vectors: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    _weights: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __len__(self) -> int:
         return len(self._weights)
@@ -84,16 +80,16 @@ class SoftModes:
         matrix = history.matrix()
         values, mixing = _tridiagonal_eigensystem(matrix[:-1, :-1])
         errors = np.abs(matrix[-1, -2] * mixing[-1])
-        is_far = (values < self._soft) | (values > self._stiff)
-        chosen = np.flatnonzero(is_far & (errors < self._found * values))
-        size, is_outdated = history.size, len(history) > self._outdated
+        is_far = (values < self.soft) | (values > self.stiff)
+        chosen = np.flatnonzero(is_far & (errors < self.found * values))
+        size, is_outdated = history.size, len(history) > self.outdated
         if self._vectors.shape[1] != size:
             self._vectors, self._weights = np.empty((0, size)), np.empty(0)
-        elif is_outdated and len(self) == self._most:
+        elif is_outdated and len(self) == self.most:
             self._vectors, self._weights = np.empty((0, size)), np.empty(0)
             # Their lengths are those with the old modes: less of a stiff one could become negative.
-            chosen = chosen[values[chosen] < self._soft]
-        chosen = chosen[: self._most - len(self)]
+            chosen = chosen[values[chosen] < self.soft]
+        chosen = chosen[: self.most - len(self)]
         if not chosen.size:
             return
         mixing = mixing[:, chosen]
@@ -105,7 +101,7 @@ class SoftModes:
         overlaps = np.einsum("in,jn->ij", vectors, untouched)
         energies = np.einsum("in,jn->ij", vectors, images)
         sizes, turn = eigensystem(overlaps + overlaps.T)
-        is_new = sizes > self._independent
+        is_new = sizes > self.independent
         turn = turn[:, is_new] / np.sqrt(sizes[is_new] / 2)
         turned_energies = np.einsum("jk,ji->ki", turn, energies + energies.T)
         values, inner = eigensystem(np.einsum("ki,ij->kj", turned_energies, turn) / 2)

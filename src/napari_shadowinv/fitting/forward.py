@@ -532,7 +532,9 @@ class Linear:
 
     def _potential_changes(self, change: Unknowns) -> FloatArray:
         imperfect = self.scene.imperfect
-        changes = np.einsum("lm,myx->lyx", self._strengths, change.potentials)
+        changes = np.einsum(
+            "lm,myx->lyx", self.scene.strengths_with(self.unknowns), change.potentials
+        )
         if imperfect.other_strengths is not None:
             other = change.common[imperfect.place("other_field")] * imperfect.other_strengths
             changes += np.einsum("lm,myx->lyx", other, self.unknowns.potentials)
@@ -551,10 +553,6 @@ class Linear:
     @cached_property
     def _entering(self) -> list[_Entering]:
         return self.scene._entering(self.unknowns, list(self.scene._lights(self.unknowns)))
-
-    @cached_property
-    def _strengths(self) -> FloatArray:
-        return self.scene.strengths_with(self.unknowns)
 
     @cached_property
     def _has_light(self) -> bool:
