@@ -87,7 +87,7 @@ def agreement_row(peak: int, n_sites: int, n: int) -> str:
         return f"{whole:.3f} ({low:.2f} to {high:.2f})"
 
     return (
-        f"| toroid {peak} | {n_sites:,} | {linear.nonlinearity:.0%} "
+        f"| toroid {peak} | {n_sites:,} | {linear.linearity.nonlinearity:.0%} "
         f"| {compared('displacement_std')} | {compared('potential_std')} |"
     )
 

@@ -171,16 +171,16 @@ def test_fitted_samples_are_compared_with_those_to_first_order() -> None:
     totals = [each.total_error for each in fits]
     assert totals[1] == pytest.approx(totals[0], rel=0.15)
     assert totals[1] != totals[0]
-    assert 0 < solved.nonlinearity < 0.3
-    assert solved.spread_ratio == pytest.approx(1, abs=0.15)
+    assert 0 < solved.linearity.nonlinearity < 0.3
+    assert solved.linearity.spread_ratio == pytest.approx(1, abs=0.15)
     assert not any(caution.code == "samples" for each in fits for caution in each.warnings)
     np.testing.assert_array_equal(fits[0].fields[0].potential, fits[1].fields[0].potential)
     restored = Fit.from_dataset(fits[1].to_dataset()).report
-    assert (restored.sampling, restored.nonlinearity) == ("resolve", solved.nonlinearity)
+    assert (restored.sampling, restored.linearity) == ("resolve", solved.linearity)
 
-    skewed = replace(linear, nonlinearity=0.6)
+    skewed = replace(linear, linearity=replace(linear.linearity, nonlinearity=0.6))
     (caution,) = (c for c in replace(fits[0], report=skewed).cautions if c.code == "samples")
-    assert "differ from fitted ones by 60 % of their change" in caution.text
+    assert "differ from solved ones by 60 % of their change" in caution.text
     assert "use the sampling 'resolve'" in caution.text
     assert not replace(fits[1], report=replace(skewed, sampling="resolve")).warnings
 

@@ -179,8 +179,8 @@ def test_a_solved_sample_explains_its_noise_and_its_force_in_full() -> None:
     linear = posterior.draw_samples(4)
     solved = posterior.solve(linear)
     pairs = compare_samples(scene, linear, solved)
-    assert 0.01 < pairs.nonlinearity < 0.5
-    assert pairs.spread_ratio == pytest.approx(1, abs=0.2)
+    assert 0.01 < pairs.linearity.nonlinearity < 0.5
+    assert pairs.linearity.spread_ratio == pytest.approx(1, abs=0.2)
 
     def gain_left(sample: Sample, change: Unknowns) -> float:
         """What a Newton step from a sample would still gain."""

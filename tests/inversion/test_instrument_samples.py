@@ -186,8 +186,8 @@ def test_linear_samples_are_near_the_solved_ones(image, source):
     assert len(inversion.errors.causes) == 8
     ratio = rms(linear.displacement_std) / rms(solved.displacement_std)
     assert ratio == pytest.approx(1, abs=0.1)
-    assert linear.spread_ratio == pytest.approx(1, abs=0.1)
-    assert linear.mean_shift < 0.2
+    assert linear.linearity.spread_ratio == pytest.approx(1, abs=0.1)
+    assert linear.linearity.mean_shift < 0.2
     assert not any(caution.code == "samples" for caution in inversion.cautions)
 
 
@@ -209,7 +209,7 @@ def test_solved_samples_correct_mean_and_deviation(image, source, stated, monkey
     assert error(linear) < max(0.3 * error(unscaled), 0.1)
     shift = rms(linear.displacement_mean - solved.displacement_mean)
     # So does a small difference of the means.
-    assert shift < max(0.5 * linear.mean_shift, 0.05) * rms(solved.displacement_std)
+    assert shift < max(0.5 * linear.linearity.mean_shift, 0.05) * rms(solved.displacement_std)
     peaks = [each.quantities["peak"] for each in (linear, unscaled, solved)]
     of_linear, of_unscaled, of_solved = (np.log(each.samples.std()) for each in peaks)
     assert abs(of_linear - of_solved) < max(0.5 * abs(of_unscaled - of_solved), 0.1)
@@ -226,7 +226,7 @@ def test_a_dark_level_above_the_darkest_pixels_leaves_them_dark(image, source):
 def test_an_instrument_too_uncertain_for_a_linear_answer_is_reported(image, source):
     result = sampled(image, source, Instrument(background=0.4), n=24)
     assert [caution.code for caution in result.cautions].count("samples") == 1
-    assert result.errors.samples.nonlinearity > 0.6
+    assert result.errors.samples.linearity.nonlinearity > 0.6
 
 
 @pytest.mark.parametrize("kind", ["masked", "free"])
@@ -239,8 +239,8 @@ def test_linear_samples_follow_a_mask_and_a_margin(image, source, kind):
         options = OPTIONS.model_copy(update={"boundary": "free"})
     stated = Instrument(beam_rms=0.01, background=0.02, gamma=0.02, blur=0.5, registration=0.2)
     result = sample(image, source, stated, n=8, mask=mask, options=options)
-    assert result.spread_ratio == pytest.approx(1, abs=0.1)
-    assert result.nonlinearity < 0.3
+    assert result.linearity.spread_ratio == pytest.approx(1, abs=0.1)
+    assert result.linearity.nonlinearity < 0.3
     assert all(result.converged)
 
 

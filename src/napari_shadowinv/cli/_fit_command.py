@@ -142,11 +142,13 @@ def _comparison_table(fits: Sequence[Fit]) -> Table:
     headings = "fields", "χ²", "log evidence", "verdict"
     table = Table(*headings, title="Comparison", title_justify="left", box=box.SIMPLE)
     table.caption = "A difference of 10 is decisive."
-    best = fits[0].report.log_evidence
+    best = fits[0].report.log_evidence or 0.0
     for fit in fits:
         names = ", ".join(field.name for field in fit.fields)
         chi2 = ", ".join(f"{value:.3g}" for value in fit.chi2)
-        evidence = "likeliest" if fit is fits[0] else f"{fit.report.log_evidence - best:+.1f}"
+        evidence = (
+            "likeliest" if fit is fits[0] else f"{(fit.report.log_evidence or 0.0) - best:+.1f}"
+        )
         table.add_row(names, chi2, evidence, fit.verdict)
     return table
 

@@ -311,11 +311,11 @@ def compare(
         )
         for choice in choices
     ]
-    least = max(each.report.log_evidence for each in fits) - decisive
+    evidences = {each: each.report.log_evidence or 0.0 for each in fits}
+    least = max(evidences.values()) - decisive
 
     def rank(one: Fit) -> tuple[float, float]:
-        evidence = one.report.log_evidence
-        return (len(one.fields) if evidence > least else np.inf), -evidence
+        return (len(one.fields) if evidences[one] > least else np.inf), -evidences[one]
 
     return tuple(sorted(fits, key=rank))
 

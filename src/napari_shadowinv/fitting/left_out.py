@@ -37,7 +37,7 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
 _SENTENCE = "left_out"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LeaveOneOut:
     """Several images, each predicted from a fit of the others.
 

@@ -6,9 +6,11 @@ import dataclasses
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from pydantic import TypeAdapter
 
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -32,6 +34,7 @@ from napari_shadowinv.facts import (
     verdict_fact,
 )
 from napari_shadowinv.fitting.instrument import number_text
+from napari_shadowinv.inversion.error_bars import FIT_LINEARITY, Linearity
 from napari_shadowinv.inversion.error_budget import ErrorBudget, per_pixel_of
 from napari_shadowinv.inversion.variables import FIT_VARIABLES, belongs, dataset_from_field
 from napari_shadowinv.options import FitOptions, Instrument
@@ -87,7 +90,6 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
 # Those with the name of their attribute.
 _OF_IMAGES = "images", "source", "reprojection", "residual", "mask", "chi2", "brightness"
 _OF_BASINS = "objective", "chi2", "distance", "displacement"
-_LINEAR_ENOUGH, _SPREAD_ENOUGH = 0.5, 0.3
 _WORDS = "reason", "advice", "explanation"  # of the assessment
 _BUDGET = "errors", "error_causes"
 _ATTRIBUTES = ("options", "instrument", "report", *_BUDGET, "verdict", *_WORDS, "folded", "setups")
@@ -104,7 +106,7 @@ _REMEDIES = {
 }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FittedField:
     """One of the fields that deflect, in the first image's pixels and at its strength.
 
@@ -133,7 +135,7 @@ class FittedField:
     samples: AnyArray | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Basin:
     """Where a start has led.
 
@@ -173,53 +175,33 @@ class FitReport:
     seconds : dict of str to float
         Time of each stage; of "samples" what they take longer than "full size", beside which they
         are drawn.
-    log_evidence : float
-        Logarithm of the evidence, up to a constant that is the same for all choices of fields; NaN
+    log_evidence : float or None
+        Logarithm of the evidence, up to a constant that is the same for all choices of fields; None
         if it was not requested.
-    pattern : float
+    pattern : float or None
         How far the smoothed residual of an image stands out of white noise, in standard
-        deviations; the largest of all images, NaN if not known. See `pattern_strength`.
+        deviations; the largest of all images. See `pattern_strength`.
     numbers : dict of str to list
         Numbers of the instrument as fitted, by their names in `Instrument`, each with its standard
         deviation, for all images or for each; see `numbers_in_units`.
     sampling : {"linear", "resolve"}
         Whether the samples of the error bars respond to first order, or were fitted.
-    nonlinearity, spread_ratio : float or None
-        Of those that were fitted: deviation of their displacements to first order, as a share of
-        them, and their size relative to these (r.m.s.); None if none was.
+    linearity : Linearity or None
+        Displacements of samples to first order against those that were fitted; None if none was.
     """
 
     objective: float
     iterations: int
     converged: bool
     seconds: dict[str, float]
-    log_evidence: float = float("nan")
-    pattern: float = float("nan")
+    log_evidence: float | None = None
+    pattern: float | None = None
     numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
     sampling: str = "linear"
-    nonlinearity: float | None = None
-    spread_ratio: float | None = None
-
-    @property
-    def sampling_text(self) -> str:
-        """How far samples to first order are from those that were fitted; "" if none was."""
-        if self.nonlinearity is None or self.spread_ratio is None:
-            return ""
-        return (
-            f"to first order, samples differ from fitted ones by {percent(self.nonlinearity)} of "
-            f"their change, and fitted ones scatter {to_figures(self.spread_ratio)} times as far"
-        )
-
-    @property
-    def is_linear_enough(self) -> bool:
-        """Whether the samples hold the response to noise and instrument."""
-        if self.sampling == "resolve" or self.nonlinearity is None or self.spread_ratio is None:
-            return True
-        is_spread = abs(self.spread_ratio - 1) > _SPREAD_ENOUGH
-        return not (is_spread or self.nonlinearity > _LINEAR_ENOUGH)
+    linearity: Linearity | None = None
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit(Summarised):
     """Fields, beam and brightness that explain several images of one object.
 
@@ -351,13 +333,11 @@ class Fit(Summarised):
             for number, each in enumerate(self._origins, 1)
             for caution in each.warnings
         )
-        if self.report.is_linear_enough:
+        linearity = self.report.linearity
+        if linearity is None or self.report.sampling == "resolve":
             return of_images
-        text = (
-            f"the response to noise and instrument is not linear: {self.report.sampling_text}; "
-            "use the sampling 'resolve'"
-        )
-        return (*of_images, Caution("samples", text))
+        caution = linearity.caution(FIT_LINEARITY, "noise and instrument", "sampling")
+        return of_images if caution is None else (*of_images, caution)
 
     @property
     def setup(self) -> Setup | None:
@@ -525,8 +505,6 @@ class Fit(Summarised):
             )
         arrays = {name: numbers_of(dataset, name) for name in _VARIABLES}
         attributes = dataset.attrs
-        entries = {field.name for field in dataclasses.fields(FitReport)}
-        content = json.loads(attributes["report"])
         names = [str(name) for name in dataset["field"].values]
         budgets = zip(*(json.loads(attributes[key]) for key in _BUDGET), strict=True)
         fields = [
@@ -553,13 +531,18 @@ class Fit(Summarised):
                 advice=str(attributes["advice"]),
                 explanation=str(attributes["explanation"]),
             ),
-            report=FitReport(**{name: content[name] for name in entries & content.keys()}),
+            report=_report_schema().validate_python(json.loads(attributes["report"])),
             options=FitOptions.model_validate_json(attributes["options"]),
             instrument=Instrument.model_validate_json(attributes["instrument"]),
             setups=setups_in(dataset),
             provenance=Provenance.of(attributes, dataset.variables),
             noise=noise_in(dataset, "noise"),
         )
+
+
+@cache
+def _report_schema() -> TypeAdapter[FitReport]:
+    return TypeAdapter(FitReport)
 
 
 def _image_facts(fit: Fit, names: Sequence[str]) -> Iterator[Fact]:

@@ -177,8 +177,7 @@ def report_of(
             [sample.change for sample in openness.samples],
         ),
         sampling=data.options.sampling,
-        nonlinearity=None if pairs is None else pairs.nonlinearity,
-        spread_ratio=None if pairs is None else pairs.spread_ratio,
+        linearity=None if pairs is None else pairs.linearity,
     )
 
 

@@ -2,6 +2,7 @@
 
 - a number that is derived from the field, with its samples: `Quantity`; of a maximum: `Maximum`
 - mean and scatter of samples in every pixel: `ErrorSamples`, drawn by `Inversion.uncertainty`
+- linear samples against those that were solved as well: `Linearity`
 
 Bands mirror the samples at the value (the basic bootstrap): B. Efron and R. J. Tibshirani, *An
 Introduction to the Bootstrap* (Chapman & Hall, 1993), chapter 13.
@@ -10,8 +11,9 @@ Introduction to the Bootstrap* (Chapman & Hall, 1993), chapter 13.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +22,9 @@ from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import label
@@ -30,7 +34,7 @@ if TYPE_CHECKING:
 
 _ENOUGH_FOR_QUANTILES = 40
 _STORED = (
-    *("n", "noise", "method", "nonlinearity", "spread_ratio", "mean_shift", "tolerance"),
+    *("n", "noise", "method", "linearity", "tolerance"),
     *("iterations", "residuals", "converged"),
 )
 
@@ -134,6 +138,56 @@ def _checked_share(share: float) -> float:
     return share
 
 
+@dataclass(frozen=True)
+class LinearityCheck:
+    """Largest deviations of linear samples from solved ones that need no caution."""
+
+    nonlinearity: float = 0.3
+    spread: float = math.inf  # of `spread_ratio` from 1
+
+
+NOISE_LINEARITY = LinearityCheck()
+"""For samples of the noise alone."""
+
+CORRECTED_LINEARITY = LinearityCheck(0.6)
+"""For samples of noise and instrument, which are corrected by those that were solved."""
+
+FIT_LINEARITY = LinearityCheck(0.5, 0.3)
+"""For the few samples of a fit, of which two are solved."""
+
+
+@dataclass(frozen=True)
+class Linearity:
+    """Linear samples against those that were solved as well.
+
+    Attributes
+    ----------
+    nonlinearity : float
+        Deviation of linear samples from solved ones, as a share of the change (r.m.s. over the
+        image).
+    spread_ratio : float
+        Size of the solved changes relative to the linear ones (r.m.s.).
+    mean_shift : float
+        Difference of their means, relative to the r.m.s. standard deviation.
+    """
+
+    nonlinearity: float
+    spread_ratio: float
+    mean_shift: float
+
+    def caution(self, check: LinearityCheck, cause: str, option: str) -> Caution | None:
+        """Warn if the response to a cause is not linear; `option` lets all samples be solved."""
+        is_spread = abs(self.spread_ratio - 1) > check.spread
+        if not (is_spread or self.nonlinearity > check.nonlinearity):
+            return None
+        return Caution(
+            "samples",
+            f"the response to {cause} is not linear: linear samples differ from solved ones by "
+            f"{percent(self.nonlinearity)} of their change, and solved ones scatter "
+            f"{to_figures(self.spread_ratio)} times as far; use the {option} 'resolve'",
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class ErrorSamples:
     """Random samples of a field by its noise, and by its instrument and edge if these are drawn.
@@ -153,15 +207,9 @@ class ErrorSamples:
         Assumed noise.
     method : {"linear", "resolve"}
         How samples were inverted.
-    nonlinearity : float
-        Deviation of linear samples from solved ones, as a share of the change (r.m.s. over the
-        image); 0 where all were solved.
-    spread_ratio : float
-        Size of the changes in those solved samples relative to the linear ones (r.m.s.); 1 where
-        all were solved. With an instrument, means and deviations are corrected by it.
-    mean_shift : float
-        Difference of their means, relative to the r.m.s. standard deviation; 0 where all were
-        solved. With an instrument, means are corrected by it.
+    linearity : Linearity or None
+        Linear samples against solved ones, by which means and deviations with an instrument are
+        corrected; None where all were solved.
     tolerance : float
         Largest relative flux error of a cell that was allowed in a sample that was solved.
     iterations, residuals, converged : tuple of int, of float, of bool
@@ -180,9 +228,7 @@ class ErrorSamples:
     n: int
     noise: str
     method: str
-    nonlinearity: float
-    spread_ratio: float
-    mean_shift: float
+    linearity: Linearity | None
     tolerance: float
     iterations: tuple[int, ...]
     residuals: tuple[float, ...]
@@ -214,6 +260,7 @@ class ErrorSamples:
         ``uncertainty``.
         """
         values = {name: each for name, each in vars(self).items() if name in _STORED}
+        values["linearity"] = self.linearity and asdict(self.linearity)
         means = {"potential": self.potential_mean, "displacement": self.displacement_mean}
         scatter = dataset_from_field(self.displacement_std, self.potential_std, setup)
         # each is its argument times a number, perhaps negative, perhaps with axes exchanged

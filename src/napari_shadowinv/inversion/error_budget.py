@@ -140,9 +140,9 @@ class ErrorBudget:
     noise_is_bound: bool = False
     assumed: tuple[str, ...] = ()
     sampled: ErrorEstimate | None = None
-    per_pixel: FloatArray | None = None
+    per_pixel: FloatArray | None = field(default=None, compare=False)
     causes: tuple[str, ...] = ()
-    samples: ErrorSamples | None = None
+    samples: ErrorSamples | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all but the values of pixels, for JSON."""

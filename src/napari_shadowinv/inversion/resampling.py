@@ -39,10 +39,11 @@ from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import percent
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.instrument.effects import InstrumentDraws, RecordedShot
 from napari_shadowinv.inversion.error_bars import (
+    CORRECTED_LINEARITY,
+    NOISE_LINEARITY,
     ErrorSamples,
     Maximum,
     Quantities,
@@ -69,7 +70,6 @@ from napari_shadowinv.physics.edge import edge_changes
 Result = TypeVar("Result")
 
 _CHECKED, _SOLVED = 3, 3 * WIDTH  # linear samples that are solved, too; with an instrument
-_LINEAR_ENOUGH, _CORRECTABLE = 0.3, 0.6  # of their change
 _MAX_BEAM_RMS = 0.9
 _POLL_SECONDS = 0.1
 _BYTES_PER_SITE, _BYTES_PER_PIXEL = 700, 150  # measured peaks of one sample, rounded up
@@ -189,9 +189,6 @@ class Sampler:
         samples = self.resolve(report) if method == "resolve" else self.respond(report)
         scatter, pairs = samples.scatter, samples.pairs
         mean, std, of_samples = scatter.mean, scatter.std, _joined(scatter.quantities)
-        check = {"nonlinearity": 0.0, "spread_ratio": 1.0, "mean_shift": 0.0}
-        if pairs is not None:
-            check = {name: getattr(pairs.part(np.s_[1:]), name) for name in check}
         if self.resampling.instrument is not None and pairs is not None:
             mean, std = mean + pairs.shift, std * pairs.factor
             for name, exact in _joined(samples.of_solved).items():
@@ -210,7 +207,7 @@ class Sampler:
             n=scatter.count,
             noise=noise,
             method=method,
-            **check,
+            linearity=None if pairs is None else pairs.part(np.s_[1:]).linearity,
             tolerance=self.resampling.options.tolerance,
             iterations=iterations,
             residuals=residuals,
@@ -239,15 +236,12 @@ class Sampler:
                 "the deviations are unreliable where the samples scatter most"
             )
             yield Caution("samples", text)
-        has_instrument = self.resampling.instrument is not None
-        # With an instrument, samples are corrected for what is not linear, as far as that is small.
-        if samples.nonlinearity > (_CORRECTABLE if has_instrument else _LINEAR_ENOUGH):
-            cause = "noise and instrument" if has_instrument else "noise"
-            text = (
-                f"the response to {cause} is not linear: samples that were solved differ by "
-                f"{percent(samples.nonlinearity)} of what these change; use the method 'resolve'"
-            )
-            yield Caution("samples", text)
+        check, cause = CORRECTED_LINEARITY, "noise and instrument"
+        if self.resampling.instrument is None:
+            check, cause = NOISE_LINEARITY, "noise"
+        if samples.linearity is not None:
+            caution = samples.linearity.caution(check, cause, "method")
+            yield from [] if caution is None else [caution]
 
 
 def check_choices(n: Any, method: Any) -> None:

@@ -158,7 +158,7 @@ class Cells:
     displacement: FloatArray
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Inversion(Summarised):
     """Deflection potential of one shot, with its errors and warnings.
 

@@ -32,6 +32,7 @@ from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.power_diagram import PowerDiagram, pixel_shares
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.instrument.effects import InstrumentDraws
+from napari_shadowinv.inversion.error_bars import Linearity
 from napari_shadowinv.inversion.normalise import (
     flooring_for,
     margin_around,
@@ -353,23 +354,15 @@ class Pairs:
         return Pairs(self.count, linear, solved, self.products[:, numbers])
 
     @property
-    def nonlinearity(self) -> float:
-        """Length of the differences relative to the solved samples."""
+    def linearity(self) -> Linearity:
+        """How far linear samples are from solved ones."""
         linear, solved, both = (float(each.sum()) for each in self.products)
-        return float(np.sqrt(max(linear + solved - 2 * both, 0.0) / solved)) if solved > 0 else 0.0
-
-    @property
-    def spread_ratio(self) -> float:
-        """Length of the solved samples relative to the linear ones."""
-        linear, solved, _ = (float(each.sum()) for each in self.products)
-        return float(np.sqrt(solved / linear)) if linear > 0 else 0.0
-
-    @property
-    def mean_shift(self) -> float:
-        """Length of the shift relative to the deviation of the solved samples."""
-        squares = float(self.products[1].sum() - (self.solved**2).sum() / self.count)
-        spread = float(np.sqrt(max(squares, 0.0) / max(self.count - 1, 1)))
-        return float(np.linalg.norm(self.shift)) / spread if spread > 0 else 0.0
+        gap = math.sqrt(max(linear + solved - 2 * both, 0.0) / solved) if solved > 0 else 0.0
+        ratio = math.sqrt(solved / linear) if linear > 0 else 0.0
+        squares = float(solved - (self.solved**2).sum() / self.count)
+        spread = math.sqrt(max(squares, 0.0) / max(self.count - 1, 1))
+        shift = float(np.linalg.norm(self.shift)) / spread if spread > 0 else 0.0
+        return Linearity(gap, ratio, shift)
 
 
 def correct(samples: FloatArray, solved: FloatArray) -> FloatArray:
