@@ -9,10 +9,9 @@ import pytest
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
+from napari_shadowinv.physics.phantoms import paper_setup, toroid
 from napari_shadowinv.physics.projection import (
     predict_image,
-    project_potential,
     transferred_displacement,
 )
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
@@ -159,13 +158,6 @@ def test_exact_field_predicts_the_image_of_another_energy() -> None:
     measured = toroid((80, 80), FAST, 40.0, 15e-6).displacement
     expected = synthetic_image(toroid((80, 80), SLOW, 40.0, 15e-6).displacement)
     np.testing.assert_allclose(predict_image(measured, FAST, SLOW), expected, rtol=1e-9)
-
-
-def test_a_potential_in_metres_makes_the_image() -> None:
-    blob = gaussian_blob((60, 70), 60.0, 9.0, (27, 40))
-    image = project_potential(GREEN.potential(blob.potential), GREEN, GREEN)
-    # Differences of second order: (1/σ)² / 6 of the displacement.
-    np.testing.assert_allclose(image, synthetic_image(blob.displacement), atol=0.03)
 
 
 def test_source_gives_the_shape_of_the_image() -> None:

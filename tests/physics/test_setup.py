@@ -168,10 +168,6 @@ def test_round_trips_of_the_line_integrals_of_light(optical: OpticalSetup) -> No
     for convert, invert in (
         (optical.line_integrated_log_index, optical.normalized_potential_from_log_index),
         (optical.line_integrated_density, optical.normalized_potential_from_density),
-        (
-            lambda phi: optical.relative_density_modulation(phi, 1.65e25),
-            lambda integral: optical.normalized_potential_from_modulation(integral, 1.65e25),
-        ),
     ):
         np.testing.assert_allclose(invert(convert(phi)), phi, rtol=1e-14)
 
@@ -237,8 +233,6 @@ def test_density_gives_the_refractive_index_of_the_potential(optical: OpticalSet
 def test_density_must_be_positive(optical: OpticalSetup, density: float) -> None:
     with pytest.raises(InputError, match=r"density is .* must be positive"):
         optical.relative_density_modulation(1.0, density)
-    with pytest.raises(InputError, match=r"density is .* must be positive"):
-        optical.normalized_potential_from_modulation(1.0, density)
 
 
 @pytest.mark.parametrize(

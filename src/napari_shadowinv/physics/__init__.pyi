@@ -3,7 +3,7 @@ from .forward import jacobian_determinant, synthetic_image
 from .particle_flight import TracedParticles, trace_particles
 from .phantoms import Phantom, ellipse_pair, gaussian_blob, paper_setup, toroid
 from .poisson import border_mean, poisson_invert
-from .projection import predict_image, project_potential, transferred_displacement
+from .projection import predict_image, transferred_displacement
 from .setup import OpticalSetup, ProtonSetup, Setup, setup_from_dict
 from .trace_options import TraceOptions
 from .tracing import TracedImage, trace
@@ -25,7 +25,6 @@ __all__ = [
     "paper_setup",
     "poisson_invert",
     "predict_image",
-    "project_potential",
     "setup_from_dict",
     "synthetic_image",
     "toroid",

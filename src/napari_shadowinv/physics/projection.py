@@ -2,7 +2,7 @@
 
 - the displacement in another experiment: `transferred_displacement`; by how much it is larger:
   `displacement_ratio`
-- the image there, from a displacement: `predict_image`; from a potential in SI: `project_potential`
+- the image there: `predict_image`
 - the cause of the deflection, which both experiments have in common: `deflector_titles`
 
 A deflection angle, and with it the potential in m, belongs to a beam. The object is described by a
@@ -25,7 +25,6 @@ their images. The object is thin: rays of every direction pass straight through 
 from __future__ import annotations
 
 import math
-from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -89,32 +88,6 @@ def predict_image(
         displacement, recorded_with, setup, deflector=deflector, dispersion=dispersion, shape=shape
     )
     return synthetic_image(moved, source, rays_per_pixel=rays_per_pixel, threads=threads)
-
-
-class _Keywords(TypedDict, total=False):
-    deflector: str | None
-    dispersion: float
-    source: ArrayLike | None
-    rays_per_pixel: int
-    threads: int | None
-
-
-def project_potential(
-    potential: ArrayLike, recorded_with: Setup, setup: Setup, **keywords: Unpack[_Keywords]
-) -> FloatArray:
-    """Image that a potential in SI units makes, in its own or in another experiment.
-
-    Parameters
-    ----------
-    potential : array_like, shape (H, W)
-        Potential Φ in m at the centres of the pixels of `recorded_with`, as its `potential` gives
-        it; `displacement_from_potential` takes the gradient.
-    recorded_with, setup, **keywords
-        As for `predict_image`, whose result and errors this has; also refused is a potential that
-        is no plane.
-    """
-    displacement = recorded_with.displacement_from_potential(potential)
-    return predict_image(displacement, recorded_with, setup, **keywords)
 
 
 def transferred_displacement(

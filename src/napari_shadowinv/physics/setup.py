@@ -47,7 +47,6 @@ from napari_shadowinv.physics.beam import (
     SIField,
     length_text,
     number_field,
-    scale_by,
 )
 
 Species = Literal["proton", "deuteron", "triton", "helion", "alpha", "electron"]
@@ -394,14 +393,6 @@ class OpticalSetup(BeamSetup):
         n₀ in m⁻³; an `InputError` if that is not positive and finite.
         """
         return self.line_integrated_density(phi) / _positive_density(density)
-
-    def normalized_potential_from_modulation(
-        self, modulation: ArrayLike, density: float
-    ) -> FloatArray:
-        """Potential φ in px² of a modulated plasma, from ∫Δn/n₀ dz in m and n₀ in m⁻³."""
-        return self.normalized_potential_from_density(
-            scale_by(modulation, _positive_density(density))
-        )
 
 
 def _positive_density(density: float) -> float:

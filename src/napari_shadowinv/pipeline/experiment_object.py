@@ -341,15 +341,13 @@ def object_of_displacement(
     return PlannedObject(samples, title=title, setup=setup, deflector=deflector)
 
 
-def object_of_result(result: Any, *, deflector: str | None = None) -> PlannedObject:
+def object_of_result(result: Any) -> PlannedObject:
     """Return the object that an inversion, a fit or a retrieved field has shown.
 
     Parameters
     ----------
     result : Inversion, Fit, RetrievedField or Dataset
         Of one shot; a dataset as `read` returns it.
-    deflector : str, optional
-        Title of the cause of the deflection. Default: the fit's.
 
     Raises
     ------
@@ -368,5 +366,5 @@ def object_of_result(result: Any, *, deflector: str | None = None) -> PlannedObj
     displacement = getattr(field, "displacement", None)
     if displacement is None:
         raise InputError(f"got a {content.kind.noun}, expected a result with a field")
-    cause = deflector or deflector_titles().get(getattr(field, "name", ""))
+    cause = deflector_titles().get(getattr(field, "name", ""))
     return object_of_displacement(displacement, setup, deflector=cause, title="an earlier result")

@@ -290,7 +290,6 @@ def run_prepared(
     should_stop: ShouldStop | None = None,
     cache: Cache | None = None,
     preview: bool = False,
-    start: Inversion | None = None,
     began: float | None = None,
 ) -> Inversion:
     """Invert a shot after the recipe's steps, otherwise as `run`.
@@ -301,8 +300,6 @@ def run_prepared(
         The shot as recorded and its recipe.
     shot : Shot
         The shot after the recipe's steps.
-    start : Inversion, optional
-        As for `napari_shadowinv.invert`.
     began : float, optional
         Value of `time.perf_counter` when the work began. Default: now.
     """
@@ -317,8 +314,6 @@ def run_prepared(
     report("prepare", 0, None)
     mask, doubts = mask_unlit(shot.image, shot.source, shot.mask)
     shot = replace(shot, mask=mask)
-    if start is not None and not same_array(start.mask, shot.usable):
-        start = None
     # Before an estimate is made, and before sites are spread: mistakes are reported at once.
     if shot.source is None:
         prepare(shot.image, None, options, shot.mask)
@@ -350,7 +345,7 @@ def run_prepared(
         options=options,
         instrument=instrument,
         # The final result must not depend on earlier previews.
-        start=cache.last_inversion(plan) if preview else start,
+        start=cache.last_inversion(plan) if preview else None,
         on_progress=on_progress,
         should_stop=should_stop,
     )
@@ -558,9 +553,9 @@ def _without_gaps(
     return MaskOrigin.of(pixels)
 
 
-def picture_mask(path: Path, name: str = "mask", variable: str | None = None) -> BoolArray:
+def picture_mask(path: Path, name: str = "mask") -> BoolArray:
     """Read a mask from a picture that is 0, or transparent, at unusable pixels."""
-    image = read_shot(path, channel="mean", variable=variable).image
+    image = read_shot(path, channel="mean").image
     mask: BoolArray = np.nan_to_num(image) != 0
     check_usable(mask, f"{path}: {name}")
     return mask
