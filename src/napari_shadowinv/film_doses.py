@@ -27,7 +27,13 @@ from napari_shadowinv.facts import (
 from napari_shadowinv.film.pack import Pack
 from napari_shadowinv.film.unfolding import relative_strengths
 from napari_shadowinv.physics.setup import ProtonSetup
-from napari_shadowinv.physics.units import PIXEL, label, numbers_of, place_coordinates
+from napari_shadowinv.physics.units import (
+    PIXEL,
+    label,
+    numbers_of,
+    place_coordinates,
+    refuse_missing,
+)
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
@@ -260,12 +266,7 @@ class FilmDoses(Summarised):
         InputError
             If a variable or attribute is missing or damaged.
         """
-        missing = [name for name in (*_VARIABLES, "energy", *_BANDS) if name not in dataset]
-        if missing:
-            raise InputError(
-                f"dataset has no {', '.join(map(repr, missing))}: expected the result of a film "
-                "pack, as shadowinv film writes it"
-            )
+        refuse_missing(dataset, "result of a film pack", (*_VARIABLES, "energy", *_BANDS))
         with as_input_errors("the film pack"):
             return cls._from_parts(dataset)
 

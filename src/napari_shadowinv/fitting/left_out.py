@@ -13,7 +13,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, percent, to_figures
 from napari_shadowinv.fitting.result import noise_in, normalise_residual, setups_in
 from napari_shadowinv.physics.setup import Setup, beam_values
-from napari_shadowinv.physics.units import FLUX_DENSITY, label
+from napari_shadowinv.physics.units import FLUX_DENSITY, label, refuse_missing
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
@@ -152,12 +152,8 @@ class LeaveOneOut:
         InputError
             If one of them is missing.
         """
-        missing = [variable for variable, *_ in _VARIABLES.values() if variable not in dataset]
-        if missing or _SENTENCE not in dataset.attrs:
-            raise InputError(
-                f"dataset has no {', '.join(missing) or _SENTENCE}: expected the result of leaving "
-                "each image out in turn"
-            )
+        variables = (variable for variable, *_ in _VARIABLES.values())
+        refuse_missing(dataset, "result of leaving each image out", variables, [_SENTENCE])
         arrays: dict[str, AnyArray] = {
             name: np.ascontiguousarray(dataset[variable].values)
             for name, (variable, *_) in _VARIABLES.items()

@@ -15,7 +15,6 @@ from pydantic import TypeAdapter
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import (
     Assessment,
     Fact,
@@ -53,6 +52,7 @@ from napari_shadowinv.physics.units import (
     label,
     numbers_of,
     peak_facts,
+    refuse_missing,
     shown_fields,
 )
 from napari_shadowinv.provenance import ImageOrigin, Provenance
@@ -92,6 +92,7 @@ _OF_IMAGES = "images", "source", "reprojection", "residual", "mask", "chi2", "br
 _OF_BASINS = "objective", "chi2", "distance", "displacement"
 _WORDS = "reason", "advice", "explanation"  # of the assessment
 _BUDGET = "errors", "error_causes"
+_CONTENT = "result of a fit"
 _ATTRIBUTES = ("options", "instrument", "report", *_BUDGET, "verdict", *_WORDS, "folded", "setups")
 _REPORT = "verdict", "errors", "error_limited_by", "error_measure_next", "residual"
 
@@ -497,12 +498,7 @@ class Fit(Summarised):
         InputError
             If a variable or attribute is missing or damaged.
         """
-        missing = [name for name in (*_VARIABLES, "field", "basin") if name not in dataset]
-        missing += [name for name in _ATTRIBUTES if name not in dataset.attrs]
-        if missing:
-            raise InputError(
-                f"dataset has no {', '.join(map(repr, missing))}: expected the result of a fit"
-            )
+        refuse_missing(dataset, _CONTENT, (*_VARIABLES, "field", "basin"), _ATTRIBUTES)
         arrays = {name: numbers_of(dataset, name) for name in _VARIABLES}
         attributes = dataset.attrs
         names = [str(name) for name in dataset["field"].values]
@@ -632,15 +628,14 @@ def _field(
     smoothness: FloatArray,
     budget: tuple[Any, Any],
 ) -> FittedField:
-    potential, displacement, std, samples = (
-        numbers_of(dataset, variable + ending) if variable + ending in dataset else None
-        for variable in ("potential", "displacement", *FIT_VARIABLES)
+    refuse_missing(dataset, _CONTENT, (f"potential{ending}", f"displacement{ending}"))
+    potential, displacement = (
+        numbers_of(dataset, variable + ending) for variable in ("potential", "displacement")
     )
-    if potential is None or displacement is None:
-        raise InputError(
-            f"dataset has no potential or no displacement of the field {name!r}: expected the "
-            "result of a fit"
-        )
+    std, samples = (
+        numbers_of(dataset, variable + ending) if variable + ending in dataset else None
+        for variable in FIT_VARIABLES
+    )
     if displacement.shape != (2, *potential.shape):
         raise ValueError(
             f"displacement has shape {displacement.shape}, potential {potential.shape}"

@@ -57,7 +57,14 @@ from napari_shadowinv.physics.significance import (
     significance_facts,
     structures_of,
 )
-from napari_shadowinv.physics.units import ShownField, label, numbers_of, peak_facts, shown_fields
+from napari_shadowinv.physics.units import (
+    ShownField,
+    label,
+    numbers_of,
+    peak_facts,
+    refuse_missing,
+    shown_fields,
+)
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
@@ -490,15 +497,8 @@ class Inversion(Summarised):
         InputError
             If a variable or attribute is missing or damaged.
         """
-        missing = [name for name in VARIABLES if name not in dataset.variables]
-        missing += [
-            name for name in ("options", "instrument", "report") if name not in dataset.attrs
-        ]
-        if missing:
-            raise InputError(
-                f"dataset has no {', '.join(map(repr, missing))}: expected the result of an "
-                "inversion"
-            )
+        attributes = "options", "instrument", "report"
+        refuse_missing(dataset, "result of an inversion", VARIABLES, attributes)
         arrays: dict[str, Any] = {name: numbers_of(dataset, name) for name in VARIABLES}
         of_cells = filter(_is_of_cells, VARIABLES)
         cells = Cells(**{name.removeprefix("site_"): arrays.pop(name) for name in of_cells})
@@ -752,8 +752,5 @@ class RetrievedField(Summarised):
     @classmethod
     def from_dataset(cls, dataset: xarray.Dataset) -> RetrievedField:
         """Return the field of a dataset; an `InputError` if it has no displacement."""
-        if "displacement" not in dataset:
-            raise InputError(
-                "dataset has no 'displacement': expected a field of shape (2, height, width) in px"
-            )
+        refuse_missing(dataset, "displacement (2, height, width) in px", ["displacement"])
         return cls(dataset)

@@ -7,7 +7,7 @@
 - the prefix for a number: `prefix_for`; whether a unit takes one: `takes_prefix`
 - attributes of a variable of a dataset: `label`; of places: `place_label`; the places:
   `place_coordinates`; units as figures print them: `display_unit`
-- a variable as an array: `numbers_of`
+- a variable as an array: `numbers_of`; a dataset that lacks one: `refuse_missing`
 
 Units of datasets are spelled as pint parses them, because napari passes the units of an xarray's
 coordinates on to it. For pint ``px`` is a length, 1/96 inch, and ``flux`` a femtolux.
@@ -16,7 +16,7 @@ coordinates on to it. For pint ``px`` is a length, 1/96 inch, and ``flux`` a fem
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -24,6 +24,7 @@ import numpy as np
 
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import (
     Assessment,
     Fact,
@@ -343,6 +344,16 @@ def place_coordinates(
 def display_unit(units: str) -> str:
     """Return the attribute ``units`` as figures print it: px² for ``pixel**2``."""
     return units.replace("**2", "²").replace("pixel", "px")
+
+
+def refuse_missing(
+    dataset: xarray.Dataset, content: str, variables: Iterable[str], attributes: Iterable[str] = ()
+) -> None:
+    """Raise an `InputError` if a dataset lacks variables or attributes that its content needs."""
+    missing = [name for name in variables if name not in dataset]
+    missing += [name for name in attributes if name not in dataset.attrs]
+    if missing:
+        raise InputError(f"dataset has no {', '.join(map(repr, missing))}: expected the {content}")
 
 
 def numbers_of(dataset: xarray.Dataset, name: str) -> AnyArray:
