@@ -1,6 +1,6 @@
 """A result in words, for every face: `Fact`, `Headline`, `Level`, `Verdict`; its `ResultKind`.
 
-The verdict on a field with its limit and the next step: `Assessment`.
+The verdict on a field with its limit and the next step: `Assessment`, by rules: `assess`.
 
 A few lines and a picture of a result, as in a notebook: `Summarised`.
 
@@ -20,10 +20,10 @@ import base64
 import html
 import math
 import textwrap
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -31,6 +31,8 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+Case = TypeVar("Case")
 
 _COLOURS = (68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)
 
@@ -244,6 +246,11 @@ class Assessment:
     def short(self) -> str:
         """Reason and advice, for a headline."""
         return ": ".join(filter(None, (self.reason, self.advice)))
+
+
+def assess(case: Case, rules: Iterable[Callable[[Case], Assessment | None]]) -> Assessment:
+    """Return the assessment by the first rule that applies to a case; one of them always does."""
+    return next(filter(None, (rule(case) for rule in rules)))
 
 
 @dataclass(frozen=True)

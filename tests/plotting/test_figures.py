@@ -124,13 +124,17 @@ def test_image_and_reprojection_share_a_scale(inversion: Inversion) -> None:
 
 def test_figure_shows_sites_warnings_and_failure(make_inversion: Make) -> None:
     good = report_figure(make_inversion((30, 30)))
-    bad = report_figure(make_inversion((30, 30), converged=False, warnings=()))
+    bad = report_figure(
+        make_inversion(
+            (30, 30), converged=False, warnings=(Caution("not-converged", "it is wrong"),)
+        )
+    )
     text = " ".join(item.get_text() for item in good.texts)
     assert "Image residual: 1.7 %" in text
     assert "Sites" not in text
     assert "1 negative pixel was set to zero" in text
-    assert "not converged" not in text
-    assert "not converged" in " ".join(item.get_text() for item in bad.texts)
+    assert "did not converge" not in text
+    assert "did not converge" in " ".join(item.get_text() for item in bad.texts)
 
 
 def test_masked_pixels_are_blank_in_all_pictures(make_inversion: Make) -> None:

@@ -14,12 +14,12 @@ import numpy as np
 from scipy import ndimage
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.facts import Assessment, Verdict, percent, to_figures
+from napari_shadowinv.facts import Assessment, Verdict, assess, percent, to_figures
 from napari_shadowinv.fitting.noise_match import NoiseMatch
 from napari_shadowinv.fitting.pattern import Pattern, noise_amplification
 from napari_shadowinv.fitting.result import Fit
 from napari_shadowinv.fitting.search import SMALL_PX
-from napari_shadowinv.physics.edge import LARGER_FIELD, beyond_sides, edge_doubt
+from napari_shadowinv.physics.edge import LARGER_FIELD, beyond_sides
 from napari_shadowinv.physics.units import Condition
 
 
@@ -150,11 +150,8 @@ class Evidence:
     def at_edge(self) -> str:
         """Why an object beyond the edge may matter; "" if it does not."""
         errors = self.fit.errors
-        if errors is None:
-            return ""
-        by_edge = errors.shares.get("edge", 0.0)
-        others = float(np.sqrt(max(errors.share**2 - by_edge**2, 0.0)))
-        return edge_doubt(by_edge, others, self.fit.options.max_error, errors.sides)
+        caution = errors and errors.edge_caution(self.fit.options.max_error)
+        return caution.text if caution else ""
 
     @property
     def is_small(self) -> bool:
@@ -195,8 +192,7 @@ Answer = Assessment | None
 
 def assess_verdict(evidence: Evidence) -> Assessment:
     """Return the assessment of a fit by the first rule that applies."""
-    answers = (rule(evidence) for rule in _RULES)
-    return next(filter(None, answers), None) or _determined(evidence)
+    return assess(evidence, (*_RULES, _determined))
 
 
 def _not_explained(case: Evidence) -> Answer:

@@ -29,6 +29,7 @@ from napari_shadowinv.facts import (
     ResultKind,
     Summarised,
     Verdict,
+    assess,
     caution_facts,
     error_fact,
     folded,
@@ -546,32 +547,7 @@ class InversionInUnits:
     @property
     def assessment(self) -> Assessment:
         """Verdict on the main field, its limit, and the next step."""
-        report, max_error = self.inversion.report, self.inversion.options.max_error
-        by_code = {caution.code: caution for caution in reversed(report.warnings)}
-        if not report.converged:
-            caution = by_code.get("not-converged")
-            advice = "do not trust the field"
-            return Assessment(Verdict.UNCERTAIN, "not converged", advice, caution=caution)
-        errors = self.errors
-        for code, (verdict, advice) in DECISIVE.items():
-            if code in by_code:
-                caution = by_code[code]
-                reason = caution.short
-                if code == "edge" and errors is not None and errors.sides:
-                    reason = f"the object goes on {beyond_sides(errors.sides)}"
-                return Assessment(verdict, reason, advice, caution.text, caution)
-        if errors is None:
-            return Assessment(Verdict.UNCERTAIN, "errors were not worked out")
-        if not errors.rms > 0:
-            return Assessment(Verdict.UNCERTAIN, "there is no displacement to compare errors with")
-        if errors.share <= max_error:
-            return Assessment(Verdict.DETERMINED, errors.limit)
-        if condition := errors.condition(max_error):
-            return self.field.conditional(condition)
-        steps = (errors.measure_next(share) for share in (max_error, errors.share / 2))
-        # That of the headline is a short one.
-        advice = next((text for text in steps if len(text.split()) <= _MOST_ADVICE), "")
-        return Assessment(Verdict.UNCERTAIN, errors.reason, advice)
+        return assess(self, (_by_caution, _without_total, _by_total))
 
     @property
     def headline(self) -> Headline:
@@ -660,6 +636,39 @@ class InversionInUnits:
             )
             rows.append(("noise", caveat))
         return rows
+
+
+def _by_caution(case: InversionInUnits) -> Assessment | None:
+    by_code = {caution.code: caution for caution in reversed(case.inversion.report.warnings)}
+    for code, (verdict, advice) in DECISIVE.items():
+        if code in by_code:
+            caution, errors = by_code[code], case.errors
+            reason = caution.short
+            if code == "edge" and errors is not None and errors.sides:
+                reason = f"the object goes on {beyond_sides(errors.sides)}"
+            return Assessment(verdict, reason, advice, caution.text, caution)
+    return None
+
+
+def _without_total(case: InversionInUnits) -> Assessment | None:
+    if case.errors is None:
+        return Assessment(Verdict.UNCERTAIN, "errors were not worked out")
+    if not case.errors.rms > 0:
+        return Assessment(Verdict.UNCERTAIN, "there is no displacement to compare errors with")
+    return None
+
+
+def _by_total(case: InversionInUnits) -> Assessment:
+    errors, max_error = case.errors, case.inversion.options.max_error
+    assert errors is not None
+    if errors.share <= max_error:
+        return Assessment(Verdict.DETERMINED, errors.limit)
+    if condition := errors.condition(max_error):
+        return case.field.conditional(condition)
+    steps = (errors.measure_next(share) for share in (max_error, errors.share / 2))
+    # That of the headline is a short one.
+    advice = next((text for text in steps if len(text.split()) <= _MOST_ADVICE), "")
+    return Assessment(Verdict.UNCERTAIN, errors.reason, advice)
 
 
 def _is_of_cells(name: str) -> bool:

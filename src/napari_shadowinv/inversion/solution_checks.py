@@ -86,6 +86,7 @@ class FoldCheck:
 
 
 DECISIVE = {
+    "not-converged": (Verdict.UNCERTAIN, "do not trust the field"),
     "misfit": (Verdict.MISFIT, "check source, mask and point spread"),
     "negative": (Verdict.UNCERTAIN, "invert its grey values, or keep it as it is"),
     "no-deflection": (Verdict.UNCERTAIN, "average more shots"),

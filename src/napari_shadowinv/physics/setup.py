@@ -392,13 +392,9 @@ class OpticalSetup(BeamSetup):
         The normalised potential φ in px² is zero where the plasma is undisturbed, with the density
         n₀ in m⁻³; an `InputError` if that is not positive and finite.
         """
-        return self.line_integrated_density(phi) / _positive_density(density)
-
-
-def _positive_density(density: float) -> float:
-    if not (density > 0 and math.isfinite(density)):
-        raise InputError(f"density is {density:g}: it must be positive, in electrons per m³")
-    return density
+        if not (density > 0 and math.isfinite(density)):
+            raise InputError(f"density is {density:g}: it must be positive, in electrons per m³")
+        return self.line_integrated_density(phi) / density
 
 
 SETUPS: dict[str, type[BeamSetup]] = {
