@@ -66,7 +66,7 @@ def cell(strength: float, name: str, n_sites: int) -> str:
         options=InversionOptions(n_sites=n_sites),
     )
     error = np.linalg.norm(inversion.displacement - true) / np.linalg.norm(true)
-    warned = "folds" in {caution.code for caution in inversion.report.warnings}
+    warned = "folds" in {caution.code for caution in inversion.report.cautions}
     return f"{error:.1%}, {inversion.caustic.mean():.1%}, {'yes' if warned else 'no'}"
 
 

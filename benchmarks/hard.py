@@ -135,7 +135,7 @@ def main() -> None:
         report = inversion.report
         said = [
             caution.text.split("; ", 1)[1]
-            for caution in report.warnings
+            for caution in report.cautions
             if caution.code == "not-converged"
         ]
         print(

@@ -117,7 +117,7 @@ def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
         "clipped_pixels": 1,
         "levels": ((4, 10, 0.1), (17, 21, 1 / 3000)),
         "seconds": {"prepare": 0.1, "sites": 0.2, "transport": 1.0, "read-out": 0.1},
-        "warnings": (Caution("negative-pixels", "1 negative pixel was set to zero"),),
+        "cautions": (Caution("negative-pixels", "1 negative pixel was set to zero"),),
         "flux_scale": 1.0,
         "flux_left": {},
         "flux_entered": {},

@@ -95,7 +95,7 @@ def test_errors_without_a_displacement_have_their_length():
 
 def results_of(image, inversion):
     hasty = FitOptions(samples=0, max_iterations=2, spacing=0.25)
-    doubtful = inversion.with_warnings(
+    doubtful = inversion.with_cautions(
         Caution("other", f"doubt {number} of <script> & co, {'very ' * 60}long")
         for number in range(9)
     )
@@ -178,7 +178,7 @@ def test_facts_with_a_setup_add_the_field_in_its_unit(inversion):
 
 
 def test_a_caution_is_a_doubtful_fact_and_lack_of_convergence_a_failed_one(image, inversion):
-    doubtful = inversion.with_warnings([Caution("beam", "the beam differs")])
+    doubtful = inversion.with_cautions([Caution("beam", "the beam differs")])
     (fact,) = [fact for fact in doubtful.facts if fact.key == "beam" and fact.title == "Warning"]
     assert (fact.text, fact.level) == ("the beam differs", Level.DOUBTFUL)
     failed = invert(image, options=InversionOptions(n_sites=400, max_iterations=1))

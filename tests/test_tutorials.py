@@ -82,7 +82,7 @@ def test_the_proton_radiograph_has_the_numbers_of_its_page(tmp_path, monkeypatch
     assert peak(uniform.displacement) == pytest.approx(13.8, abs=0.1)
     assert uniform.report.image_residual == pytest.approx(0.0603, abs=5e-4)
     assert f"even smaller ({percent(uniform.report.image_residual)})" in page
-    assert "edge" in {caution.code for caution in uniform.report.warnings}
+    assert "edge" in {caution.code for caution in uniform.report.cautions}
 
 
 def test_the_recipe_of_the_first_shadowgram_repeats_its_report(
@@ -216,7 +216,7 @@ def test_the_table_of_sources_is_as_the_inversions_say():
         wrong = 100 * np.linalg.norm(inversion.displacement - truth) / np.linalg.norm(truth)
         assert wrong == pytest.approx(float(error), abs=0.6), title
         assert 100 * inversion.report.image_residual == pytest.approx(float(residual), abs=0.06)
-        codes = {caution.code for caution in inversion.report.warnings}
+        codes = {caution.code for caution in inversion.report.cautions}
         assert ("edge" in codes) != title.startswith("supplied"), title
 
 

@@ -810,7 +810,7 @@ def test_a_point_source_is_used_or_suggested(folder: Path, shot: Path) -> None:
         assert result.exit_code == 0, result.output
         assert ("choose the source 'isotropic'" in " ".join(result.stdout.split())) == warned
         report = Inversion.from_dataset(dataset("result.shadowinv")).report
-        assert ("'isotropic'" in str(report.warnings)) == warned
+        assert ("'isotropic'" in str(report.cautions)) == warned
     expected = sources.isotropic_source(np.load(shot), near, centre_y=2)
     np.testing.assert_array_equal(dataset("result.shadowinv")["source"], expected)
 

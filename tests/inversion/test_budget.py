@@ -277,7 +277,7 @@ def test_the_total_holds_the_error_by_another_beam(source):
         errors.append(rms(inversion.displacement - blob.displacement))
         totals.append(inversion.errors.total.rms)
         if variation >= 0.05 and source == "recorded":
-            assert "beam" in {caution.code for caution in inversion.report.warnings}
+            assert "beam" in {caution.code for caution in inversion.report.cautions}
     ratio = np.array(errors) / totals
     assert (ratio < 2.5).all()
     if source == "recorded":
@@ -448,7 +448,7 @@ def test_a_pattern_that_few_sites_miss_gets_more():
     plain, patterned = (invert(shot, options=options).report for shot in (broad, fine))
     assert plain.n_sites < patterned.n_sites
     assert "missed structures" in patterned.sites_reason
-    assert patterned.warnings == ()
+    assert patterned.cautions == ()
 
 
 def test_given_sites_are_used_and_the_paper_has_one_a_pixel(image):
@@ -478,7 +478,7 @@ def test_an_accuracy_out_of_reach_is_reported():
     image = synthetic_image(pair().displacement)
     report = invert(image, options=InversionOptions(accuracy=1e-6)).report
     assert report.n_sites == image.size
-    assert "the accuracy of 0.0001 % is not reached" in str(report.warnings)
+    assert "the accuracy of 0.0001 % is not reached" in str(report.cautions)
 
 
 def test_an_unconverged_solution_has_no_errors(image):
@@ -561,10 +561,10 @@ def test_noise_correlated_over_many_pixels_is_named(blur):
     noise = gaussian_filter(rng.normal(size=clean.shape), blur, mode="wrap")
     options = InversionOptions(n_sites=900, negative="clip")
     white = clean + 0.02 * rng.normal(size=clean.shape)
-    cautions = invert(white + 0.05 * noise / noise.std(), options=options).report.warnings
+    cautions = invert(white + 0.05 * noise / noise.std(), options=options).report.cautions
     assert "correlated-noise" in [caution.code for caution in cautions]
     for image in (white, clean):
-        cautions = invert(image, options=options).report.warnings
+        cautions = invert(image, options=options).report.cautions
         assert "correlated-noise" not in [caution.code for caution in cautions]
 
 
@@ -715,7 +715,7 @@ def test_the_error_by_noise_follows_a_stated_correlation(width):
     errors = [result.errors for result in results]
     assert np.median([e.noise.rms for e in errors]) == pytest.approx(scatter, rel=0.35)
     assert errors[0].noise_correlation == pytest.approx(width)
-    assert not any(c.code == "correlated-noise" for c in results[0].report.warnings)
+    assert not any(c.code == "correlated-noise" for c in results[0].report.cautions)
     white = invert(shot(), plan=plan, options=options, instrument={"noise_correlation": 0})
     assert white.errors.noise_correlation == 0
 

@@ -67,7 +67,7 @@ def test_an_image_nearly_equal_to_its_source_gives_nearly_no_field():
     image = 5 * source * (1 + 5e-6 * rng.uniform(-1, 1, source.shape))
     inversion = invert(image, source=source, options=InversionOptions(tolerance=1e-9))
     assert peak(inversion.displacement) < 1e-5
-    nothing, scaled = inversion.report.warnings
+    nothing, scaled = inversion.report.cautions
     assert nothing.code == "no-deflection"
     assert scaled.text.startswith("the image's flux is 5 times")
 
@@ -342,12 +342,12 @@ def test_the_report_describes_the_run(image):
     assert report.residual <= report.tolerance == 1e-3
     assert report.iterations == sum(steps for _, steps, _ in report.levels)
     assert set(report.seconds) == {"prepare", "sites", "transport", "read-out", "errors"}
-    assert "negative-pixels" in {caution.code for caution in report.warnings}
+    assert "negative-pixels" in {caution.code for caution in report.cautions}
     noisy[5, 5:12] = 1.0
     noisy[5, 5] = -1.0
     few = invert(noisy, options=InversionOptions(negative="clip")).report
     assert few.clipped_pixels > 0
-    assert "negative-pixels" not in {caution.code for caution in few.warnings}
+    assert "negative-pixels" not in {caution.code for caution in few.cautions}
 
 
 def test_an_inversion_that_does_not_converge_says_so(image):
@@ -355,8 +355,8 @@ def test_an_inversion_that_does_not_converge_says_so(image):
     report = invert(image, options=options).report
     assert not report.converged
     assert report.residual > 1e-9
-    assert "not converged: flux residual" in report.warnings[0].text
-    assert "all 1 iterations" in report.warnings[0].text
+    assert "not converged: flux residual" in report.cautions[0].text
+    assert "all 1 iterations" in report.cautions[0].text
 
 
 def test_progress_covers_all_stages_and_cancelling_ends_each(image):
@@ -537,7 +537,7 @@ def test_the_headline_begins_with_the_peak_and_ends_with_warnings(image):
     peak_text, reason = inversion.headline.text.split("; ")
     assert peak_text.startswith(f"peak |d| {peak(inversion.displacement):.4f} ± ")
     assert reason.startswith("limited by ")
-    doubtful = inversion.with_warnings([Caution("beam", "the beam is wrong")]).headline
+    doubtful = inversion.with_cautions([Caution("beam", "the beam is wrong")]).headline
     assert doubtful.level == "doubtful"
     assert doubtful.text == f"{inversion.headline.text}; {CAUTION_CODES['beam']}"
     unconverged = dataclasses.replace(inversion.report, converged=False)

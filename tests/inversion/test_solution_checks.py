@@ -95,7 +95,7 @@ def jet(y: Array, x: Array) -> tuple[Array, Array]:
 
 def codes_of(inversion):
     """Codes of all warnings."""
-    return {caution.code for caution in inversion.report.warnings}
+    return {caution.code for caution in inversion.report.cautions}
 
 
 def signs(image: Array, **options: object) -> list[str]:
@@ -104,7 +104,7 @@ def signs(image: Array, **options: object) -> list[str]:
     report = invert(image, options=InversionOptions.model_validate(choices)).report
     assert report.converged
     codes = (MISFIT, NOTHING, FOLDS, EDGE)
-    return [caution.code for caution in report.warnings if caution.code in codes]
+    return [caution.code for caution in report.cautions if caution.code in codes]
 
 
 def noisy(image: Array, share: float, seed: int = 1) -> Array:
@@ -155,15 +155,15 @@ def test_a_pattern_as_fine_as_the_pixels_does_not_fit(pattern, contrast):
     inversion = invert(np.where(odd == 1, float(contrast), 1.0))
     assert inversion.report.converged
     assert inversion.report.image_residual > 0.15
-    assert inversion.report.warnings[0].code == MISFIT
+    assert inversion.report.cautions[0].code == MISFIT
     assert NOTHING not in codes_of(inversion)
 
 
 def test_too_few_sites_do_not_fit_and_the_advice_is_more():
     image = traced(gaussian(0.6))
     report = invert(image, options=InversionOptions(n_sites=100)).report
-    assert report.warnings[0].code == MISFIT
-    assert "use more sites" in report.warnings[0].text
+    assert report.cautions[0].code == MISFIT
+    assert "use more sites" in report.cautions[0].text
     assert signs(image, n_sites=5000) == []
 
 
@@ -222,7 +222,7 @@ def test_noise_of_the_source_counts_too():
     y, x = np.indices((SIDE, SIDE))
     beam = 0.3 + np.exp(-((y - 40) ** 2 + (x - 60) ** 2) / 2 / 30**2)
     image, source = rng.poisson(100 * beam), rng.poisson(100 * beam)
-    assert invert(image, source=source).report.warnings[0].code == NOTHING
+    assert invert(image, source=source).report.cautions[0].code == NOTHING
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -263,7 +263,7 @@ def test_caustics_that_have_just_formed_are_right_and_get_no_warning(strength, s
     true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
     assert inversion.caustic.mean() > 0.01
     assert np.linalg.norm(inversion.displacement - true) < 0.05 * np.linalg.norm(true)
-    assert inversion.report.warnings == ()
+    assert inversion.report.cautions == ()
 
 
 @pytest.mark.parametrize(
@@ -282,7 +282,7 @@ def test_deep_folds_are_wrong_and_get_a_warning(strength, shape, share):
     inversion = invert(noisy(traced(field), share), options=InversionOptions(negative="clip"))
     true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
     assert np.linalg.norm(inversion.displacement - true) > 0.07 * np.linalg.norm(true)
-    assert inversion.report.warnings[0].code == FOLDS
+    assert inversion.report.cautions[0].code == FOLDS
 
 
 def test_hot_pixels_are_no_folds():
@@ -359,7 +359,7 @@ def test_other_reference_images_get_no_doubts(name: str):
 def test_a_real_plume_gets_no_doubts(burner: list[Path], number: int):
     reference = read(burner[0]).bin_pixels(4).image
     assert (
-        invert(read(burner[1 + number]).bin_pixels(4).image, source=reference).report.warnings == ()
+        invert(read(burner[1 + number]).bin_pixels(4).image, source=reference).report.cautions == ()
     )
 
 

@@ -97,7 +97,7 @@ def test_a_beam_that_nobody_measured_is_a_condition_unless_more_is_wrong(image):
     assert (peak, share / 100) == pytest.approx((errors.peak, errors.share), rel=0.05)
     for fault in ({"beam_rms": 0.05}, {"background": 0.5}):
         assert invert(image, options=FEW, instrument=fault).verdict is Verdict.UNCERTAIN
-    assert inversion.with_warnings([Caution("flux", "")]).headline.level is Level.DOUBTFUL
+    assert inversion.with_cautions([Caution("flux", "")]).headline.level is Level.DOUBTFUL
 
 
 def test_the_error_of_the_energy_counts_for_the_field_alone(image):
@@ -134,7 +134,7 @@ def test_errors_of_zero_displacement_are_not_determined():
 def test_a_caution_about_the_solution_decides_the_verdict(image, code, verdict):
     inversion = invert(image, source=np.ones(image.shape), options=FEW)
     assert inversion.verdict is Verdict.DETERMINED
-    doubtful = inversion.with_warnings([Caution(code, "a sentence")])
+    doubtful = inversion.with_cautions([Caution(code, "a sentence")])
     assert doubtful.verdict is verdict
     assert doubtful.to_dataset().attrs["verdict"] == verdict
     assert doubtful.headline.title == verdict

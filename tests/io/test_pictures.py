@@ -157,7 +157,7 @@ def test_mask_for_screens_gives_no_caution_and_its_gaps_are_unusable(tmp_path: P
     Image.fromarray(mask).save(tmp_path / "mask.png", pnginfo=info, transparency=9)
     recipe = Recipe(mask=tmp_path / "mask.png", options={"n_sites": 60})
     result = run(recipe, 200.0 + SHOT)
-    assert "gamma" not in {caution.code for caution in result.report.warnings}
+    assert "gamma" not in {caution.code for caution in result.report.cautions}
     np.testing.assert_array_equal(picture_mask(tmp_path / "mask.png"), mask == 255)
 
 

@@ -146,7 +146,7 @@ def test_a_verdict_cannot_be_missed(
 def test_warnings_of_a_saved_inversion_are_told(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path, messages: list[str]
 ) -> None:
-    report = replace(solved.report, warnings=(Caution("not-converged", "it did not converge"),))
+    report = replace(solved.report, cautions=(Caution("not-converged", "it did not converge"),))
     opened(viewer, write(tmp_path / "shot.shadowinv", replace(solved, report=report)))
     assert messages == ["shot.shadowinv: it did not converge"]
 

@@ -327,7 +327,7 @@ EDGE = (Caution("edge", "the field reaches the edge"),)
 def test_doubtful_result_has_the_doubt_in_its_names(solved: Inversion) -> None:
     marks = {((), True): "✓", (EDGE, True): "?", (EDGE, False): "✗"}
     for (warnings, converged), mark in marks.items():
-        report = replace(solved.report, warnings=warnings, converged=converged)
+        report = replace(solved.report, cautions=warnings, converged=converged)
         for _, keywords, _ in inversion_layers(replace(solved, report=report), name="a"):
             assert keywords["name"].startswith(f"{mark} ")
             assert keywords["name"].endswith(" – a")

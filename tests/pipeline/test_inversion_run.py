@@ -90,7 +90,7 @@ def test_seconds_of_all_stages_are_told(shot: Array) -> None:
     report = run(Recipe(source=LowPassEstimate(), options=FEW), shot).report
     assert set(report.seconds) == {"source", "prepare", "sites", "transport", "read-out", "errors"}
     assert report.seconds["sites"] > 0
-    assert not report.warnings
+    assert not report.cautions
 
 
 def test_report_leaves_masked_pixels_out_of_the_peak(shot: Array) -> None:
@@ -109,7 +109,7 @@ def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
 
     def warnings(source: Estimate, image: Shot | Array = shot, **more: Any) -> str:
         recipe = Recipe(source=source, options=FEW, setup=near)
-        return str(run(recipe, image, **more).report.warnings)
+        return str(run(recipe, image, **more).report.cautions)
 
     assert "choose the source 'isotropic'" in warnings(UniformEstimate())
     assert "isotropic" not in warnings(IsotropicEstimate())

@@ -44,7 +44,7 @@ def test_setup_with_other_pixels_than_the_file_is_doubted(
     setup = ProtonSetup(**LENGTHS, **size)
     recipe = Recipe(setup=setup, steps=steps, options={"n_sites": 100})
     result = run(recipe, path)
-    texts = [caution.text for caution in result.report.warnings if caution.code == "setup"]
+    texts = [caution.text for caution in result.report.cautions if caution.code == "setup"]
     assert any("by the image's file" in text for text in texts) == is_doubted
 
 

@@ -398,7 +398,7 @@ def test_a_shot_is_shown_and_what_an_inversion_does_not_use_is_named(image: Floa
         _ = Shot("shot.tif").shape
     with pytest.raises(InputError, match=r"setup is 'setup\.toml': expected that of an experiment"):
         Shot(image, setup="setup.toml")
-    texts = [c.text for c in run(Recipe(options=OPTIONS), Shot(image, psf=2.0)).report.warnings]
+    texts = [c.text for c in run(Recipe(options=OPTIONS), Shot(image, psf=2.0)).report.cautions]
     assert any("the shot has psf, which only fits use" in text for text in texts)
 
 

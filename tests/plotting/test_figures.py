@@ -62,7 +62,7 @@ def test_no_panel_touches_another_or_leaves_the_page(
     make_inversion: Make, shape: tuple[int, int], with_setup: bool, proton_setup: ProtonSetup
 ) -> None:
     inversion = make_inversion(
-        shape, converged=False, warnings=(Caution("flux", "a long warning " * 20),)
+        shape, converged=False, cautions=(Caution("flux", "a long warning " * 20),)
     )
     figure = report_figure(inversion, proton_setup if with_setup else None, title="Shot 42")
     assert len(panels(figure)) == 6
@@ -126,7 +126,7 @@ def test_figure_shows_sites_warnings_and_failure(make_inversion: Make) -> None:
     good = report_figure(make_inversion((30, 30)))
     bad = report_figure(
         make_inversion(
-            (30, 30), converged=False, warnings=(Caution("not-converged", "it is wrong"),)
+            (30, 30), converged=False, cautions=(Caution("not-converged", "it is wrong"),)
         )
     )
     text = " ".join(item.get_text() for item in good.texts)

@@ -127,7 +127,7 @@ def test_a_reference_out_of_register_is_moved_and_what_is_left_is_an_error():
     assert error_of(stated_in_place) > 0.4
     inversion = invert(image, source=source)
     assert error_of(inversion) < 2 * inversion.errors.share < 0.4
-    assert "register" in [caution.code for caution in inversion.report.warnings]
+    assert "register" in [caution.code for caution in inversion.report.cautions]
     assert any(name.startswith("registration") for name in inversion.errors.parts)
 
 

@@ -195,7 +195,7 @@ def test_a_result_that_is_changed_does_not_change_later_checks(faint):
     first = invert(image, plan=plan)
     first.source[:] = np.roll(first.source, 6, axis=0)
     assert measure_shift(image, first.source).is_significant.any()
-    assert invert(image, plan=plan).report.warnings == first.report.warnings
+    assert invert(image, plan=plan).report.cautions == first.report.cautions
 
 
 def test_image_warnings_are_silent_on_a_right_shot(shot):
@@ -348,12 +348,12 @@ def test_invert_reports_the_cautions_of_the_checks(shot):
     image, source = (plane[30:130, 30:130] for plane in shot)
     dark = 0.5 * image.mean()
     few = InversionOptions(n_sites=300)
-    warnings = invert(image + dark, source=source + dark, options=few).report.warnings
+    warnings = invert(image + dark, source=source + dark, options=few).report.cautions
     assert "dark-level" in {caution.code for caution in warnings}
     # An estimate of the source comes from the image itself: nothing is compared with it.
     recipe = Recipe(source={"method": "gaussian"}, options=few)
     alone = run(recipe, np.minimum(image, 1.5 * image.mean()))
-    names = {caution.code for caution in alone.report.warnings}
+    names = {caution.code for caution in alone.report.cautions}
     assert "saturation" in names
     assert not {"register", "swapped", "negative"} & names
 

@@ -238,7 +238,7 @@ def test_the_report_names_a_mask_that_leaves_a_halo():
     image, _ = traced_shot(0, 0.09)
     recipe = Recipe(source={"method": "kriged"}, options={"n_sites": 300})
     result = run(recipe, Shot(image, source_mask=np.hypot(Y, X) > 0.28))
-    assert any("next to the source mask" in each.text for each in result.report.warnings)
+    assert any("next to the source mask" in each.text for each in result.report.cautions)
 
 
 @pytest.mark.parametrize("rms", [0.0, 0.03])

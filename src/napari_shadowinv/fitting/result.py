@@ -327,7 +327,7 @@ class Fit(Summarised):
         yield from (error_fact(name, text) for name, text in rows.items())
 
     @property
-    def warnings(self) -> tuple[Caution, ...]:
+    def _input_cautions(self) -> tuple[Caution, ...]:
         """Reasons to doubt the images, each with the name of its image, and the error bars."""
         of_images = tuple(
             caution.about(each.file or f"image {number}")
@@ -349,19 +349,19 @@ class Fit(Summarised):
     def cautions(self) -> tuple[Caution, ...]:
         """Reasons to doubt the result: its verdict, unless it is a success, and of its images."""
         if self.verdict.level.is_success:
-            return self.warnings
+            return self._input_cautions
         text = f"the fit's verdict is '{self.verdict}': {self.explanation}"
-        return (Caution("verdict", text), *self.warnings)
+        return (Caution("verdict", text), *self._input_cautions)
 
     @property
     def headline(self) -> Headline:
-        """The peaks of the fields, the verdict and the warnings in one line."""
+        """The peaks of the fields, the verdict and the cautions in one line."""
         peaks = [
             self.shown(field).short_peak_text(self.peak_error(field, self.setup))
             for field in self.fields
         ]
         converged = self.report.converged
-        return Headline.of(peaks, self.assessment, self.warnings, converged=converged)
+        return Headline.of(peaks, self.assessment, self._input_cautions, converged=converged)
 
     @property
     def facts(self) -> tuple[Fact, ...]:
@@ -380,7 +380,7 @@ class Fit(Summarised):
         fields = [fact for field in self.fields for fact in self._field_facts(field)]
         facts = (
             verdict_fact(self.verdict),
-            *caution_facts(self.warnings),
+            *caution_facts(self._input_cautions),
             *self._why(),
             *fields,
             *self._error_facts(),

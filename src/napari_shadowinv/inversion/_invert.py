@@ -712,7 +712,7 @@ def _make_report(
             (len(level.weights), level.iterations, level.residual) for level in solution.levels
         ),
         seconds=seconds,
-        warnings=cautions,
+        cautions=cautions,
         flux_scale=prepared.flux_scale,
         flux_left=fields.flux_left,
         flux_entered=fields.flux_entered,

@@ -105,7 +105,7 @@ class Report:
     seconds : dict of str to float
         Time of each stage: prepare, sites, transport, read-out, errors; of the errors what they
         take longer than the re-projection, beside which they are estimated.
-    warnings : tuple of Caution
+    cautions : tuple of Caution
         Reasons to doubt the result.
     flux_scale : float
         Factor by which the image was divided to match the source.
@@ -131,7 +131,7 @@ class Report:
     clipped_pixels: int
     levels: tuple[tuple[int, int, float], ...]
     seconds: dict[str, float]
-    warnings: tuple[Caution, ...]
+    cautions: tuple[Caution, ...]
     flux_scale: float
     flux_left: dict[str, float]
     flux_entered: dict[str, float]
@@ -195,7 +195,7 @@ class Inversion(Summarised):
     mask : ndarray of bool, shape (H, W)
         The pixels that were used; image, source, residual and caustic are 0 elsewhere.
     report : Report
-        Convergence, timing and warnings.
+        Convergence, timing and cautions.
     options : InversionOptions
         The options used.
     instrument : Instrument
@@ -240,7 +240,7 @@ class Inversion(Summarised):
     @property
     def cautions(self) -> tuple[Caution, ...]:
         """Reasons to doubt the result."""
-        return self.report.warnings
+        return self.report.cautions
 
     @property
     def lit(self) -> BoolArray:
@@ -413,20 +413,20 @@ class Inversion(Summarised):
         drawn = sampler.draw(method, described, Reporter(on_progress, should_stop))
         std, causes = drawn.displacement_std, sampler.causes
         errors = replace(errors, per_pixel=std, causes=causes, samples=drawn)
-        earlier = (each for each in self.report.warnings if each.code != "samples")
-        report = replace(self.report, warnings=(*earlier, *sampler.cautions(drawn)))
+        earlier = (each for each in self.report.cautions if each.code != "samples")
+        report = replace(self.report, cautions=(*earlier, *sampler.cautions(drawn)))
         return replace(self, errors=errors, report=report)
 
-    def with_warnings(self, cautions: Iterable[Caution]) -> Inversion:
-        """Return the same inversion with more warnings in its report.
+    def with_cautions(self, cautions: Iterable[Caution]) -> Inversion:
+        """Return the same inversion with more cautions in its report.
 
         Parameters
         ----------
         cautions : iterable of Caution
             To be appended.
         """
-        warnings = (*self.report.warnings, *cautions)
-        return replace(self, report=replace(self.report, warnings=warnings))
+        report = replace(self.report, cautions=(*self.report.cautions, *cautions))
+        return replace(self, report=report)
 
     def to_dataset(
         self, setup: Setup | None = None, *, attributes: Mapping[str, str] | None = None
@@ -504,7 +504,7 @@ class Inversion(Summarised):
         of_cells = filter(_is_of_cells, VARIABLES)
         cells = Cells(**{name.removeprefix("site_"): arrays.pop(name) for name in of_cells})
         content = json.loads(dataset.attrs["report"])
-        content["warnings"] = [Caution.from_json(caution) for caution in content["warnings"]]
+        content["cautions"] = [Caution.from_json(caution) for caution in content["cautions"]]
         return cls(
             **arrays,
             cells=cells,
@@ -555,7 +555,7 @@ class InversionInUnits:
         errors = self.errors
         error = None if errors is None else errors.of_peak
         peaks, report = [self.field.short_peak_text(error)], self.inversion.report
-        return Headline.of(peaks, self.assessment, report.warnings, converged=report.converged)
+        return Headline.of(peaks, self.assessment, report.cautions, converged=report.converged)
 
     @property
     def facts(self) -> tuple[Fact, ...]:
@@ -579,7 +579,7 @@ class InversionInUnits:
             error_rows["measure next"] = assessment.explanation
         facts = (
             verdict_fact(assessment.verdict),
-            *caution_facts(report.warnings),
+            *caution_facts(report.cautions),
             *peak_facts(
                 inversion.displacement, self.setup, mask=inversion.lit, error=error_of_peak
             ),
@@ -639,7 +639,7 @@ class InversionInUnits:
 
 
 def _by_caution(case: InversionInUnits) -> Assessment | None:
-    by_code = {caution.code: caution for caution in reversed(case.inversion.report.warnings)}
+    by_code = {caution.code: caution for caution in reversed(case.inversion.report.cautions)}
     for code, (verdict, advice) in DECISIVE.items():
         if code in by_code:
             caution, errors = by_code[code], case.errors

@@ -364,7 +364,7 @@ def run_prepared(
     if shot.setup is not None:
         doubts += setup_warnings(shot.setup, shot.shape, shot.metadata)
         doubts += deflection_warnings(shot.setup, inversion.displacement)
-    return inversion.with_warnings(dict.fromkeys((*doubts, *shot.warnings)))
+    return inversion.with_cautions(dict.fromkeys((*doubts, *shot.warnings)))
 
 
 def _source(

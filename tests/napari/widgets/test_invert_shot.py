@@ -231,7 +231,7 @@ def test_what_a_file_brings_is_used_and_told(window: Any, tool: Any, shot: Array
     tool.image.layer = window.add_image(shot, name="other", metadata=metadata)
     inversion = computed(tool)
     assert (inversion.mask == (mask == 0)).all()
-    assert inversion.report.warnings[-1].text == "it may be film"
+    assert inversion.report.cautions[-1].text == "it may be film"
 
 
 def test_a_saved_result_tells_how_it_was_made(
@@ -583,7 +583,7 @@ def test_doubts_stand_under_run_with_a_notification(
     run(tool)
     report = result_of(layer_of(window, "field")).content.report
     assert report.converged
-    assert report.warnings
+    assert report.cautions
     verdict = result_of(layer_of(window, "field")).content.verdict.capitalize()
     assert tool.verdict.text().startswith(f"<b>{verdict}")
     assert messages[-1].startswith(verdict)

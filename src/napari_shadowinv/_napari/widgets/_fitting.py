@@ -109,7 +109,9 @@ class FitView(QWidget):
 
     def _show_report(self, fit: Fit, facts: Sequence[Fact], inputs: panels.Rows = ()) -> None:
         self.verdict.show_headline(fit.headline)
-        warnings = [("Warning", caution.text) for caution in fit.warnings]
+        warnings = [
+            ("Warning", caution.text) for caution in fit.cautions if caution.code != "verdict"
+        ]
         rows = [row for row in warnings if row not in inputs]
         shown, details = (panels.fact_rows(facts, details=flag) for flag in (False, True))
         self.report.show_rows([*rows, *inputs, *shown], details)
