@@ -137,7 +137,6 @@ class Summarised:
 def _picture_html(
     plane: FloatArray, side: int = 256, percentiles: tuple[float, float] = (0.5, 99.5)
 ) -> str:
-    """Return an image tag with a plane in colours, transparent where it is NaN."""
     import imageio.v3 as iio
 
     step = -(-max(plane.shape) // side)

@@ -136,7 +136,6 @@ def _products_for(products: list[Product], frame: FieldFrame, n_fields: int) -> 
 
 
 def _names(products: Sequence[Product]) -> list[str]:
-    """Return names for files: the label or the kind, with a number if there are several."""
     bases = [(each.label or each.name()).replace(" ", "_").replace("-", "_") for each in products]
     return [
         base if bases.count(base) == 1 else f"{base}_{bases[:number].count(base)}"
@@ -215,7 +214,6 @@ class _Task:
         return {f"{frame.setup.beam_quantity().noun}, {percent(share)}": scaled - value}
 
     def _by_product(self) -> Values:
-        """Return the errors by the products' own methods."""
         field = self.field.potential, self.field.displacement, self.field.frame
         errors = [product.systematic(*field) for product in self.products]
         if not any(errors):

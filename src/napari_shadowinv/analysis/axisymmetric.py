@@ -294,7 +294,6 @@ class AxisymmetricProfile(Product):
 
     @property
     def _has_slices(self) -> bool:
-        """Whether there are profiles of several slices, as a plane."""
         return len(self._slices) > 1
 
     def measure(self, potential: FloatArray, displacement: FloatArray, frame: FieldFrame) -> Values:
@@ -497,7 +496,6 @@ def _scale(frame: FieldFrame) -> float:
 
 
 def _is_index(frame: FieldFrame) -> bool:
-    """Return whether the field is a refractive index in SI units."""
     if frame.setup is None:
         return False
     is_light = any(each.name == _INDEX for each in frame.setup.si_fields)

@@ -216,7 +216,6 @@ def _direction(displacement: FloatArray, weights: FloatArray) -> float:
 
 
 def _along(plane: FloatArray, direction: FloatArray, lags: FloatArray) -> FloatArray:
-    """Return the autocorrelation along a direction (y, x)."""
     centre = (np.array(plane.shape) - 1) / 2
     points = centre + lags[:, None] * direction
     size = np.array(plane.shape) - 1

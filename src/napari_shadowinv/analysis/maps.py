@@ -161,8 +161,6 @@ class Smoothed(Product):
 
 
 class _SourceMap(Smoothed):
-    """Map of the sources of a field over the image."""
-
     unit: ClassVar[str]
     long_name: ClassVar[str]
     variable: ClassVar[str] = "density"

@@ -303,7 +303,6 @@ def _phantom_spectra(
     report: Reporter,
     margin: float = 0.15,  # around the random field, over the image's side
 ) -> tuple[RingSpectrum, RingSpectrum, float]:
-    """Return the spectra of a random field and of its inversion, and its r.m.s. divergence."""
     margins = [int(np.ceil(margin * count)) for count in weights.shape]
     height, width = (count + 2 * m for count, m in zip(weights.shape, margins, strict=True))
     inner = tuple(slice(width, -width) for width in margins)

@@ -177,7 +177,6 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Ti
 
 
 def _single_numbers(result: ProductResult) -> dict[str, Measurand]:
-    """Return the variables that can be followed over the shots, or raise an `InputError`."""
     variables = {
         name: variable
         for name, variable in result.variables.items()
@@ -218,7 +217,6 @@ def _facts(series: ProductResult, times: FloatArray, unit: str) -> Iterator[Fact
 
 
 def _rate_unit(rate: float, unit: str) -> tuple[float, str]:
-    """Return the factor from a rate to one in a handy unit, and that unit."""
     if not unit:
         return 1.0, "per shot"
     factor, prefix = prefix_for(1 / max(abs(rate), 1e-300))

@@ -490,7 +490,6 @@ def _check_contrast(contrast: float, most: float) -> None:
 
 
 def _check_rings(count: int, resolution: float) -> None:
-    """Refuse a slope from too few rings."""
     if count < MIN_RINGS:
         raise InputError(
             f"the range has {count} trusted rings of wavenumbers, expected at least "
@@ -564,7 +563,6 @@ def _slope_error(
 
 
 def _longest_run(rings: BoolArray) -> BoolArray:
-    """Return the longest run of true values alone."""
     runs, count = label(rings)
     longest = 1 + int(np.bincount(runs)[1:].argmax()) if count else -1
     return np.asarray(runs == longest)

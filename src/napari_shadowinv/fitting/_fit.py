@@ -190,7 +190,6 @@ def _search(data: FitData, on_step: OnStep, should_stop: ShouldStop | None) -> _
 def _with_smoothness(
     data: FitData, minima: _Minima, rng: np.random.Generator, on_step: OnStep
 ) -> _Minima:
-    """Estimate λ and κ, and the weights of counts, at the best minimum."""
     is_near = data.near is not None
     scene, best = estimate_smoothness(minima.scene, minima.best, rng, on_step, is_near=is_near)
     if data.counted:
@@ -200,7 +199,6 @@ def _with_smoothness(
 
 
 def _refine(data: FitData, minima: _Minima, on_step: OnStep) -> tuple[FineMinimum, float]:
-    """Descend in recorded pixels; also return the seconds."""
     begun, is_near = time.perf_counter(), data.near is not None
     refined = refine_minimum(minima.scene, minima.best, data.options, on_step, is_near=is_near)
     return refined, time.perf_counter() - begun
@@ -220,7 +218,6 @@ def _explore(
 def _find_pattern(
     data: FitData, minima: _Minima, refined: FineMinimum, openness: Openness, on_step: OnStep
 ) -> Pattern:
-    """Find a pattern that the fit leaves, and how much of the noise of counts is missing."""
     pattern = find_pattern(data, refined.scene, refined.unknowns)
     if pattern.lacks_counts() and openness.posterior is not None:
         posterior = openness.posterior.reporting(lambda: on_step("samples", refined.objective))

@@ -127,8 +127,6 @@ class _SampledFit:
 
 
 class _JointFit(NamedTuple):
-    """Fit of all images that agree, with dense rays, and the images to first order around it."""
-
     members: list[int]
     linear: Linear
     unknowns: Unknowns  # of all images
@@ -247,7 +245,6 @@ class _Work:
         return [predictions[k] for k in self._all]
 
     def _with_joint_fit(self, members: list[int]) -> _Work:
-        """Fit images with dense rays, unless they are too many for Jacobians."""
         if self.scene.only(members).images.size > self.most_sampled:
             return self
         _, fine, unknowns, _ = self._fit_densely(members)
@@ -257,7 +254,6 @@ class _Work:
     def _fit_densely(
         self, members: list[int], least_gain: float = 0.5
     ) -> tuple[Minimum, Scene, Unknowns, float]:
-        """Fit some images; return where that ends in pixels of two, and with dense rays."""
         coarse = self._settle_members(self.common, members, _name(members), least_gain)
         first = replace(coarse, unknowns=coarse.unknowns.only(members))
         scene = self.scene.only(members)

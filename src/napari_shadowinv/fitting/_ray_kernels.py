@@ -568,7 +568,6 @@ def _add_entry(
     columns: AnyArray,
     values: AnyArray,
 ) -> int:
-    """Add a value to a column of the row that begins at `first`; return where the next begins."""
     place = places[number]
     if place >= first:
         values[place] += value

@@ -150,8 +150,6 @@ def eigensystem(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 class _History:
-    """Steps of conjugate gradients: vectors in whose space the matrix is simple."""
-
     def __init__(self, size: int, worth: int, most_numbers: int = 8_000_000) -> None:
         most = most_numbers // size  # in each list of vectors
         self.size, self._most = size, most if most >= worth else 0

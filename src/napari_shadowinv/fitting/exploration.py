@@ -164,7 +164,6 @@ def explore(
 
 
 def _tested_instrument(data: FitData, minimum: Minimum) -> Imperfect:
-    """Return the imperfections to which each fit states its sensitivity."""
     sizes = {each.key: each.tested for each in EFFECTS if each.tested}
     shapes = transmission_of(data, minimum, sizes["absorption"])
     responses = {each.key: each.tested for each in RESPONSES}

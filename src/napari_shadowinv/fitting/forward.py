@@ -296,7 +296,6 @@ class Scene(PriorTerms):
         return list(map(TracedBeam, *of_each))
 
     def _lights(self, unknowns: Unknowns) -> FloatArray:
-        """The light that enters for each image."""
         common, separate = unknowns.common, unknowns.separate
         light = [
             self.imperfect.entering(beam, common, numbers)[0]
@@ -305,7 +304,6 @@ class Scene(PriorTerms):
         return np.stack(light) * np.exp(self.imperfect.shape_changes(common, separate))
 
     def _seen(self, unknowns: Unknowns, k: int, traced: TracedBeam) -> _Seen:
-        """An image without its brightness, and its derivatives."""
         imperfect = self.imperfect
         rays = self.rays.image(traced)
         image, slope = self._spread(k, rays, unknowns), np.ones(())
@@ -496,7 +494,6 @@ class Linear:
         return self._with_columns(slope, columns)
 
     def _columns(self, change: Unknowns) -> list[FloatArray]:
-        """Changes of the columns of each image's Jacobian."""
         potentials = list(self._potential_changes(change).reshape(len(self.jacobians), -1))
         if not self._has_others:
             return potentials
@@ -508,7 +505,6 @@ class Linear:
         return columns
 
     def _with_columns(self, slope: Unknowns, columns: Sequence[FloatArray]) -> Unknowns:
-        """Add derivatives by the columns of each Jacobian, and return those that are free."""
         scene, (inner, outer) = self.scene, (self.scene.rays.shape, self.scene.beams.shape[1:])
         if not self._has_others:
             pulls = [Pulls(each.reshape(inner), np.zeros(0), np.zeros(6)) for each in columns]
@@ -521,12 +517,10 @@ class Linear:
         return scene._with_pulls(slope, self.unknowns, pulls, self._entering)
 
     def _light_change(self, change: Unknowns, k: int) -> FloatArray:
-        """The change of an image by numbers that act where it is seen."""
         of_brightness = change.brightness[k] * self.seen[k].image
         return np.asarray(of_brightness + self.seen[k].effects.push(change, k, np.zeros(())))
 
     def _add_light_pulls(self, slope: Unknowns, k: int, pull: FloatArray) -> None:
-        """Add derivatives by numbers that act where an image is seen."""
         slope.brightness[k] = np.einsum("yx,yx", pull, self.seen[k].image)
         self.seen[k].effects.add_pulls(slope, k, pull)
 

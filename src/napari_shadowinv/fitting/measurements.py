@@ -541,7 +541,6 @@ def _are_alike(first: FloatArray, second: FloatArray, rounding: float = 1e-6) ->
 
 
 def _means(planes: FloatArray, used: BoolArray) -> FloatArray:
-    """Mean of each plane over its used pixels."""
     return np.array([plane[use].mean() for plane, use in zip(planes, used, strict=True)])
 
 
@@ -579,7 +578,6 @@ def _refuse_other_units(brightness: FloatArray, names: Sequence[str], most: floa
 
 
 def _deviations(noise: Any, data: FloatArray, used: BoolArray, names: Sequence[str]) -> FloatArray:
-    """Standard deviation of each pixel's noise."""
     if isinstance(noise, str):
         if noise not in KINDS_OF_NOISE:
             raise InputError(

@@ -228,7 +228,6 @@ class Posterior:
         return solved
 
     def _draw_held(self, normal: FloatArray) -> Unknowns:
-        """Random numbers of the instrument: as uncertain as the scene says, or as stated."""
         scene, numbers = self.scene, self._unknowns.zeros()
         if scene.spread is not None:
             units = np.stack([unit.flat() for unit in scene.response_units()])
@@ -417,7 +416,6 @@ class Posterior:
         return self._scales.hessian_times(self._linear, flat)
 
     def _change(self, slope: Unknowns, tolerance: float, most_steps: int = 600) -> Unknowns:
-        """The change of the unknowns that undoes a slope."""
         right = self._scales.transpose_times(slope).flat()
         scaled = solve(
             self._times, right, tolerance=tolerance, iterations=most_steps, modes=self._modes

@@ -316,7 +316,6 @@ class Fit(Summarised):
         return _REMEDIES.get(largest, _MEASURE).format(largest)
 
     def _error_facts(self) -> Iterator[Fact]:
-        """The errors of the displacement, and the numbers of the instrument as fitted."""
         if self.errors is None:
             return
         is_condition = self.verdict.level is Level.CONDITIONAL

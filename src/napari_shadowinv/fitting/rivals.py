@@ -203,7 +203,6 @@ def _rivals(data: FitData, scene: Scene, best: Minimum) -> Iterator[Rival]:
 
 
 def _with_imperfections(data: FitData, scene: Scene, best: Minimum) -> Iterator[Rival]:
-    """Rivals with one more imperfection of the instrument, or with a wider prior of it."""
     imperfect = scene.imperfect
     used = np.asarray((data.scene.weights > 0).any(axis=0))[: data.size[0], : data.size[1]]
 

@@ -63,7 +63,6 @@ def collect_starts(
 def _transport_potential(
     data: FitData, number: int, should_stop: ShouldStop | None, most_sites: int = 10_000
 ) -> FloatArray | None:
-    """Return the potential that transport makes of an image; None if it makes none of it."""
     height, width = data.size
     scene = data.scene
     image = scene.images[number, :height, :width]

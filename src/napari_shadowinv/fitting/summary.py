@@ -259,7 +259,6 @@ def _beam_basis(data: FitData) -> str:
 
 
 def _most_folded(scene: Scene, displacements: FloatArray) -> FloatArray:
-    """Return the Jacobian of the image in which most of it is negative."""
     jacobians = [
         jacobian_determinant(moved)
         for moved in np.einsum("lm,mcyx->lcyx", scene.strengths, displacements)

@@ -247,7 +247,6 @@ class Prior(PriorTerms):
 
     @cached_property
     def _within(self) -> BoolArray:
-        """Which coefficients belong to the image."""
         lines = [
             np.abs(KNOT * (np.arange(n) - 1.0) - self.rays.pad - side / 2) <= side / 2
             for n, side in zip(self.rays.shape, self.rays.size, strict=True)

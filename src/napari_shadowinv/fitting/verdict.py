@@ -372,7 +372,6 @@ def _doubt(verdict: Verdict, reason: str, detail: str, advice: str) -> Assessmen
 
 
 def _limited(case: Evidence) -> str:
-    """The largest part of the errors, with their total; "" if there are none."""
     return "" if case.fit.errors is None else case.fit.errors.limit
 
 
@@ -382,7 +381,6 @@ def _cut_by_edge(case: Evidence, explanation: str) -> Assessment:
 
 
 def _short_cause(case: Evidence) -> str:
-    """The likely cause of a misfit, or a check, in a few words."""
     cause = case.pattern.cause.partition(":")[0]
     return f"likely {cause}" if cause else "check noise, source and point spread"
 

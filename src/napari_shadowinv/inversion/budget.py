@@ -361,7 +361,6 @@ class Budget:
         return self._responses[solution]
 
     def _coarser(self, solution: LevelSolution) -> LevelSolution:
-        """Return the same solution with fewer sites."""
         for earlier in self._responses:
             return earlier
         levels = self._plan.levels
@@ -428,7 +427,6 @@ def _nearest_sites(level: SiteLevel) -> tuple[IntArray, int]:
 def _solver_gap(
     response: LinearResponse, solution: LevelSolution, options: InversionOptions
 ) -> FloatArray:
-    """Return the solver's remaining flux error in each cell."""
     gap = solution.flux - solution.level.mass
     # The nearest of the few sites is looked up by squares.
     nearest, width = _nearest_sites(response.level)
@@ -509,7 +507,6 @@ def _stride(shape: tuple[int, ...]) -> int:
 
 
 def _near(peak: FloatArray, places: FloatArray, spacing: float) -> FloatArray:
-    """Weights of the places around the peak."""
     distance = np.hypot(*(places - peak).T)
     close = distance <= max(_NEAR * spacing, float(distance.min()))
     return np.asarray(close / close.sum())

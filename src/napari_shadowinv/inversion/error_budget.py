@@ -246,7 +246,6 @@ class ErrorBudget:
         return ", ".join(map(self._part_text, self.parts))
 
     def _part_text(self, name: str) -> str:
-        """Describe a part by its title, its share, and the deviation that it stands for."""
         share = share_of(self.parts[name].rms, self.rms)
         if name == self._beam_name:
             size = f"{percent(self.beam_variation)} rms over {self._beam_length}"
@@ -266,7 +265,6 @@ class ErrorBudget:
         return {*self.assumed, *[self._beam_name] * is_assumed}
 
     def _without(self, names: Collection[str]) -> ErrorBudget:
-        """Return the budget without some of the parts."""
         parts, sampled = self.parts, self.sampled
         if sampled is not None:
             squares = np.array([parts[name] for name in names]).reshape(-1, 2) ** 2

@@ -154,7 +154,6 @@ def _cell_ratios(
 def _is_quiet(
     ratio: FloatArray, means: FloatArray, variance: FloatArray, tiles: QuietTiles
 ) -> BoolArray:
-    """Return which tiles contain only a plane and noise."""
     residual = ratio - means[..., None, None]
     for slope in np.indices((tiles.cells, tiles.cells)) - (tiles.cells - 1) / 2:
         share = (residual * slope).sum(axis=(2, 3), keepdims=True) / (slope**2).sum()

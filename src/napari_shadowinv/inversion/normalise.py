@@ -207,7 +207,6 @@ def _clip_negative(values: FloatArray) -> FloatArray:
 
 
 def _raise_to_floor(values: FloatArray, least: float, flux: float | None) -> FloatArray:
-    """Raise dark pixels to the floor, and then all to a flux."""
     floored = np.maximum(values, least)
     if flux is not None:
         # The floor has added to image and source, not alike.

@@ -307,7 +307,6 @@ def instrument_draws(
 def _quantity_choice(
     quantities: Quantities,
 ) -> Callable[[FloatArray], Mapping[str, QuantityOf]]:
-    """Return a function that chooses the quantities by changes of the potential."""
     if callable(quantities):
         return quantities
     if not isinstance(quantities, Mapping) or not all(map(callable, quantities.values())):
@@ -338,7 +337,6 @@ def _blocks(seeds: list[Seed]) -> list[list[Seed]]:
 
 
 def _workers(options: InversionOptions, n_sites: int, n_pixels: int) -> int:
-    """Return the number of parallel samples: one a thread, within half of the memory."""
     threads = available_threads(options.threads)
     memory = physical_memory()
     if memory is None:

@@ -620,7 +620,6 @@ class InversionInUnits:
         return "displacement" if errors is self.inversion.errors else "field"
 
     def _error_rows(self, errors: ErrorBudget | None) -> list[tuple[str, str]]:
-        """Describe an error budget in words: names and texts."""
         if errors is None:
             return []
         rows = errors.rows(self._subject(errors))
@@ -688,7 +687,6 @@ def _errors_in(dataset: xarray.Dataset) -> ErrorBudget | None:
 
 
 def _deviation(dataset: xarray.Dataset, name: str) -> FloatArray | None:
-    """Return the standard deviation of the displacement in a dataset; None if it has none."""
     if name not in dataset:
         return None
     std, shape = numbers_of(dataset, name), dataset["displacement"].shape

@@ -279,7 +279,6 @@ def _correlation(values: FloatArray, down: int, right: int) -> float:
 
 
 def _no_deflection(noise: ImageNoise, rms: float) -> str:
-    """Describe a displacement that noise alone explains."""
     usual, most = noise.displacements(noise.typical)
     if rms > max(most, _ROUNDING):
         return ""
@@ -291,7 +290,6 @@ def _no_deflection(noise: ImageNoise, rms: float) -> str:
 
 
 def _far_correlation(noise: ImageNoise) -> str:
-    """Noise whose strength at long wavelengths is not known."""
     if not noise.is_correlated_far:
         return ""
     return (
@@ -370,7 +368,6 @@ def _strips(
 def _share_of_strips(
     jacobian: FloatArray, inner: float, labels: AnyArray, strip_labels: AnyArray
 ) -> float:
-    """Return the share of pixels below `inner` in all strips."""
     strips = jacobian[np.isin(labels, strip_labels)]
     return float((strips < inner).sum() / max(strips.size, 1))
 

@@ -212,7 +212,6 @@ def _normalise(images: Iterable[ArrayLike]) -> list[FloatArray]:
 
 
 def _noise_variance(ratio: FloatArray, bright: Any) -> float:
-    """Return the variance of white noise by differences in which smooth structure cancels."""
     finest = (ratio[1:, 1:] - ratio[1:, :-1] - ratio[:-1, 1:] + ratio[:-1, :-1]) / 2
     used = bright[1:, 1:] & bright[1:, :-1] & bright[:-1, 1:] & bright[:-1, :-1]
     if not used.any():

@@ -303,7 +303,6 @@ def _turn(array: AnyArray, axes: Sequence[int], signs: Sequence[int]) -> AnyArra
 
 
 def _name_axes(dataset: Any) -> Any:
-    """Return a dataset of PlasmaPy with axes named x, y and z, with their units."""
     units = dataset.attrs.get("axis_units", [""] * 3)
     renamed = dataset.rename(dict(zip(_PLASMAPY_AXES, reversed(AXES), strict=True)))
     for axis, unit in zip(reversed(AXES), units, strict=True):

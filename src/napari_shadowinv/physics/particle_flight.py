@@ -203,7 +203,6 @@ class Flight:
         self._check_strength(setup.energy)
 
     def _check_strength(self, energy: float, *, max_steps: int = 10_000_000) -> None:
-        """Refuse a field in which a particle would take too many steps, or get no finite speed."""
         u = float(self.momenta(np.array([energy]))[0])
         gamma = math.hypot(1.0, u)
         strength = abs(self.charge) * (self.peaks[0] + self.peaks[1] * gamma / u)

@@ -363,7 +363,6 @@ def _scene(
     make: Callable[..., Phantom], parts: Iterable[Part], shape: tuple[int, int],
     setup: ProtonSetup, strength: float,
 ) -> Phantom:  # fmt: skip
-    """Sum of the parts, each made by `toroid` or `cosine_toroid`."""
     _require_finite(strength=strength)
     _require_positive("smaller side of the image", min(shape), "px")
     side = min(shape) * setup.object_pixel_size

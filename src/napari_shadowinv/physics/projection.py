@@ -211,7 +211,6 @@ def _require_same_kind(recorded_with: Setup, setup: Setup) -> None:
 
 
 def _covered_shape(old: tuple[int, int], ratio: float) -> tuple[int, int]:
-    """Height and width in pixels of the new size that fit into the old image."""
     # Rounding may put an image's edge beyond the other's.
     height, width = (math.floor(n / ratio + 1e-6) for n in old)
     if min(height, width) < MIN_SIDE_PX:

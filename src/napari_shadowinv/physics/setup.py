@@ -497,7 +497,6 @@ def bin_setup(setup: Setup, factor: int) -> Setup:
 
 
 def _suggest_kind(kind: Any) -> str:
-    """Suggest a kind or species for an unknown kind."""
     match = None if kind is None else nearest(str(kind), [*SETUPS, *SPECIES])
     if match is None or match in SETUPS:
         return f"; did you mean '{match}'?" if match else ""

@@ -347,7 +347,6 @@ class _Exposure:
 def _fluence(
     flight: Flight, reach: tuple[IntArray, IntArray], profile: Profile | None, threads: int | None
 ) -> _Exposure:
-    """Return the exposure by regular rays."""
     fine = math.isqrt(flight.options.rays_per_pixel - 1) + 1
     first, last = reach
     size = tuple((last - first) * fine)
@@ -378,7 +377,6 @@ def _count(
     energies: Callable[[np.random.Generator, int], FloatArray],
     seed: int,
 ) -> _Exposure:
-    """Return the exposure by random particles."""
     first, last = reach
     options = flight.options
     beam = _beam(flight, profile, first, last, 1)

@@ -434,7 +434,6 @@ def _pixel_size(pack: Pack, scans: list[Scan]) -> float | None:
 
 
 def _pixel_warnings(pack: Pack, pixel: float | None) -> tuple[Caution, ...]:
-    """Warn of a size of the scans' pixels that no scanner has."""
     if pixel is None or pack.pixel_size is not None:
         return ()
     per_inch = INCH_M / pixel

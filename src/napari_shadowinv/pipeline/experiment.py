@@ -371,8 +371,6 @@ def _tally(shots: Sequence[PlannedShot]) -> str:
 
 
 class _Retrieved(NamedTuple):
-    """The outcome of a draw, with its images and the displacement that was retrieved."""
-
     shot: PlannedShot
     images: FloatArray
     displacement: FloatArray
@@ -452,7 +450,6 @@ def _fitted(
 
 
 def _fields_of(inputs: ExperimentInputs) -> tuple[str, ...]:
-    """Return the key of the cause of the deflection."""
     setup = inputs.setups[0]
     cause = inputs.object.cause(setup)
     if setup is None or cause is None:

@@ -395,7 +395,6 @@ def _collect_image(recipe: Recipe, shot: Shot, name: str, *, unknown: bool) -> I
 
 
 def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Shot:
-    """Apply the steps to an image, and estimate its source if the recipe does so."""
     try:
         shot = inputs.prepare(should_stop)
         source, estimate = shot.source, inputs.recipe.estimate

@@ -376,7 +376,6 @@ def _source(
     *,
     preview: bool,
 ) -> FloatArray:
-    """Return the undisturbed beam of a shot after its steps."""
     recorded = inputs.shot.shape
     matrix = inputs.recipe.matrix(recorded)
     estimate = inputs.recipe.estimate
@@ -483,7 +482,6 @@ def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
 
 
 def _dark_frame(recipe: Recipe, shot: Shot) -> Shot | None:
-    """Read the dark frame that the recipe subtracts, if it names a file."""
     file = recipe.dark_file
     if shot.dark is not None:
         raise InputError(
@@ -501,7 +499,6 @@ def _dark_frame(recipe: Recipe, shot: Shot) -> Shot | None:
 
 
 def _source_file(kind: MeasuredSource, shot: Shot) -> Path | None:
-    """Return the file of a measured source; a variable alone refers to the shot's file."""
     return kind.file if kind.file is not None or kind.variable is None else shot.path
 
 
@@ -525,7 +522,6 @@ def _mask(
 
 
 def _pixels(mask: Any, name: str) -> Any:
-    """Return a mask's pixels, from its file or as checked."""
     if mask is None:
         return None
     if isinstance(mask, (str, Path)):

@@ -128,7 +128,6 @@ def _change(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def _random_beams(shape: tuple[int, int], beam: BeamPrior) -> list[FloatArray]:
-    """Return random smooth variations of a prior's length and r.m.s."""
     rng = np.random.default_rng(0)
     shapes = Shapes.of_length("beam", beam.length * min(shape), np.ones(shape))
     fields = [shapes.sum(rng.normal(size=len(shapes))) for _ in range(_BEAMS)]

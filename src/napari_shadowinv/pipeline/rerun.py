@@ -262,7 +262,6 @@ def _report_in_stack(dataset: xarray.Dataset) -> dict[str, Any] | None:
 
 
 def _checked_provenance(dataset: xarray.Dataset, name: str) -> Provenance:
-    """Return the provenance of a dataset, or raise an `InputError` that says what is wrong."""
     if "shot" in dataset.dims:
         raise InputError(
             f"{name} is a stack: expected one result, such as that of one of its shots"
@@ -276,7 +275,6 @@ def _checked_provenance(dataset: xarray.Dataset, name: str) -> Provenance:
 
 
 def _defect(dataset: xarray.Dataset) -> str:
-    """Describe a missing, damaged or newer provenance."""
     text = dataset.attrs.get("provenance", "")
     if "report" in dataset.variables:
         return "is a shot of a stack without a provenance: repeat it with shadowinv fit or batch"
@@ -325,7 +323,6 @@ class _Reader:
             )
 
     def inputs(self, dataset: xarray.Dataset, provenance: Provenance) -> RerunInputs:
-        """Read the inputs of an inversion or a fit."""
         count = len(provenance.images)
         if len(self.images) not in (0, count):
             raise InputError(
@@ -359,7 +356,6 @@ class _Reader:
         )
 
     def _check_recipe(self, recipe: Recipe) -> None:
-        """Refuse files that a recipe names in other folders."""
         files = {
             "a mask": recipe.mask,
             "a source mask": recipe.source_mask,

@@ -11,8 +11,6 @@ from napari_shadowinv._system.validation import CheckedModel
 
 
 class _StoreOptions(CheckedModel, allow_inf_nan=False):
-    """Choices of a store, and of a run that resumes it."""
-
     variables: tuple[str, ...] | None = Field(
         default=None,
         description="Variables to store; on the command line, separated by commas. Default: "

@@ -228,7 +228,6 @@ def write_table(path: Path, rows: Sequence[ShotRow]) -> None:
 
 
 def _used_rows(table: Path | Sequence[ShotRow], shared: Mapping[str, Any]) -> dict[int, ShotRow]:
-    """Return the rows that are not excluded, by their lines in a file or their numbers."""
     rows = _read_shots(table, shared) if isinstance(table, Path) else dict(enumerate(table, 1))
     used = {number: row for number, row in rows.items() if not row.exclude}
     if not used:

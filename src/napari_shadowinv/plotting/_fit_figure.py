@@ -87,7 +87,6 @@ def _draw_image(panel: Panel, fit: Fit, k: int, kind: str, fact: Fact) -> None:
 
 
 def _draw_fitted(panels: list[Panel], fit: Fit, field: FittedField) -> None:
-    """Fill a row of panels with a field; the potential comes first if there is room for it."""
     deflector, in_units = deflector_titles()[field.name], fit.shown(field)
     title = in_units.name if len(fit.fields) == 1 else f"{field.name}: {in_units.symbol}"
     std = per_pixel_of(field.errors)
@@ -114,14 +113,12 @@ def _draw_fitted(panels: list[Panel], fit: Fit, field: FittedField) -> None:
 
 
 def _crossed_rays(fit: Fit) -> BoolArray:
-    """Return the pixels whose rays have crossed others in any image."""
     displacements = np.stack([field.displacement for field in fit.fields])
     moved = np.einsum("lm,mcyx->lcyx", fit.strengths, displacements)
     return np.asarray(np.any([jacobian_determinant(total) < 0 for total in moved], axis=0))
 
 
 def _magnitude_error(field: FittedField, in_units: ShownField) -> FloatArray | None:
-    """Return the standard deviation of a field's magnitude in the unit in which it is shown."""
     std = per_pixel_of(field.errors)
     if std is None:
         return None

@@ -87,7 +87,6 @@ def _common_setup(stack: xarray.Dataset) -> Any:
 
 
 def _plane(field: xarray.DataArray, index: int, used: xarray.DataArray | None) -> FloatArray:
-    """Values or lengths in one shot, NaN where a mask leaves pixels out."""
     values = np.asarray(field.isel(shot=index).values, dtype=np.float64)
     plane: FloatArray = values if values.ndim == 2 else np.sqrt((values**2).sum(axis=0))
     if used is None:
@@ -117,7 +116,6 @@ def _draw_frames(
     label: str,
     limits: tuple[float, float],
 ) -> Iterator[NDArray[np.uint8]]:
-    """Redraw a figure with the values and the name of each shot."""
     grid = choose_grid(shape, 1, title=False)
     lines = textwrap.wrap(label, max(12, int(grid.height / 0.075)))
     grid = replace(grid, right_margin=grid.right_margin + 0.15 * (len(lines) - 1))
@@ -172,7 +170,6 @@ def write_film(
 
 
 def _encode(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int:
-    """Write frames to a file; return their number, which is that of the frames read back."""
     import imageio.v2 as iio
 
     is_gif = path.suffix == ".gif"

@@ -91,7 +91,6 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
 
 
 def _draw_errors(axes: Axes, plan: ExperimentPlan) -> None:
-    """Errors made and reported in each draw; draws that are not determined in another colour."""
     numbers = [shot.number for shot in plan.shots]
     colours = [LEVEL_COLOURS[shot.verdict.level] for shot in plan.shots]
     axes.bar(numbers, [100 * shot.error for shot in plan.shots], color=colours)

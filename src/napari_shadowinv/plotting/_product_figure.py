@@ -57,7 +57,6 @@ def products_figure(results: Sequence[ProductResult], *, title: str | None = Non
 
 
 def _footer(results: Sequence[ProductResult]) -> list[tuple[str, str]]:
-    """Return the numbers of each product, each caution once, and what the image cannot show."""
     sentences, doubts = [], []
     for each in results:
         numbers = [fact for fact in each.facts if fact.short or fact.key in each.variables]
@@ -73,7 +72,6 @@ def _footer(results: Sequence[ProductResult]) -> list[tuple[str, str]]:
 
 
 def _panels_of(result: ProductResult) -> tuple[tuple[str, ...], ...]:
-    """Return the variables of each panel: a map, or curves in one unit."""
     maps = [name for name, variable in result.variables.items() if len(variable.dims) == 2]
     return ((maps[0],),) if maps else result.curve_groups
 
