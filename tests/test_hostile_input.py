@@ -296,7 +296,7 @@ def test_rim_wider_than_the_film_is_refused() -> None:
 @pytest.mark.parametrize("name", ["report", "options", "setup"])
 @pytest.mark.parametrize("junk", ["", "{", "[]", "null", '"x"', '{"a": 1}'])
 def test_result_with_junk_is_refused_in_one_sentence(name: str, junk: str) -> None:
-    dataset = invert(SHOT, options={"n_sites": 60}).to_dataset(ProtonSetup.example())
+    dataset = invert(SHOT, options={"n_sites": 60}).in_units(ProtonSetup.example()).to_dataset()
     dataset.attrs[name] = junk
     load = setup_from_dataset if name == "setup" else Inversion.from_dataset
     message = refusal(lambda: load(dataset))

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.result import RetrievedField
-    from napari_shadowinv.physics.setup import Setup
 
     AnyResult: TypeAlias = Inversion | Fit | FilmDoses | RetrievedField
 
@@ -37,23 +36,21 @@ def result_from_dataset(dataset: xarray.Dataset) -> AnyResult:
     return next(each for each in classes if each.kind is kind).from_dataset(dataset)
 
 
-def unpack_result(result: Any) -> tuple[AnyResult, Setup | None]:
-    """Return a result, or the result in a dataset, of a single shot, and its setup.
+def unpack_result(result: Any) -> AnyResult:
+    """Return a result, or the result in a dataset, of a single shot.
 
     Raises
     ------
     InputError
         If it is neither, or is a stack or a damaged dataset.
     """
-    from napari_shadowinv.inversion.variables import setup_from_dataset
-
     if hasattr(type(result), "headline"):
-        return result, getattr(result, "setup", None)
+        content: AnyResult = result
+        return content
     if not hasattr(result, "data_vars"):
         raise InputError(f"got {type(result).__name__}, expected a result or its dataset")
     if "shot" in result.dims:
         raise InputError(
             "got a stack of shots, expected the result of one shot: choose one by its index"
         )
-    content = result_from_dataset(result)
-    return content, setup_from_dataset(result) or getattr(content, "setup", None)
+    return result_from_dataset(result)

@@ -73,7 +73,7 @@ def test_bands_are_those_of_uncertainty(inversion: Inversion):
 
 
 def test_a_saved_inversion_has_the_same_bands(inversion: Inversion):
-    dataset = inversion.to_dataset(SETUP)
+    dataset = inversion.in_units(SETUP).to_dataset()
     again = Inversion.from_dataset(dataset)
     before, after = (analyse(each, LINE, samples=20, setup=SETUP)[0] for each in (inversion, again))
     np.testing.assert_array_equal(before["magnitude"].samples, after["magnitude"].samples)
@@ -187,7 +187,7 @@ def test_every_result_says_what_the_image_cannot_show(exact: RetrievedField):
 
 def test_products_come_back_from_a_dataset(inversion: Inversion):
     results = analyse(inversion, [LINE, CIRCLES[0], CIRCLES[1]], setup=SETUP, samples=20)
-    dataset = add_products(inversion.to_dataset(SETUP), results)
+    dataset = add_products(inversion.in_units(SETUP).to_dataset(), results)
     assert dataset["current_1_current"].attrs["units"] == "A m"
     assert Inversion.from_dataset(dataset).displacement is not None
     again = products_in(dataset)

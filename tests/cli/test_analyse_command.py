@@ -27,7 +27,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     image = np.random.default_rng(0).poisson(400 * synthetic_image(phantom.displacement))
     inversion = invert(image, source=np.full(image.shape, 400.0))
     path = tmp_path_factory.mktemp("result") / "ring.shadowinv"
-    return write(path, inversion.to_dataset(SETUP))
+    return write(path, inversion.in_units(SETUP).to_dataset())
 
 
 @pytest.fixture

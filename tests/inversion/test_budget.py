@@ -591,7 +591,7 @@ def test_noise_error_does_not_depend_on_the_unit_of_the_image(image):
 
 def test_a_dataset_keeps_the_errors_and_has_them_in_si(image, proton_setup: ProtonSetup):
     inversion = invert(image, options=InversionOptions(n_sites=900))
-    dataset = inversion.to_dataset(proton_setup)
+    dataset = inversion.in_units(proton_setup).to_dataset()
     assert Inversion.from_dataset(dataset).errors == inversion.errors
     in_si = json.loads(dataset.attrs["errors_si"])
     strongest = np.sqrt((dataset[in_si["field"]] ** 2).sum("component")).max().item()

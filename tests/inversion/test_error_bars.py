@@ -319,9 +319,9 @@ def test_dataset_has_a_deviation_beside_each_field(
 ):
     result = sampled.errors.samples
     for setup in (None, proton_setup, optical_setup):
-        dataset = sampled.to_dataset(setup)
+        dataset = sampled.in_units(setup).to_dataset()
         plain = dataclasses.replace(sampled, errors=None)
-        fields = set(plain.to_dataset(setup).data_vars)
+        fields = set(plain.in_units(setup).to_dataset().data_vars)
         np.testing.assert_array_equal(dataset["potential_std"], result.potential_std)
         np.testing.assert_array_equal(dataset["displacement_mean"], result.displacement_mean)
         deviations = {str(name) for name in dataset.data_vars if str(name).endswith("_std")}
@@ -338,7 +338,7 @@ def test_dataset_has_a_deviation_beside_each_field(
 
 def test_deviations_of_si_fields_belong_to_their_components(sampled, proton_setup: ProtonSetup):
     """Protons deflected along y have met a field along x."""
-    dataset = sampled.to_dataset(proton_setup)
+    dataset = sampled.in_units(proton_setup).to_dataset()
     of_one_pixel = np.abs(proton_setup.path_integrated_b(np.array([1.0, 0.0])[:, None, None]))
     along_x = float(of_one_pixel[1, 0, 0])
     np.testing.assert_allclose(

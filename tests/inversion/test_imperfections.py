@@ -272,7 +272,7 @@ def test_an_error_of_the_energy_scales_the_field_not_the_displacement(setup, pow
     result = invert(image, source=np.ones(image.shape), instrument={"energy": 0.1})
     exact = invert(image, source=np.ones(image.shape))
     assert result.errors == exact.errors
-    in_si = result.in_units(setup).errors
+    in_si = result.in_units(setup).field_errors
     added = np.sqrt(in_si.total.rms**2 - result.errors.total.rms**2)
     assert added == pytest.approx(0.1 * power * result.errors.rms, rel=0.02, abs=1e-9)
     assert (result.in_units(setup).facts[0] == exact.in_units(setup).facts[0]) == (power == 0)

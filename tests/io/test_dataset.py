@@ -59,7 +59,7 @@ def test_file_gives_back_every_bit(
     assert setup_from_dataset(dataset) == setups[kind]
     xr.testing.assert_identical(
         dataset.drop_attrs(deep=False),
-        inversion.to_dataset(setups[kind]).drop_attrs(deep=False),
+        inversion.in_units(setups[kind]).to_dataset().drop_attrs(deep=False),
     )
 
 
@@ -88,7 +88,7 @@ def test_every_variable_has_units_and_a_name(
     inversion: Inversion, proton_setup: ProtonSetup, optical_setup: OpticalSetup
 ) -> None:
     for setup in (None, proton_setup, optical_setup):
-        dataset = inversion.to_dataset(setup)
+        dataset = inversion.in_units(setup).to_dataset()
         for name, variable in dataset.variables.items():
             assert variable.attrs.get("units"), name
             assert variable.attrs.get("long_name"), name
@@ -100,7 +100,7 @@ def test_every_variable_has_units_and_a_name(
 def test_si_values_of_protons_follow_from_the_setup(
     inversion: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    dataset = inversion.to_dataset(proton_setup)
+    dataset = inversion.in_units(proton_setup).to_dataset()
     slope = 1.5e-6 * proton_setup.magnification / 2e-2
     np.testing.assert_allclose(dataset["deflection_angle"], inversion.displacement * slope)
     np.testing.assert_allclose(dataset["potential_si"], inversion.potential * slope * 1.5e-6)
@@ -119,7 +119,7 @@ def test_si_values_of_protons_follow_from_the_setup(
 def test_si_values_of_light_follow_from_the_setup(
     inversion: Inversion, optical_setup: OpticalSetup
 ) -> None:
-    dataset = inversion.to_dataset(optical_setup)
+    dataset = inversion.in_units(optical_setup).to_dataset()
     np.testing.assert_array_equal(
         dataset["line_integrated_density"],
         optical_setup.line_integrated_density(inversion.potential),

@@ -29,7 +29,7 @@ reads_coordinates = pytest.mark.skipif(
 def test_field_in_metres_lies_over_a_layer_of_its_pixels(
     origin: str, inversion: Inversion, tmp_path: Path
 ) -> None:
-    dataset = inversion.to_dataset(SETUP)
+    dataset = inversion.in_units(SETUP).to_dataset()
     path = tmp_path / "shot.shadowinv"
     if origin == "file":
         write(path, dataset)
@@ -58,7 +58,7 @@ def test_field_without_a_setup_is_in_pixels_of_napari(inversion: Inversion) -> N
 
 
 def test_units_of_a_result_are_parsed_by_pint_as_meant(inversion: Inversion) -> None:
-    dataset = inversion.to_dataset(SETUP)
+    dataset = inversion.in_units(SETUP).to_dataset()
     units = {name: registry.Unit(dataset[name].attrs["units"]) for name in dataset.variables}
     pixel = registry.Unit("pixel")
     assert units["potential"] == pixel**2

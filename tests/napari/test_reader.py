@@ -292,7 +292,7 @@ def store(solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path) -> Path:
     """Three shots, the first still empty, as a run writes them."""
     import xarray as xr
 
-    result = solved.to_dataset(proton_setup)
+    result = solved.in_units(proton_setup).to_dataset()
     half = result.copy()
     empty = result.copy(deep=True)
     for name in ("potential", "displacement", "reprojection", "residual"):

@@ -95,7 +95,7 @@ def test_nothing_of_the_result_is_lost(
     add_to_viewer(viewer, solved, proton_setup, attributes={"setup_origin": "typed"})
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     dataset = read(tmp_path / "a.shadowinv")
-    expected = solved.to_dataset(proton_setup)
+    expected = solved.in_units(proton_setup).to_dataset()
     for name in expected.variables:
         np.testing.assert_array_equal(dataset[name], expected[name])
     assert dataset.attrs["options"] == expected.attrs["options"]

@@ -90,7 +90,7 @@ def test_an_object_keeps_its_size_in_other_pixels():
 def test_a_saved_result_is_an_object_with_its_setup(tmp_path):
     result = invert(image_of())
     path = tmp_path / "shot.shadowinv"
-    write(path, result.to_dataset(SETUP))
+    write(path, result.in_units(SETUP).to_dataset())
     target = object_of_result(read(path))
     np.testing.assert_allclose(
         target.displacement(SETUP, Grid((64, 64))), result.displacement, atol=1e-9

@@ -64,7 +64,9 @@ def test_no_panel_touches_another_or_leaves_the_page(
     inversion = make_inversion(
         shape, converged=False, cautions=(Caution("flux", "a long warning " * 20),)
     )
-    figure = report_figure(inversion, proton_setup if with_setup else None, title="Shot 42")
+    figure = report_figure(
+        inversion.in_units(proton_setup if with_setup else None), title="Shot 42"
+    )
     assert len(panels(figure)) == 6
     assert_nothing_overlaps(figure)
 
@@ -86,7 +88,7 @@ def test_units_are_on_every_axis_and_colour_bar(
         (proton_setup, "µm", "T·m"),
         (optical_setup, "µm", "rad"),
     ):
-        figure = report_figure(inversion, setup)
+        figure = report_figure(inversion.in_units(setup))
         for axes in panels(figure)[:5]:
             assert axes.get_xlabel() == f"x ({length})"
             assert axes.get_ylabel() == f"y ({length})"
@@ -99,7 +101,7 @@ def test_units_are_on_every_axis_and_colour_bar(
 
 
 def test_field_is_shown_in_si(inversion: Inversion, proton_setup: ProtonSetup) -> None:
-    axes = panels(report_figure(inversion, proton_setup))[2]
+    axes = panels(report_figure(inversion.in_units(proton_setup)))[2]
     unit = axes.child_axes[0].get_ylabel().rpartition("(")[2].rstrip(")")
     factor = {"T·m": 1, "mT·m": 1e3, "µT·m": 1e6}[unit]
     expected = np.hypot(*proton_setup.path_integrated_b(inversion.displacement)) * factor

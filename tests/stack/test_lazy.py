@@ -56,7 +56,7 @@ def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup, 
     assert computed.sizes == stack.sizes
     for index, image in enumerate(night.images):
         inversion = invert(image, source=night.source, options=options)
-        alone = inversion.to_dataset(optical_setup)
+        alone = inversion.in_units(optical_setup).to_dataset()
         names = [k for k in alone.data_vars if boundary == "closed" or "site" not in alone[k].dims]
         assert {*names} <= set(stack.data_vars)
         for name in names:

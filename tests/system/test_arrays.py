@@ -189,7 +189,7 @@ def test_forward_models_take_axes_by_name() -> None:
 
 def test_dataset_of_a_result_is_taken_as_it_is() -> None:
     inversion = invert(SHOT, options=OPTIONS)
-    dataset = inversion.to_dataset(SETUP)
+    dataset = inversion.in_units(SETUP).to_dataset()
 
     for turn in (dataset, dataset.transpose("x", ...)):
         image = synthetic_image(turn.displacement, turn.source)

@@ -22,7 +22,6 @@ from napari_shadowinv._napari.packs import pack_layers
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import PRADFORMAT, RESULT, SITES, Format
 from napari_shadowinv.results import result_from_dataset
@@ -74,7 +73,7 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
     name = dataset.attrs.get(_NAME, name)
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     content = result_from_dataset(dataset)
-    setup = setup_from_dataset(dataset) or content.setup
+    setup = content.setup
     result = Result(
         content,
         setup,
@@ -161,7 +160,7 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]
     for data, keywords, _ in layers:
         if about.role_of(keywords) == "caustic":
             content = replace(content, caustic=np.asarray(data) > 0)
-    return content.to_dataset(result.setup, attributes=attributes)
+    return content.in_units(result.setup).to_dataset(attributes=attributes)
 
 
 def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:

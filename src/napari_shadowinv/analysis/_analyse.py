@@ -95,8 +95,8 @@ def analyse(
     if samples < 20:
         raise InputError(f"samples is {samples}, expected at least 20")
     chosen_unit = None if unit is None else field_unit(unit)
-    content, own_setup = unpack_result(result)
-    fields = sampled_fields(content, setup or own_setup, chosen_unit, deflector)
+    content = unpack_result(result)
+    fields = sampled_fields(content, setup or content.setup, chosen_unit, deflector)
     callbacks = {"on_progress": on_progress, "should_stop": should_stop}
     tasks = [_Task(each, _products_for(listed, each.frame, len(fields))) for each in fields]
     missing = [each for each in listed if not any(each in task.products for task in tasks)]

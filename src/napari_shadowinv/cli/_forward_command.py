@@ -219,7 +219,7 @@ def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
     """Return the only field in the dataset of a result, with the beam of its first image."""
     from napari_shadowinv.results import unpack_result
 
-    result, setup = unpack_result(dataset)
+    result = unpack_result(dataset)
     names = json.loads(dataset.attrs.get("fields", "[]"))
     if len(names) > 1:
         raise InputError(
@@ -232,7 +232,7 @@ def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
     source = dataset["source"].values if "source" in dataset else None
     if source is not None and source.ndim == 3:
         source = source[0]
-    return Field(displacement, source, setup)
+    return Field(displacement, source, result.setup)
 
 
 def _displacement(path: Path, array: AnyArray) -> FloatArray:

@@ -148,25 +148,22 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
     from napari_shadowinv.analysis import products_in
     from napari_shadowinv.fitting import LeaveOneOut
 
-    content, setup = unpack_result(dataset)
-    result: Any = content
+    content = unpack_result(dataset)
     kind = f"{content.kind.noun} of shadowinv {dataset.attrs.get('package_version')}"
     if content.kind is ResultKind.FIELD and "options" not in dataset.attrs:
         is_pradformat = dataset.attrs.get("format") == "pradformat"
         kind = "pradformat inversion" if is_pradformat else "field retrieved by another program"
-    if content.kind is ResultKind.INVERSION:
-        result = result.in_units(setup)
-    facts = list(result.facts)
+    facts = list(content.facts)
     if "left_out_chi2" in dataset:
         facts += LeaveOneOut.from_dataset(dataset).facts
     shape = (dataset.sizes["y"], dataset.sizes["x"])
-    has_verdict = result.headline.verdict is not None
+    has_verdict = content.headline.verdict is not None
     rows: _summary.Rows = [
-        *([_summary.headline_row(result.headline)] if has_verdict else []),
+        *([_summary.headline_row(content.headline)] if has_verdict else []),
         ("kind", kind),
         *([("created", str(dataset.attrs["created"]))] if "created" in dataset.attrs else []),
         ("image", _summary.size_text(shape)),
-        ("setup", _summary.setup_text(setup, shape=shape)),
+        ("setup", _summary.setup_text(content.setup, shape=shape)),
         *_summary.fact_rows(facts, details=True),
         *_summary.provenance_rows(Provenance.of(dataset.attrs, dataset.variables)),
     ]

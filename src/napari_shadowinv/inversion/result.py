@@ -1,7 +1,4 @@
-"""The result of an inversion, `Inversion` with a `Report`, and a field alone, `RetrievedField`.
-
-The result in words, in the units of a setup: `InversionInUnits`.
-"""
+"""The result of an inversion, `Inversion` with a `Report`, and a field alone, `RetrievedField`."""
 
 from __future__ import annotations
 
@@ -200,6 +197,8 @@ class Inversion(Summarised):
         The options used.
     instrument : Instrument
         How well the experiment is known, which the errors hold.
+    setup : Setup or None
+        The experiment: gives the main field in SI units. None: all is in pixels.
     provenance : Provenance or None
         Recipe and input files, if it was made by a recipe.
     errors : ErrorBudget or None
@@ -220,12 +219,12 @@ class Inversion(Summarised):
     report: Report
     options: InversionOptions
     instrument: Instrument = field(default_factory=Instrument)
+    setup: Setup | None = None
     provenance: Provenance | None = None
     errors: ErrorBudget | None = None
 
     def _picture(self) -> FloatArray:
-        (field,) = shown_fields([self.displacement], self.setup, mask=self.lit)
-        return field.magnitude
+        return self.main_field.magnitude
 
     @property
     def total_error(self) -> float | None:
@@ -255,44 +254,119 @@ class Inversion(Summarised):
         return structures_of(self.displacement, std, self.mask, element=element)
 
     @property
-    def setup(self) -> Setup | None:
-        """Geometry of the pixels, if the provenance contains it."""
-        return None if self.provenance is None else self.provenance.setup
+    def main_field(self) -> ShownField:
+        """The main field of the setup, where rays start."""
+        (shown,) = shown_fields([self.displacement], self.setup, mask=self.lit)
+        return shown
+
+    @property
+    def field_errors(self) -> ErrorBudget | None:
+        """Errors of the main field, px of displacement, with that by the energy of the beam."""
+        name = "" if self.setup is None else self.setup.main_field.name
+        return self.errors and self.errors.in_field(self.setup, name, self.instrument.energy)
+
+    @property
+    def assessment(self) -> Assessment:
+        """Verdict on the main field, its limit, and the next step."""
+        return assess(self, (_by_caution, _without_total, _by_total))
 
     @property
     def verdict(self) -> Verdict:
         """Whether the field is known within the largest error of the options."""
-        return self.in_units(self.setup).assessment.verdict
+        return self.assessment.verdict
 
     @property
     def headline(self) -> Headline:
         """The peak of the main field, its limit, and the next step."""
-        return self.in_units(self.setup).headline
+        errors, report = self.field_errors, self.report
+        peaks = [self.main_field.short_peak_text(errors and errors.of_peak)]
+        return Headline.of(peaks, self.assessment, report.cautions, converged=report.converged)
 
     @property
     def facts(self) -> tuple[Fact, ...]:
         """The result in words, as every face shows it below the headline."""
-        return self.in_units(self.setup).facts
+        report, errors = self.report, self.field_errors
+        flows = {
+            "flux_left": ("Flux left", report.flux_left),
+            "flux_entered": ("Flux entered", report.flux_entered),
+        }
+        details = {
+            "sites": f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; "),
+            "iterations": f"{report.iterations} on {len(report.levels)} levels",
+            "floor": f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
+            f"{report.clipped_pixels} clipped",
+        }
+        convergence = Level.SOUND if report.converged else Level.FAILED
+        assessment, error_rows = self.assessment, dict(self._error_rows(errors))
+        if assessment.verdict is Verdict.CONDITIONAL:
+            error_rows["measure next"] = assessment.explanation
+        facts = (
+            verdict_fact(assessment.verdict),
+            *caution_facts(report.cautions),
+            *peak_facts(
+                self.displacement,
+                self.setup,
+                mask=self.lit,
+                error=errors and errors.of_peak,
+            ),
+            *(error_fact(name, text) for name, text in error_rows.items()),
+            Fact(
+                "image_residual",
+                "Image residual",
+                f"{percent(report.image_residual)} of the mean (r.m.s.)",
+                short=f"residual {percent(report.image_residual)}",
+            ),
+            *significance_facts(self.structures, () if errors is None else errors.causes),
+            Fact("caustics", "Caustics", f"{percent(self.caustic.mean())} of the pixels"),
+            *masked_fact(self.mask),
+            *(
+                Fact(
+                    key,
+                    title,
+                    ", ".join(f"{side} {percent(share)}" for side, share in flow.items()),
+                )
+                for key, (title, flow) in flows.items()
+                if flow
+            ),
+            Fact(
+                "flux_residual",
+                "Flux residual",
+                f"{to_figures(report.residual)} of a cell, tolerance "
+                f"{to_figures(report.tolerance)}: "
+                f"{'converged' if report.converged else 'NOT converged'}",
+                convergence,
+                short="" if report.converged else "NOT converged",
+            ),
+            *(Fact(key, key.capitalize(), text, is_detail=True) for key, text in details.items()),
+            time_fact(report.seconds),
+        )
+        return folded(facts, _REPORT)
+
+    def _error_rows(self, errors: ErrorBudget | None) -> list[tuple[str, str]]:
+        if errors is None:
+            return []
+        rows = errors.rows("displacement" if errors is self.errors else "field")
+        provenance, options = self.provenance, self.options
+        steps = () if provenance is None else provenance.recipe.steps
+        smoothing = [step.title for step in steps if step.smooths]
+        is_stated = (options.noise_level, options.units_per_quantum) != (None, None)
+        if smoothing and not is_stated and not errors.noise_correlation:
+            caveat = (
+                f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
+                "error is larger than stated; give the noise level, or units per quantum, of the "
+                "recorded image"
+            )
+            rows.append(("noise", caveat))
+        return rows
 
     def variable(self, name: str) -> AnyArray:
         """Return the array of a variable of the dataset, one of `VARIABLES`."""
         owner = self.cells if _is_of_cells(name) else self
         return np.asarray(getattr(owner, name.removeprefix("site_")))
 
-    def in_units(self, setup: Setup | None) -> InversionInUnits:
-        """Return errors, assessment, headline and facts in the units of a setup.
-
-        Parameters
-        ----------
-        setup : Setup or None
-            Gives the main field in SI units, and the error of its energy; None the displacement in
-            px.
-
-        Returns
-        -------
-        InversionInUnits
-        """
-        return InversionInUnits(self, setup)
+    def in_units(self, setup: Setup | None) -> Inversion:
+        """Return the same in the units of another experiment; None for px."""
+        return replace(self, setup=setup)
 
     @property
     def recorded(self) -> RecordedShot:
@@ -428,16 +502,13 @@ class Inversion(Summarised):
         report = replace(self.report, cautions=(*self.report.cautions, *cautions))
         return replace(self, report=report)
 
-    def to_dataset(
-        self, setup: Setup | None = None, *, attributes: Mapping[str, str] | None = None
-    ) -> xarray.Dataset:
+    def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.
+
+        The setup adds the line-integrated fields in SI units, and coordinates in metres.
 
         Parameters
         ----------
-        setup : Setup, optional
-            Adds the potential and the line-integrated fields in SI units, and coordinates in
-            metres. Default: the provenance's.
         attributes : mapping of str to str, optional
             Further attributes.
 
@@ -457,13 +528,10 @@ class Inversion(Summarised):
             "report": json.dumps(dataclasses.asdict(self.report)),
             "image_residual": self.report.image_residual,
         }
-        if self.provenance is not None:
-            setup = self.setup if setup is None else setup
         if self.errors is not None:
             history["errors"] = json.dumps(self.errors.to_dict())
             history["error_causes"] = json.dumps(self.errors.causes)
-        in_units = self.in_units(setup)
-        errors, assessment = in_units.errors, in_units.assessment
+        errors, assessment, setup = self.field_errors, self.assessment, self.setup
         history |= {"verdict": assessment.verdict.value, "explanation": assessment.explanation}
         if errors is not None and setup is not None:
             field = setup.main_field
@@ -511,134 +579,14 @@ class Inversion(Summarised):
             report=_report_schema().validate_python(content),
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             instrument=Instrument.model_validate_json(dataset.attrs["instrument"]),
+            setup=setup_from_dataset(dataset),
             provenance=Provenance.of(dataset.attrs, dataset.variables),
             errors=_errors_in(dataset),
         )
 
 
-@dataclass(frozen=True)
-class InversionInUnits:
-    """An inversion in the units of a setup.
-
-    Attributes
-    ----------
-    inversion : Inversion
-        The result.
-    setup : Setup or None
-        Gives the main field in SI units, and the error of its energy; None the displacement in px.
-    """
-
-    inversion: Inversion
-    setup: Setup | None
-
-    @property
-    def field(self) -> ShownField:
-        """The main field, where rays start."""
-        (field,) = shown_fields([self.inversion.displacement], self.setup, mask=self.inversion.lit)
-        return field
-
-    @property
-    def errors(self) -> ErrorBudget | None:
-        """Error budget of the main field, px of displacement; None if it was not estimated."""
-        errors, setup = self.inversion.errors, self.setup
-        name = "" if setup is None else setup.main_field.name
-        return errors and errors.in_field(setup, name, self.inversion.instrument.energy)
-
-    @property
-    def assessment(self) -> Assessment:
-        """Verdict on the main field, its limit, and the next step."""
-        return assess(self, (_by_caution, _without_total, _by_total))
-
-    @property
-    def headline(self) -> Headline:
-        """The peak of the main field, its limit, and the next step."""
-        errors = self.errors
-        error = None if errors is None else errors.of_peak
-        peaks, report = [self.field.short_peak_text(error)], self.inversion.report
-        return Headline.of(peaks, self.assessment, report.cautions, converged=report.converged)
-
-    @property
-    def facts(self) -> tuple[Fact, ...]:
-        """The result in words, as every face shows it below the headline."""
-        inversion = self.inversion
-        report, errors = inversion.report, self.errors
-        error_of_peak = None if errors is None else errors.of_peak
-        flows = {
-            "flux_left": ("Flux left", report.flux_left),
-            "flux_entered": ("Flux entered", report.flux_entered),
-        }
-        details = {
-            "sites": f"{report.n_sites:,}; {report.sites_reason}".removesuffix("; "),
-            "iterations": f"{report.iterations} on {len(report.levels)} levels",
-            "floor": f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
-            f"{report.clipped_pixels} clipped",
-        }
-        convergence = Level.SOUND if report.converged else Level.FAILED
-        assessment, error_rows = self.assessment, dict(self._error_rows(errors))
-        if assessment.verdict is Verdict.CONDITIONAL:
-            error_rows["measure next"] = assessment.explanation
-        facts = (
-            verdict_fact(assessment.verdict),
-            *caution_facts(report.cautions),
-            *peak_facts(
-                inversion.displacement, self.setup, mask=inversion.lit, error=error_of_peak
-            ),
-            *(error_fact(name, text) for name, text in error_rows.items()),
-            Fact(
-                "image_residual",
-                "Image residual",
-                f"{percent(report.image_residual)} of the mean (r.m.s.)",
-                short=f"residual {percent(report.image_residual)}",
-            ),
-            *significance_facts(inversion.structures, () if errors is None else errors.causes),
-            Fact("caustics", "Caustics", f"{percent(inversion.caustic.mean())} of the pixels"),
-            *masked_fact(inversion.mask),
-            *(
-                Fact(
-                    key,
-                    title,
-                    ", ".join(f"{side} {percent(share)}" for side, share in flow.items()),
-                )
-                for key, (title, flow) in flows.items()
-                if flow
-            ),
-            Fact(
-                "flux_residual",
-                "Flux residual",
-                f"{to_figures(report.residual)} of a cell, tolerance "
-                f"{to_figures(report.tolerance)}: "
-                f"{'converged' if report.converged else 'NOT converged'}",
-                convergence,
-                short="" if report.converged else "NOT converged",
-            ),
-            *(Fact(key, key.capitalize(), text, is_detail=True) for key, text in details.items()),
-            time_fact(report.seconds),
-        )
-        return folded(facts, _REPORT)
-
-    def _subject(self, errors: ErrorBudget) -> str:
-        return "displacement" if errors is self.inversion.errors else "field"
-
-    def _error_rows(self, errors: ErrorBudget | None) -> list[tuple[str, str]]:
-        if errors is None:
-            return []
-        rows = errors.rows(self._subject(errors))
-        provenance, options = self.inversion.provenance, self.inversion.options
-        steps = () if provenance is None else provenance.recipe.steps
-        smoothing = [step.title for step in steps if step.smooths]
-        is_stated = (options.noise_level, options.units_per_quantum) != (None, None)
-        if smoothing and not is_stated and not errors.noise_correlation:
-            caveat = (
-                f"measured after {', '.join(smoothing)}, where most of it cannot be seen: its "
-                "error is larger than stated; give the noise level, or units per quantum, of the "
-                "recorded image"
-            )
-            rows.append(("noise", caveat))
-        return rows
-
-
-def _by_caution(case: InversionInUnits) -> Assessment | None:
-    by_code = {caution.code: caution for caution in reversed(case.inversion.report.cautions)}
+def _by_caution(case: Inversion) -> Assessment | None:
+    by_code = {caution.code: caution for caution in reversed(case.report.cautions)}
     for code, (verdict, advice) in DECISIVE.items():
         if code in by_code:
             caution, errors = by_code[code], case.errors
@@ -649,7 +597,7 @@ def _by_caution(case: InversionInUnits) -> Assessment | None:
     return None
 
 
-def _without_total(case: InversionInUnits) -> Assessment | None:
+def _without_total(case: Inversion) -> Assessment | None:
     if case.errors is None:
         return Assessment(Verdict.UNCERTAIN, "errors were not worked out")
     if not case.errors.rms > 0:
@@ -657,13 +605,13 @@ def _without_total(case: InversionInUnits) -> Assessment | None:
     return None
 
 
-def _by_total(case: InversionInUnits) -> Assessment:
-    errors, max_error = case.errors, case.inversion.options.max_error
+def _by_total(case: Inversion) -> Assessment:
+    errors, max_error = case.field_errors, case.options.max_error
     assert errors is not None
     if errors.share <= max_error:
         return Assessment(Verdict.DETERMINED, errors.limit)
     if condition := errors.condition(max_error):
-        return case.field.conditional(condition)
+        return case.main_field.conditional(condition)
     steps = (errors.measure_next(share) for share in (max_error, errors.share / 2))
     # That of the headline is a short one.
     advice = next((text for text in steps if len(text.split()) <= _MOST_ADVICE), "")

@@ -354,5 +354,5 @@ def _as_dataset(result: Any, setup: Setup | None) -> xarray.Dataset:
     from napari_shadowinv.inversion import Inversion
 
     if isinstance(result, Inversion):
-        return result.to_dataset(setup)
+        return result.in_units(setup).to_dataset()
     raise InputError(f"received a setup for a {result.kind.noun}, which has its own: leave it out")

@@ -392,8 +392,8 @@ def _inverted(
         options=InversionOptions(max_error=options.max_error, threads=1),
         should_stop=should_stop,
     )
-    in_units = inversion.in_units(setup)
-    assessment, errors = in_units.assessment, in_units.errors
+    inversion = inversion.in_units(setup)
+    assessment, errors = inversion.assessment, inversion.field_errors
     shot = PlannedShot(
         number,
         assessment.verdict,

@@ -354,7 +354,7 @@ def object_of_result(result: Any) -> PlannedObject:
     InputError
         If it has no field or several, or is not of one shot.
     """
-    content, setup = unpack_result(result)
+    content = unpack_result(result)
     fields: tuple[Any, ...] = getattr(content, "fields", (content,))
     if len(fields) > 1:
         names = " and ".join(field.name for field in fields)
@@ -367,4 +367,6 @@ def object_of_result(result: Any) -> PlannedObject:
     if displacement is None:
         raise InputError(f"got a {content.kind.noun}, expected a result with a field")
     cause = deflector_titles().get(getattr(field, "name", ""))
-    return object_of_displacement(displacement, setup, deflector=cause, title="an earlier result")
+    return object_of_displacement(
+        displacement, content.setup, deflector=cause, title="an earlier result"
+    )

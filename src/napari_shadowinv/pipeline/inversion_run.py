@@ -358,9 +358,8 @@ def run_prepared(
     provenance = inputs.provenance.with_image(notes=notes).model_copy(
         update={"setup": shot.setup, "recipe": recipe}
     )
-    inversion = replace(
-        inversion, report=replace(inversion.report, seconds=seconds), provenance=provenance
-    )
+    report_in_all = replace(inversion.report, seconds=seconds)
+    inversion = replace(inversion, report=report_in_all, setup=shot.setup, provenance=provenance)
     if shot.setup is not None:
         doubts += setup_warnings(shot.setup, shot.shape, shot.metadata)
         doubts += deflection_warnings(shot.setup, inversion.displacement)

@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 DOTS_PER_INCH = 160  # of a figure's file
 
 
-def report_figure(
-    inversion: Inversion, setup: Setup | None = None, *, title: str | None = None
-) -> Figure:
+def report_figure(inversion: Inversion, *, title: str | None = None) -> Figure:
     """Show all of one shot on a page.
 
     Six panels: image, potential with contours, field with arrows, re-projection, residual and
@@ -42,8 +40,6 @@ def report_figure(
     Parameters
     ----------
     inversion : Inversion
-    setup : Setup, optional
-        Gives axes in metres and the field in SI units. Default: the inversion's, or else pixels.
     title : str, optional
         A heading, such as the shot's name.
 
@@ -52,11 +48,9 @@ def report_figure(
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    setup = inversion.setup if setup is None else setup
-    shape = inversion.potential.shape
+    shape, setup = inversion.potential.shape, inversion.setup
     (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
-    in_units = inversion.in_units(setup)
-    headline, facts = in_units.headline, in_units.facts
+    headline, facts = inversion.headline, inversion.facts
     with _panels.shot_page(shape, setup, title, headline, facts) as (figure, panels):
         mean = float(inversion.source.mean())
         limits = intensity_limits(inversion.image / mean)

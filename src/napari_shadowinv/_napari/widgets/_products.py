@@ -362,8 +362,9 @@ class ProductForm(QtWidgets.QWidget):
         if not name:
             return
         content = result.content
-        has_setup = result.setup is not None and content.setup is None
-        dataset = content.to_dataset(result.setup) if has_setup else content.to_dataset()
+        if result.setup is not None and content.setup is None:
+            content = content.in_units(result.setup)
+        dataset = content.to_dataset()
         show_info(f"Wrote {write(name, add_products(dataset, self.results), overwrite=True)}")
 
 

@@ -263,8 +263,9 @@ class InvertShot(InversionInputs, panels.ToolPanel):
             self.reveal(self.verdict)
 
     def _report(self, inversion: Inversion, setup: Setup | None, input_rows: panels.Rows) -> None:
-        self.verdict.show_headline(inversion.in_units(setup).headline)
-        facts = inversion.in_units(setup).facts
+        inversion = inversion.in_units(setup)
+        self.verdict.show_headline(inversion.headline)
+        facts = inversion.facts
         said = self.setup.warning_label.text()  # in the form, above
         warnings = [row for row in panels.warning_rows(facts) if row[1] not in said]
         rows = [*warnings, *input_rows, *panels.fact_rows(facts)]
