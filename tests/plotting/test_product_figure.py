@@ -64,14 +64,12 @@ def test_words_are_on_the_page_and_not_over_each_other():
 def test_series_has_a_panel_for_each_unit():
     fields = [field_of(toroid((48, 48), SETUP, peak, 9e-6)) for peak in (20.0, 30.0)]
     series = time_series([analyse(field, PRODUCTS[1])[0] for field in fields], [0.0, 2e-9])
-    numbers, places = products_figure([series.result]).axes
+    numbers, places = products_figure([series]).axes
     assert (numbers.get_ylabel(), places.get_ylabel()) == ("field (T m)", "µm")
     assert places.get_xlabel() == "time (ns)"
     lines = {line.get_label(): line for axes in (numbers, places) for line in axes.lines}
     np.testing.assert_allclose(lines["rms"].get_xdata(), [0, 2])
-    np.testing.assert_allclose(
-        lines["centroid_x"].get_ydata(), 1e6 * series.result["centroid_x"].value
-    )
+    np.testing.assert_allclose(lines["centroid_x"].get_ydata(), 1e6 * series["centroid_x"].value)
 
 
 def test_numbers_alone_need_no_panel():

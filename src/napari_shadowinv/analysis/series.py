@@ -1,4 +1,4 @@
-"""A product over the shots of a stack: `time_series`, `analyse_shots`; `TimeSeries`.
+"""A product over successive shots: `time_series`, `analyse_shots`; its `growth_rate`.
 
 - the time of each shot from the time between two: `shot_times`
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,46 +39,35 @@ _TIME, _SHOT = SERIES_AXES
 _AXES = {"s": (_TIME, "time"), "": (_SHOT, "number of the shot")}
 
 
-@dataclass(frozen=True, eq=False)
-class TimeSeries:
-    """Numbers of one product in successive shots.
+def growth_rate(series: ProductResult, name: str) -> Quantity:
+    """Return the rate γ in 1/s of exponential growth, such as of the r.m.s. of a region.
 
-    Attributes
+    It is the slope of the logarithm over time, by least squares in which a shot counts as its
+    relative error allows; the band follows from the samples. Without them it follows from the
+    scatter of at least three shots about the line (Student's t).
+
+    Parameters
     ----------
-    result : ProductResult
-        The numbers along the axis of the shots, for tables, figures and files; errors of different
-        shots are independent in its samples. Its facts are the growth rates.
+    series : ProductResult
+        Of `time_series` or `analyse_shots`.
+    name : str
+        One of its numbers.
+
+    Raises
+    ------
+    InputError
+        If there is no such number, or it does not keep its sign.
     """
-
-    result: ProductResult
-
-    @property
-    def times(self) -> FloatArray:
-        """Time of each shot in s, or its number where no times are stated, shape (n,)."""
-        (places,) = self.result.coordinates.values()
-        return np.asarray(places.values)
-
-    def growth_rate(self, name: str) -> Quantity:
-        """Return the rate γ in 1/s of exponential growth, such as of the r.m.s. of a region.
-
-        It is the slope of the logarithm over time, by least squares in which a shot counts as its
-        relative error allows; the band follows from the samples. Without them it follows from the
-        scatter of at least three shots about the line (Student's t).
-
-        Raises
-        ------
-        InputError
-            If there is no such number, or it does not keep its sign.
-        """
-        quantities = self.result.quantities
-        if name not in quantities:
-            raise InputError(f"got the number {name!r}, expected one of {', '.join(quantities)}")
-        if not _keeps_sign(quantities[name]):
-            raise InputError(
-                f"{name} is zero or changes its sign in the series: expected numbers that grow or "
-                "decay, such as an r.m.s."
-            )
-        return _growth_rate(quantities[name], self.times)
+    quantities = series.quantities
+    if name not in quantities:
+        raise InputError(f"got the number {name!r}, expected one of {', '.join(quantities)}")
+    if not _keeps_sign(quantities[name]):
+        raise InputError(
+            f"{name} is zero or changes its sign in the series: expected numbers that grow or "
+            "decay, such as an r.m.s."
+        )
+    (places,) = series.coordinates.values()
+    return _growth_rate(quantities[name], places.values)
 
 
 def _keeps_sign(quantity: Quantity) -> bool:
@@ -107,7 +96,7 @@ def _growth_rate(quantity: Quantity, times: FloatArray, *, samples: int = 1000) 
     return Quantity(rate, rate + error * normal)
 
 
-def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None) -> TimeSeries:
+def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None) -> ProductResult:
     """Join the numbers of one product in several shots.
 
     Parameters
@@ -119,7 +108,9 @@ def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None
 
     Returns
     -------
-    TimeSeries
+    ProductResult
+        The numbers along the axis of the shots; errors of different shots are independent in its
+        samples. Its facts are the growth rates.
 
     Raises
     ------
@@ -137,7 +128,7 @@ def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None
     return _join(results, np.asarray(times, dtype=np.float64), "s")
 
 
-def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> TimeSeries:
+def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> ProductResult:
     """Join results at times in s, or at numbers of shots."""
     if len(results) < 2 or places.shape != (len(results),):
         raise InputError(
@@ -173,7 +164,7 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Ti
         coordinates={axis: Coordinate(places, unit, long_name)},
         stored={},
     )
-    return TimeSeries(replace(result, facts=tuple(_facts(result, places, unit))))
+    return replace(result, facts=tuple(_facts(result, places, unit)))
 
 
 def _single_numbers(result: ProductResult) -> dict[str, Measurand]:
@@ -260,7 +251,7 @@ def analyse_shots(
     setup: Setup | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
-) -> list[TimeSeries]:
+) -> list[ProductResult]:
     """Measure products in each shot of a stack.
 
     A store keeps fields without the errors of their pixels, so the numbers have no bands; growth
@@ -278,8 +269,8 @@ def analyse_shots(
 
     Returns
     -------
-    list of TimeSeries
-        For each product, and each field that it is defined for.
+    list of ProductResult
+        As of `time_series`, for each product, and each field that it is defined for.
 
     Raises
     ------

@@ -107,8 +107,7 @@ def analyse(
             if flags.times is not None:
                 numbers, shots = numbers_of("--times", flags.times), dataset["index"].values
                 seconds = shot_times(numbers, shots.tolist(), f"--times is {flags.times!r}")
-            series = analyse_shots(dataset, chosen, seconds, **common)
-            results = [each.result for each in series]
+            results = analyse_shots(dataset, chosen, seconds, **common)
         else:
             results = measure(dataset, chosen, samples=flags.samples, **common)
     with ExitStack() as stack:  # both files, or none

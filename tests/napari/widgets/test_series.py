@@ -69,10 +69,10 @@ def test_series_of_a_store_is_that_of_python(form: Any, qtbot: Any, store: Path)
     region = Region(center=(15.5, 15.5), radius=10)
     times = 1e-9 * np.arange(SHOTS)
     (expected,) = analyse_shots(read_stack(store), region, times)
-    for name, quantity in expected.result.quantities.items():
+    for name, quantity in expected.quantities.items():
         np.testing.assert_allclose(measured[name].value, quantity.value, rtol=1e-12)
     rows = texts_of(form.report)
-    for fact in expected.result.facts:
+    for fact in expected.facts:
         assert rows[fact.title] == fact.text
     assert float(rows["Growth of rms"].split()[0]) == pytest.approx(RATE, rel=0.05)
     assert "95 %" in rows["Growth of rms"]

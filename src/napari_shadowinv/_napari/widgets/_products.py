@@ -241,7 +241,7 @@ class ProductForm(QtWidgets.QWidget):
             if isinstance(origin, Path):
                 stack = open_shots(origin, shots)
                 seconds = _seconds(times, stack["index"].values.tolist())
-                return [each.result for each in analyse_shots(stack, product, seconds, **common)]
+                return analyse_shots(stack, product, seconds, **common)
             return analyse(origin.content, product, samples=samples, setup=origin.setup, **common)
 
         return _Request(origin, layer, work)
