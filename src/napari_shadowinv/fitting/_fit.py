@@ -23,7 +23,7 @@ from napari_shadowinv._system.progress import (
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
-from napari_shadowinv.fitting.exploration import Openness, adapt, explore, find_basins
+from napari_shadowinv.fitting.exploration import PosteriorSummary, adapt, explore, find_basins
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import EXACT, Imperfect
 from napari_shadowinv.fitting.measurements import FitData, collect_data
@@ -124,22 +124,22 @@ def fit(
         partial(_refine, data, minima),
         partial(_explore, data, minima, rng),
     ]
-    (refined, seconds["full size"]), (basins, openness) = run_in_parallel(works, threads, on_step)
+    (refined, seconds["full size"]), (basins, summary) = run_in_parallel(works, threads, on_step)
     seconds["samples"] = max(time.perf_counter() - begun - seconds["full size"], 0.0)
     with measure_time("residual", seconds):
-        pattern = _find_pattern(data, minima, refined, openness, on_step)
+        pattern = _find_pattern(data, minima, refined, summary, on_step)
         pattern = _with_cause(data, minima, pattern, on_step)
     with measure_time("samples", seconds):
         # What the weights do not include of it.
         least = float(np.sqrt(data.noise.expected_chi2.min()))
         amplification = max(noise_amplification(pattern.correlation) * least, 1.0)
-        errors = field_errors(data, minima.scene, openness, amplification)
-        report = report_of(data, minima.instrument, refined, openness, pattern)
+        errors = field_errors(data, minima.scene, summary, amplification)
+        report = report_of(data, minima.instrument, refined, summary, pattern)
         if options.evidence:
             evidence = log_evidence(data, minima.scene, minima.best, on_step)
             report = replace(report, log_evidence=evidence)
     report = replace(report, seconds=seconds)
-    return summarise(data, refined, basins, openness, errors, report, pattern)
+    return summarise(data, refined, basins, summary, errors, report, pattern)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,7 @@ def _refine(data: FitData, minima: _Minima, on_step: OnStep) -> tuple[FineMinimu
 
 def _explore(
     data: FitData, minima: _Minima, rng: np.random.Generator, on_step: OnStep
-) -> tuple[tuple[Basin, ...], Openness]:
+) -> tuple[tuple[Basin, ...], PosteriorSummary]:
     """Find how far the images leave the answer open, by other starts and by samples."""
     best, *rivals = minima.ends
     basins = find_basins(minima.scene, best, rivals, on_step)
@@ -216,11 +216,11 @@ def _explore(
 
 
 def _find_pattern(
-    data: FitData, minima: _Minima, refined: FineMinimum, openness: Openness, on_step: OnStep
+    data: FitData, minima: _Minima, refined: FineMinimum, summary: PosteriorSummary, on_step: OnStep
 ) -> Pattern:
     pattern = find_pattern(data, refined.scene, refined.unknowns)
-    if pattern.lacks_counts() and openness.posterior is not None:
-        posterior = openness.posterior.reporting(lambda: on_step("samples", refined.objective))
+    if pattern.lacks_counts() and summary.posterior is not None:
+        posterior = summary.posterior.reporting(lambda: on_step("samples", refined.objective))
         absorbed = posterior.count_determined(np.random.default_rng(data.options.seed))
         share = pattern.missing_counts - absorbed / np.count_nonzero(minima.scene.weights)
         pattern = replace(pattern, missing_counts=share)

@@ -38,7 +38,7 @@ from napari_shadowinv.inversion.samples import Pairs
 
 
 @dataclass(frozen=True)
-class Openness:
+class PosteriorSummary:
     """How far the images leave the best unknowns open, and how far an instrument would move them.
 
     There is a `posterior` for counts alone; `pairs` compares samples with those that are solved in
@@ -54,14 +54,6 @@ class Openness:
     by_beam: BeamShifts | None
     assumed: dict[str, Unknowns]
     sensitivities: dict[str, FloatArray]
-
-    def amplified(self, factor: float) -> Openness:
-        """Return the same with larger errors by noise, as correlated noise makes them."""
-        if self.errors is None:
-            return self
-        by_part = {**self.by_part, "noise": factor * self.by_part["noise"]}
-        more = (factor**2 - 1) * self.by_part["noise"] ** 2
-        return replace(self, errors=np.sqrt(self.errors**2 + more), by_part=by_part)
 
 
 def find_basins(
@@ -98,7 +90,7 @@ def explore(
     spacing: float = 1 / 3,
     checked: int = 2,
     least_of_beams: int = 24,
-) -> Openness:
+) -> PosteriorSummary:
     """Draw samples around the best unknowns, and respond to a detector that nobody stated.
 
     Rays are `spacing` px apart. Of samples of an instrument, `checked` are solved, too. Where each
@@ -147,7 +139,7 @@ def explore(
         }
     # Counts are those of a detector that is linear and has no dark level.
     is_linear = data.counted or data.instrument.has_numbers
-    return Openness(
+    return PosteriorSummary(
         posterior if data.counted else None,  # its Jacobians are large
         samples,
         pairs,

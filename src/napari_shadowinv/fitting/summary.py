@@ -13,7 +13,7 @@ import numpy as np
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting.conjugate_gradients import product
-from napari_shadowinv.fitting.exploration import Openness
+from napari_shadowinv.fitting.exploration import PosteriorSummary
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import TITLES, Imperfect, numbers_in_units
 from napari_shadowinv.fitting.measurements import FitData
@@ -35,40 +35,42 @@ from napari_shadowinv.physics.significance import deviation_along
 
 @dataclass(frozen=True)
 class FieldErrors:
-    """Errors of displacements, (M, 2, H, W) px: in all, if there are any, and by each part.
+    """Errors of displacements, (M, 2, H, W) px: in all, and by each part.
 
     With samples of potentials, (M, n, H, W), and the sides beyond which an object may lie.
     """
 
-    in_all: FloatArray | None
+    in_all: FloatArray
     by_part: dict[str, FloatArray]
-    samples: FloatArray | None
+    samples: FloatArray
     sides: tuple[str, ...] = ()
 
     def with_part(self, key: str, errors: FloatArray) -> FieldErrors:
         """Return the same with another part."""
-        in_all = None if self.in_all is None else np.hypot(self.in_all, errors)
+        in_all = np.hypot(self.in_all, errors)
         return replace(self, in_all=in_all, by_part={**self.by_part, key: errors})
 
 
 def field_errors(
-    data: FitData, scene: Scene, openness: Openness, amplification: float
-) -> FieldErrors:
-    """Return the errors by noise, numbers, beam and an assumed detector, and samples of fields."""
-    amplified = openness.amplified(amplification)
-    errors = FieldErrors(amplified.errors, amplified.by_part, None)
-    if openness.errors is None or amplified.errors is None:
-        return errors
-    by_beam = openness.by_beam
-    of_beam = () if by_beam is None else by_beam.changes
-    shifts = [*of_beam, *openness.assumed.values()]
-    samples = sampled_potentials(scene, openness.samples, shifts, data.size, data.options.seed)
-    before, after = openness.errors.ravel(), amplified.errors.ravel()
+    data: FitData, scene: Scene, summary: PosteriorSummary, amplification: float
+) -> FieldErrors | None:
+    """Return the errors by noise, numbers, beam and an assumed detector, and samples of fields.
+
+    Correlated noise makes those by noise larger, by an `amplification`. None without samples.
+    """
+    if summary.errors is None:
+        return None
+    noise = summary.by_part["noise"]
+    in_all = np.sqrt(summary.errors**2 + (amplification**2 - 1) * noise**2)
+    by_beam = summary.by_beam
+    shifts = [*(() if by_beam is None else by_beam.changes), *summary.assumed.values()]
+    samples = sampled_potentials(scene, summary.samples, shifts, data.size, data.options.seed)
+    before, after = summary.errors.ravel(), in_all.ravel()
     samples *= np.float32(np.sqrt(product(after, after) / product(before, before)))
-    errors = replace(errors, samples=samples)
+    errors = FieldErrors(in_all, {**summary.by_part, "noise": amplification * noise}, samples)
     if by_beam is not None:
         errors = errors.with_part("beam", by_beam.errors)
-    for key, change in openness.assumed.items():
+    for key, change in summary.assumed.items():
         errors = errors.with_part(key, displacement_errors(scene, [change], data.size))
     return errors
 
@@ -77,8 +79,6 @@ def with_edge(
     errors: FieldErrors, potentials: FloatArray, displacements: FloatArray, seed: int
 ) -> FieldErrors:
     """Return errors with one by objects beyond the edge, as far as it exceeds them."""
-    if errors.in_all is None or errors.samples is None:
-        return errors
     changes = _changes_by_edge(potentials, displacements, errors.in_all)
     by_edge = np.sqrt((changes[:, :, 1:] ** 2).sum(axis=1))
     if by_edge.any():
@@ -91,8 +91,8 @@ def summarise(
     data: FitData,
     refined: FineMinimum,
     basins: tuple[Basin, ...],
-    openness: Openness,
-    errors: FieldErrors,
+    summary: PosteriorSummary,
+    errors: FieldErrors | None,
     report: FitReport,
     pattern: Pattern,
 ) -> Fit:
@@ -108,7 +108,8 @@ def summarise(
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
     displacements = scene.displacement(unknowns)[..., :height, :width].copy()
     potentials = potentials_of(scene, unknowns, data.size)
-    errors = with_edge(errors, potentials, displacements, data.options.seed)
+    if errors is not None:
+        errors = with_edge(errors, potentials, displacements, data.options.seed)
     jacobian = _most_folded(scene, displacements)
     in_any = np.asarray(used.any(axis=0))
     unassessed = Fit(
@@ -121,10 +122,10 @@ def summarise(
                 potentials[m],
                 displacements[m],
                 error_budget(
-                    data, errors, openness, m, displacements[m], in_any, pattern.correlation
+                    data, errors, summary, m, displacements[m], in_any, pattern.correlation
                 ),
                 (float(scene.smoothness[m, 0]), float(scene.smoothness[m, 1])),
-                None if errors.samples is None else errors.samples[m],
+                None if errors is None else errors.samples[m],
             )
             for m, name in enumerate(data.fields)
         ),
@@ -160,11 +161,11 @@ def report_of(
     data: FitData,
     instrument: Imperfect,
     refined: FineMinimum,
-    openness: Openness,
+    summary: PosteriorSummary,
     pattern: Pattern,
 ) -> FitReport:
     """Return the report of a fit, without its errors."""
-    unknowns, pairs = refined.unknowns, openness.pairs
+    unknowns, pairs = refined.unknowns, summary.pairs
     return FitReport(
         objective=refined.objective,
         iterations=refined.iterations,
@@ -174,7 +175,7 @@ def report_of(
         numbers=numbers_in_units(
             instrument,
             instrument.adapt(unknowns, refined.scene.imperfect),
-            [sample.change for sample in openness.samples],
+            [sample.change for sample in summary.samples],
         ),
         sampling=data.options.sampling,
         linearity=None if pairs is None else pairs.linearity,
@@ -183,8 +184,8 @@ def report_of(
 
 def error_budget(
     data: FitData,
-    errors: FieldErrors,
-    openness: Openness,
+    errors: FieldErrors | None,
+    summary: PosteriorSummary,
     number: int,
     displacement: FloatArray,
     used: BoolArray,
@@ -194,7 +195,7 @@ def error_budget(
 
     Noise is correlated as by a blur of `correlation` px.
     """
-    if errors.in_all is None:
+    if errors is None:
         return None
     length = np.where(used, np.hypot(*displacement), 0.0)
     row, column = np.unravel_index(length.argmax(), length.shape)
@@ -211,7 +212,7 @@ def error_budget(
         edge = root_of(*(np.array([edge, *others]) ** 2).sum(axis=0))
     # Shares of no displacement are large, not infinite.
     field = ErrorEstimate(max(_length(displacement), 1e-6), max(float(length.max()), 1e-6))
-    assumed = [each for each in EFFECTS if each.key in openness.assumed]
+    assumed = [each for each in EFFECTS if each.key in summary.assumed]
     sizes = {each.name(each.tested): each.tested for each in assumed}
     names = TITLES | {each.key: each.name(each.tested) for each in assumed}
     budget = ErrorBudget(
@@ -223,12 +224,12 @@ def error_budget(
         sides=errors.sides,
         beam=by_beam if data.beam.rms else None,
         beam_sensitivity=None
-        if openness.by_beam is None
-        else estimate(openness.by_beam.by_percent[number]),
+        if summary.by_beam is None
+        else estimate(summary.by_beam.by_percent[number]),
         sensitivities={
-            each.name(each.tested): field.times(float(openness.sensitivities[each.key][number]))
+            each.name(each.tested): field.times(float(summary.sensitivities[each.key][number]))
             for each in EFFECTS
-            if each.key in openness.sensitivities.keys() - errors.by_part.keys()
+            if each.key in summary.sensitivities.keys() - errors.by_part.keys()
         },
         sizes=sizes,
         beam_variation=data.beam.rms,
