@@ -182,7 +182,8 @@ def test_machine_code_of_an_earlier_process_is_recognised(monkeypatch, tmp_path)
     kernel = SimpleNamespace(signatures=[], stats=stats, py_func=flips.build.py_func)
     monkeypatch.setattr(flips, "build", kernel)
     assert not machine_code.is_compiled()
-    (tmp_path / f"{source.stem}.build-402.py311.nbi").touch()
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    (tmp_path / f"{source.stem}.build-402.{version}.nbi").touch()
     assert machine_code.is_compiled()
 
 

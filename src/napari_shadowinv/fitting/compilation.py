@@ -6,9 +6,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +14,7 @@ import numpy as np
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv.fitting import _ray_kernels
 from napari_shadowinv.fitting.rays import RayModel, TracedBeam
-from napari_shadowinv.geometry.compiler import is_code_cached
+from napari_shadowinv.geometry.compiler import has_machine_code
 from napari_shadowinv.inversion import compilation as of_transport
 from napari_shadowinv.inversion.machine_code import compilation_frequency
 
@@ -38,18 +36,7 @@ def ensure_compiled(
 
 def is_compiled() -> bool:
     """Return whether this or an earlier run has compiled the kernels that trace rays."""
-    return all(kernel.signatures or _is_kept(kernel) for kernel in _KERNELS)
-
-
-def _is_kept(kernel: Any) -> bool:
-    """Whether there is machine code that was made of the kernel as it is now."""
-    if not is_code_cached():
-        return False
-    source = Path(kernel.py_func.__code__.co_filename)
-    version = f"py{sys.version_info.major}{sys.version_info.minor}"
-    name = f"{source.stem}.{kernel.py_func.__name__}-*.{version}*.nbi"
-    build_times = (index.stat().st_mtime for index in Path(kernel.stats.cache_path).glob(name))
-    return max(build_times, default=0.0) >= source.stat().st_mtime
+    return all(map(has_machine_code, _KERNELS))
 
 
 def _compile_rays(report: Reporter) -> None:

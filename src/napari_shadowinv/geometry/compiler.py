@@ -6,8 +6,10 @@ it can write to none of these, each process compiles again.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -38,6 +40,19 @@ def is_code_cached() -> bool:
     except RuntimeError:
         return False
     return True
+
+
+def has_machine_code(kernel: Any) -> bool:
+    """Return whether a kernel is loaded, or was cached by an earlier process as it is now."""
+    if getattr(kernel, "signatures", True):  # NUMBA_DISABLE_JIT leaves plain functions
+        return True
+    if not is_code_cached():
+        return False
+    source = Path(kernel.py_func.__code__.co_filename)
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    name = f"{source.stem}.{kernel.py_func.__name__}-*.{version}*.nbi"
+    build_times = (index.stat().st_mtime for index in Path(kernel.stats.cache_path).glob(name))
+    return max(build_times, default=0.0) >= source.stat().st_mtime
 
 
 @cache

@@ -71,13 +71,10 @@ def compilation_frequency() -> str:
 
 def is_compiled() -> bool:
     """Return whether the machine code is loaded, or cached by an earlier process."""
-    from napari_shadowinv.geometry.flips import build
+    from napari_shadowinv.geometry import flips
+    from napari_shadowinv.geometry.compiler import has_machine_code
 
-    if is_loaded():
-        return True
-    folder = code_folder()
-    module = Path(build.py_func.__code__.co_filename).stem  # type: ignore[attr-defined]
-    return folder is not None and any(folder.glob(f"{module}.build-*.nbi"))
+    return has_machine_code(flips.build)
 
 
 def is_loaded() -> bool:
