@@ -24,6 +24,7 @@ from rich.table import Table
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.cli._outputs import flaw_of
 from napari_shadowinv.cli._summary import Rows, options_text, provenance_rows, two_columns
 from napari_shadowinv.cli._terminal import (
     EXIT_FAILED_SHOTS,
@@ -75,7 +76,7 @@ class _Printer:
     Attributes
     ----------
     quiet : bool
-        Whether to print nothing.
+        Whether to print only shots that fail, and warnings.
     watched : str
         The folder of a watch and its files in words, empty for another run.
     show : callable, optional
@@ -94,18 +95,18 @@ class _Printer:
             self.status = status
         if self.show is not None:
             self.show(self._progress(status))
-        if self.quiet:
-            return
         if status.outcome is not None and status.outcome.reason:
             name = f"{status.name}{' (again)' * status.again}"
             say_on_stderr(f"failed: {name}: {status.outcome.reason}", "red")
         elif not self.watched:
             return
+        elif status.outcome is not None:
+            self._print_shot(status, status.outcome.seconds)
+        elif self.quiet:
+            return
         elif status.note or status.stage:
             text = status.note or f"{status.stage[:1].upper()}{status.stage[1:]}"
             say_on_stderr(text, "dim")
-        elif status.outcome is not None:
-            self._print_shot(status, status.outcome.seconds)
         elif is_first:
             counts = f"{status.text}; " if status.total else ""
             say(f"Watching {self.watched}; {counts}press Ctrl-C to stop.")
@@ -135,7 +136,8 @@ class _Printer:
         columns = max(_LINE_COLUMNS - len(summary), _MIN_NAME_COLUMNS)
         if len(name) > columns:  # its end identifies the file
             name = f"…{name[1 - columns :]}"
-        say(f"{name}{summary}", "" if result.headline.level.is_success else "yellow")
+        if not self.quiet:
+            say(f"{name}{summary}", "" if result.headline.level.is_success else "yellow")
         for warning in result.cautions:
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
@@ -216,11 +218,12 @@ def exit_unless_reliable(store: StackStore) -> None:
     if not np.isin(statuses, (DONE, SKIPPED)).all():
         raise typer.Exit(EXIT_FAILED_SHOTS)
     for status, report in zip(statuses, store.reports(), strict=True):
+        if status != DONE:
+            continue
         codes = {caution["code"] for caution in report.get("warnings", ())}
-        is_sound = _is_success(report.get("verdict", "")) and "samples" not in codes
-        if "level" in report:  # an inversion
-            is_sound = bool(report.get("converged"))
-        if status == DONE and not is_sound:
+        is_inversion = "level" in report
+        converged = not is_inversion or report["converged"]
+        if flaw_of(converged, None if is_inversion else report["verdict"], codes):
             raise typer.Exit(EXIT_NOT_CONVERGED)
 
 
@@ -243,7 +246,7 @@ def _report_rows(store: StackStore) -> Rows:
     provenances = [each for each in map(Provenance.of, reports) if each is not None]
     sources = [each.image.source for each in provenances]
     files = dict.fromkeys(source.file for source in sources if source and source.file)
-    rows += [("sources", _list_text(list(files)))] if files else []
+    rows += [("own sources", _list_text(list(files)))] if files else []
     for name, quantity in beam_quantities().items():
         values = sorted({report[name] for report in reports if name in report})
         rows += [(quantity.plural, quantity.text(*values, digits=6))] if values else []

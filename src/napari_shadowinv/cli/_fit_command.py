@@ -14,7 +14,6 @@ from napari_shadowinv.cli._inputs import recipe_from
 from napari_shadowinv.cli._outputs import (
     Outputs,
     check_setup,
-    exit_unless_sound,
     left_out_path,
     result_and_figure,
 )
@@ -56,7 +55,7 @@ def fit(
     out: Annotated[Path | None, Option(help="Result: .shadowinv, or .h5 for one field.")] = None,
     figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
-    quiet: _flags.QuietInversion = False,
+    quiet: _flags.Quiet = False,
 ) -> None:
     """Fit the fields, and the beam, to one or several images of an object.
 
@@ -108,8 +107,7 @@ def fit(
     if left_out is not None and not quiet:
         say(two_columns("Left out", fact_rows(left_out.facts)))
     outputs.show("Fit", result_rows(found, outputs.printed, names=names))
-    exit_unless_sound(found, result, left_out)
-    outputs.exit_unless_drawn()
+    outputs.exit_unless_sound(found, result, left_out)
 
 
 def _fields_of(fit: Fit) -> set[str]:

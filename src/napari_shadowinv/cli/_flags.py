@@ -37,8 +37,7 @@ Variable = Annotated[str | None, Option(metavar="NAME", help="Array of the file,
 ChosenShots = Annotated[str | None, Option(help="Shots such as 3, 3:20, ::10 or 1,4,9.")]
 Figure = Annotated[Path | None, Option(help=".png, .pdf or .svg. Default: a PNG.")]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
-Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors only.")]
-QuietInversion = Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")]
+Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")]
 # Names of two words have a hyphen on the command line.
 Deflector = Annotated[
     str | None,

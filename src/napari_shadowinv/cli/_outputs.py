@@ -6,7 +6,7 @@ facts of the result, and a result that is not sound ends the command with an exi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from napari_shadowinv.cli._terminal import (
     say_on_stderr,
 )
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import ResultKind, to_figures
+from napari_shadowinv.facts import ResultKind, Verdict, to_figures
 from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
 from napari_shadowinv.physics.beam import setup_warnings
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.results import AnyResult
 
+_NOT_CONVERGED, _BAD_SAMPLES = "not converged", "unreliable error bars"
 Output = tuple[Path | None, tuple[str, ...]]
 """A file, or None, and the endings that it may have."""
 
@@ -167,32 +168,44 @@ class Outputs:
         if self.undrawn:
             raise Exit(EXIT_NO_FIGURE)
 
+    def exit_unless_sound(
+        self, result: Any, out: Path, left_out: LeaveOneOut | None = None
+    ) -> None:
+        """Exit with an error code if a result has a flaw, or a figure could not be written.
 
-def exit_unless_sound(result: Any, out: Path, left_out: LeaveOneOut | None = None) -> None:
-    """Exit with an error code if an inversion did not converge or a fit is doubtful.
+        A static field that does not explain an image that was left out is a flaw, too.
+        """
+        doubts = {each.code: each.text for each in result.cautions}
+        if result.kind is ResultKind.INVERSION:
+            flaw = flaw_of(result.report.converged, None, doubts)
+        else:
+            flaw = flaw_of(True, getattr(result, "verdict", None), doubts)
+        if left_out is not None and not left_out.explained.all():
+            flaw, reason = "not static", left_out.explanation
+        elif flaw == _NOT_CONVERGED:
+            report = result.report
+            reason = (
+                f"its flux residual is {to_figures(report.residual)} (tolerance "
+                f"{to_figures(report.tolerance)}): do not trust the field"
+            )
+        elif flaw:
+            reason = doubts["samples"] if flaw == _BAD_SAMPLES else result.explanation
+        if flaw:
+            say_on_stderr(f"{flaw.upper()}: {out} was written, but {reason}")
+            raise Exit(EXIT_NOT_CONVERGED)
+        self.exit_unless_drawn()
 
-    Also if a static field does not explain an image that was left out.
+
+def flaw_of(converged: bool, verdict: str | None, codes: Collection[str]) -> str:
+    """Return the flaw by which a shot's result ends its command with an error code, or "".
+
+    An inversion has to converge, and has no `verdict` here; the field of a fit has to be known.
     """
-    is_inversion = result.kind is ResultKind.INVERSION
-    # Of a fit; a film pack has none.
-    verdict: Any = None if is_inversion else getattr(result, "verdict", None)
-    if left_out is not None and not left_out.explained.all():
-        text = f"NOT STATIC: {out} was written, but {left_out.explanation}"
-    elif is_inversion and not result.report.converged:
-        report = result.report
-        text = (
-            f"NOT CONVERGED: {out} was written, but its flux residual is "
-            f"{to_figures(report.residual)} (tolerance {to_figures(report.tolerance)}): do not "
-            "trust the field"
-        )
-    elif verdict is not None and not verdict.level.is_success:
-        text = f"{verdict.upper()}: {out} was written, but {result.explanation}"
-    elif doubts := [each.text for each in result.cautions if each.code == "samples"]:
-        text = f"UNRELIABLE ERROR BARS: {out} was written, but {doubts[0]}"
-    else:
-        return
-    say_on_stderr(text)
-    raise Exit(EXIT_NOT_CONVERGED)
+    if not converged:
+        return _NOT_CONVERGED
+    if verdict is not None and not Verdict(verdict).level.is_success:
+        return verdict
+    return _BAD_SAMPLES if "samples" in codes else ""
 
 
 def result_and_figure(image: Path, out: Path | None, figure: Path | None) -> tuple[Path, Path]:

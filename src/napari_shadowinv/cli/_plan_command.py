@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from napari_shadowinv.cli._settings import Sections, Settings, numbers_of, setti
 from napari_shadowinv.cli._summary import fact_rows, headline_row
 from napari_shadowinv.cli._terminal import EXIT_NOT_CONVERGED, notify_errors, work_callbacks
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.files import split_address
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
@@ -119,7 +121,10 @@ def plan(
 
 
 def _file_of(text: str) -> Path | None:
-    return Path(text) if Path(text).suffix else None
+    """Return the file of an object; None for a phantom, such as toroid:peak=1.5."""
+    file, _ = split_address(text)
+    is_file = os.path.exists(file) or (file.suffix and "=" not in text)
+    return file if is_file else None
 
 
 def _object(
@@ -134,7 +139,7 @@ def _object(
         phantom_of_text,
     )
 
-    is_file = _file_of(text.partition(":")[0]) is not None
+    is_file = _file_of(text) is not None
     is_grid = is_file and is_field_grid(Path(text))
     stated = {"--recorded-with": flags.recorded_with, "--deflector": flags.deflector}
     received = [] if is_file and not is_grid else [flag for flag in stated if stated[flag]]

@@ -14,7 +14,6 @@ from napari_shadowinv.cli._inputs import recipe_from, setup_for
 from napari_shadowinv.cli._outputs import (
     Outputs,
     check_setup,
-    exit_unless_sound,
     left_out_path,
     result_and_figure,
 )
@@ -71,7 +70,7 @@ def invert(
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
-    quiet: _flags.QuietInversion = False,
+    quiet: _flags.Quiet = False,
 ) -> None:
     """Retrieve the deflection potential of one image.
 
@@ -104,8 +103,7 @@ def invert(
         write_recipe(save_recipe, recipe, overwrite=overwrite)
     title = f"{shot.path}, {size_text(inversion.image.shape)}"
     outputs.show(title, result_rows(inversion, outputs.printed, shot=shot))
-    exit_unless_sound(inversion, result)
-    outputs.exit_unless_drawn()
+    outputs.exit_unless_sound(inversion, result)
 
 
 @notify_errors
@@ -117,7 +115,7 @@ def rerun(
     figure: _flags.Figure = None,
     other_folders: Annotated[bool, Option("--other-folders", help=HELP["other_folders"])] = False,
     overwrite: _flags.Overwrite = False,
-    quiet: _flags.QuietInversion = False,
+    quiet: _flags.Quiet = False,
 ) -> None:
     """Repeat a result from the recipe it contains, and report the changes.
 
@@ -146,8 +144,7 @@ def rerun(
         *fact_rows(again.content.facts, outputs.printed),
     ]
     outputs.show("Rerun", rows)
-    exit_unless_sound(again.content, again_out, again.left_out)
-    outputs.exit_unless_drawn()
+    outputs.exit_unless_sound(again.content, again_out, again.left_out)
 
 
 @notify_errors
@@ -236,8 +233,7 @@ def demo(
     outputs.write_figures(figures)
     rows = [("error", errors["Retrieved"]), ("error of Poisson", errors["Poisson"])]
     outputs.show("Demo", [*result_rows(inversion), *rows])
-    exit_unless_sound(inversion, result)
-    outputs.exit_unless_drawn()
+    outputs.exit_unless_sound(inversion, result)
 
 
 def _error_text(estimate: FloatArray, truth: FloatArray) -> str:

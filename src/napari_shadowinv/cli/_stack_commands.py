@@ -22,7 +22,7 @@ from napari_shadowinv.cli._settings import (
     settings_of,
 )
 from napari_shadowinv.cli._terminal import notify_errors, say
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 # Help of options, where it is longer than a line.
@@ -82,8 +82,7 @@ def _stack_inputs(flags: _flags.InversionFlags, settings: Settings, quiet: bool)
     chosen = shots_recipe_from(flags, settings)
     if flags.setup is not None:
         chosen = chosen.model_copy(update={"setup": read_setup(flags.setup)})
-    if not quiet:
-        Outputs(overwrite=False, quiet=quiet).warn_of_setups([(chosen.setup, None)])
+    Outputs(overwrite=False, quiet=quiet).warn_of_setups([(chosen.setup, None)])
     from napari_shadowinv.stack import read_pixels
 
     # A reader is part of a store's identity: only a variable that is there names itself.
@@ -170,7 +169,7 @@ def movie(
     out: Annotated[Path, Option("--out", "-o", help="Output movie: .mp4 or .gif.")],
     variable: Annotated[str | None, Option(help=HELP["variable"])] = None,
     shots: _flags.ChosenShots = None,
-    rate: Annotated[float, Option(min=0.1, max=120, help="Shots per second.")] = 10.0,
+    rate: Annotated[float, Option(help="Shots per second.")] = 10.0,
     limits: Annotated[
         tuple[float, float] | None, Option(metavar="MIN MAX", help=HELP["limits"])
     ] = None,
@@ -183,6 +182,8 @@ def movie(
     from napari_shadowinv.io.store_shots import open_shots
     from napari_shadowinv.plotting import stack_frames, write_film
 
+    if not 0.1 <= rate <= 120:
+        raise InputError(f"--rate is {rate:g}: expected 0.1 to 120 shots per second")
     check_output(out, overwrite, suffixes=(".mp4", ".gif"))
     protect_store(store, out)
     if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
