@@ -17,7 +17,6 @@ from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.files import make_folder
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
-from napari_shadowinv.io.openpmd import check_openpmd_setup, write_openpmd
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import STATUS_NAMES, StackStore, read_stack
 from napari_shadowinv.io.store_shots import open_shots, parse_shots
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     import xarray
 
 _FORMULA_SIGNS = ("=", "+", "-", "@")
-FORMATS = ("tiff", "pradformat", "openpmd", "csv")
+FORMATS = ("tiff", "pradformat", "csv")
 
 
 def export_shots(
@@ -47,21 +46,14 @@ def export_shots(
     dataset = open_shots(store, shots)
     if form == "tiff":
         _check_images(dataset, variables)
-    series = f"{out.name}_%06T{PRADFORMAT.suffix}"
     jobs: list[tuple[Path, Callable[[Path], object]]] = []
     for position in range(dataset.sizes["shot"]):
         shot = dataset.isel(shot=position)
-        setup, index = setup_from_dataset(shot), int(shot["index"])
+        setup = setup_from_dataset(shot)
         if form == "tiff":
             for name, plane in _planes(shot, variables):
                 job = partial(_write_plane, plane=plane, setup=setup, overwrite=overwrite)
                 jobs.append((out / f"{_stem(shot)}_{name}{TIFF.suffix}", job))
-        elif form == "openpmd":
-            setup = check_openpmd_setup(setup)
-            job = partial(
-                _write_openpmd, shot=shot, setup=setup, series=series, overwrite=overwrite
-            )
-            jobs.append((out / f"{out.name}_{index:06d}{PRADFORMAT.suffix}", job))
         else:
             check_pradformat_setup(setup)
             # A shot may have its own provenance.
@@ -111,13 +103,6 @@ def _write_plane(path: Path, plane: xarray.DataArray, setup: Any, overwrite: boo
 
 def _write_field(path: Path, shot: xarray.Dataset, setup: Any, overwrite: bool) -> None:
     write(path, shot.compute(), setup=setup, overwrite=overwrite)
-
-
-def _write_openpmd(
-    path: Path, shot: xarray.Dataset, setup: Any, series: str, overwrite: bool
-) -> None:
-    with replacing(path, overwrite) as temporary:
-        write_openpmd(temporary, shot, setup, series, int(shot["index"]))
 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:

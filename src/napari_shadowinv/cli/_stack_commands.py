@@ -28,8 +28,8 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 # Help of options, where it is longer than a line.
 HELP = {
     "scheduler": "threads, processes or tcp://host:8786.",
-    "format": "tiff (float32, one file per shot and component), pradformat or openpmd (one file "
-    "per shot), or csv (a table with a row per shot).",
+    "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
+    "csv (a table with a row per shot).",
     "shots": "A quoted glob, a folder, files, a file of frames, an array of frames in HDF5, or a "
     "table (.csv) with a row per shot.",
     "workers": "Shots at once. Default: one per core.",
@@ -144,7 +144,7 @@ def watch(
 @notify_errors
 def export(
     store: _flags.StoreFolder,
-    form: Annotated[str, Option("--format", metavar="tiff|pradformat|…", help=HELP["format"])],
+    form: Annotated[str, Option("--format", metavar="tiff|pradformat|csv", help=HELP["format"])],
     shots: _flags.ChosenShots = None,
     variables: Annotated[str, Option(help=HELP["variables"])] = "potential",
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,
