@@ -36,7 +36,7 @@ def site_column(monkeypatch) -> ShotColumn:
     return column
 
 
-def test_added_column_is_stored_and_listed_everywhere(
+def test_added_column_is_read_and_listed_everywhere(
     site_column, make_night, out, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("COLUMNS", "200")  # so that no heading is folded
@@ -69,7 +69,7 @@ def test_keys_and_titles_of_a_store_are_unique(store):
 
 
 def test_value_without_entry_is_the_fill_value():
-    values = {column.kind: column.of({}) for column in COLUMNS}
+    values = {column.kind: column.values([{}])[0] for column in COLUMNS}
     assert (values[str], values[bool], values[int]) == ("", 0, 0)
     assert np.isnan(values[float])
     assert COLUMNS[0].text({}) == ""

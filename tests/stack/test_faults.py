@@ -198,8 +198,8 @@ def test_a_run_killed_at_any_change_of_a_file_is_resumed_bit_by_bit(night, out, 
     undisturbed = tmp_path / "undisturbed.shadowinv.zarr"
     night.run(undisturbed)
     np.save(night.folder / "source.npy", night.source)
-    # While it creates the store, writes its shots, and gathers their columns.
-    changes = [30, 120, 180, 200, 20, 30, 5, 35, 25, 12, 30, 40, 42, 10, 20]
+    # While it creates the store, and writes its shots.
+    changes = [30, 60, 85, 100, 20, 30, 5, 35, 25, 12, 18, 22, 10, 20, 15]
     code, paths = textwrap.dedent(KILLED), [str(night.folder), str(out)]
     command = [sys.executable, "-c", code, *paths, *map(str, changes)]
     output = subprocess.run(command, env=environment(), capture_output=True, check=True).stdout

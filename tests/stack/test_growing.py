@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 
@@ -61,21 +60,6 @@ def test_appended_shots_give_the_bytes_of_a_single_run(night, out, whole, hidden
     # So do those who go by the arrays' own metadata.
     plain = zarr.open_group(out, mode="r", use_consolidated=False)
     assert {array.shape[0] for name, array in plain.arrays() if name not in "yx"} - {2} == {6}
-
-
-def test_store_without_image_residuals_still_grows(night, out, hidden):
-    hidden(5)
-    night.run(out)
-    shutil.rmtree(out / "image_residual")
-    file = out / "zarr.json"
-    metadata = json.loads(file.read_text(encoding="utf-8"))
-    del metadata["consolidated_metadata"]["metadata"]["image_residual"]
-    file.write_text(json.dumps(metadata), encoding="utf-8")
-    hidden()
-    grown = night.run(out)
-    assert list(grown.status) == [DONE] * 6
-    assert (grown.iterations > 0).all()
-    assert "image_residual" not in grown
 
 
 def test_shot_that_sorts_in_between_is_appended(night, out, hidden):

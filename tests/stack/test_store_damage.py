@@ -60,12 +60,12 @@ def test_deleted_chunk_makes_its_shot_damaged(store, name):
     assert np.isfinite(read(store)[name][:3].values.astype(float)).all()
 
 
-@pytest.mark.parametrize("key", ["y/c/0", "image_residual/c/0"])
-def test_lost_file_of_all_shots_is_damage(store, key):
-    (store / key).unlink()
-    assert StackStore(store).damage.files == (f"{key} is missing",)
-    with pytest.raises(FileFormatError, match=f"{key} is missing; resume its run"):
-        read(store)
+def test_lost_file_of_all_shots_is_damage(any_night, store):
+    (store / "y" / "c" / "0").unlink()
+    assert StackStore(store).damage.files == ("y/c/0 is missing",)
+    for call in (read, any_night.run):
+        with pytest.raises(FileFormatError, match="y/c/0 is missing"):
+            call(store)
 
 
 def test_done_shot_without_some_field_is_not_damaged(store):
@@ -95,10 +95,10 @@ def test_lost_report_of_a_failed_shot_damages_the_shot(make_night, out):
 
 def test_flipped_bit_of_the_last_file_is_found_by_verify(store):
     flip(field(store, 5, "caustic"), 0)
-    flip(store / "noise_error" / "c" / "0", 0)
+    flip(store / "shot" / "c" / "0", 0)
     damage = StackStore(store, every_byte=True).damage
     assert list(damage.shots) == [5]
-    assert any(problem.startswith("noise_error/c/0 is damaged") for problem in damage.files)
+    assert any(problem.startswith("shot/c/0 is damaged") for problem in damage.files)
 
 
 def test_flipped_bit_in_a_field_is_refused_on_reading(store):
@@ -129,8 +129,6 @@ def test_run_again_redoes_only_damaged_shots(any_night, store, finished):
     flip(field(store, 1), 300)
     flip(store / "report" / "c" / "4", 20)
     flip(store / "status" / "c" / "5", 0)
-    flip(store / "image_residual" / "c" / "0", 5)
-    (store / "noise_error" / "c" / "0").unlink()
     stamps = {index: field(store, index).stat().st_mtime_ns for index in range(6)}
     written = any_night.run(store)
     assert written.status.values.tolist() == [DONE] * 6
@@ -177,8 +175,8 @@ def test_many_shots_span_chunks_without_false_alarm(any_night, tmp_path, monkeyp
     any_night.run(path, shots=[any_night.path(i) for i in range(3)])
     any_night.run(path)
     assert StackStore(path, every_byte=True).damage.files == ()
-    (path / "flux_residual" / "c" / "2").rename(path / "away")
-    assert StackStore(path).damage.files == ("flux_residual/c/2 is missing",)
+    (path / "shot" / "c" / "2").rename(path / "away")
+    assert StackStore(path).damage.files == ("shot/c/2 is missing",)
 
 
 def test_copy_by_another_program_may_leave_out_empty_chunks(finished, tmp_path):

@@ -313,7 +313,7 @@ def _trouble_rows(store: StackStore) -> Rows:
             more = f"and {len(listed) - _MAX_LISTED} more: shadowinv info {store.path} --all"
             rows.append((label, more))
     rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_MAX_LISTED]]
-    if store.damage.shots or store.damage.files:
+    if store.damage.shots:
         rows.append(("warning", "repeat the run with --resume to repair the damage"))
     return rows
 

@@ -169,8 +169,8 @@ def check_files(store: StackStore) -> None:
     """Refuse a store with damage to files that belong to no single shot."""
     if store.damage.files:
         raise FileFormatError(
-            f"{store.path} is damaged: {store.damage.files[0]}; resume its run, or copy the store "
-            "again"
+            f"{store.path} is damaged: {store.damage.files[0]}; copy it again, or repeat the run "
+            "with overwriting"
         )
 
 
@@ -237,8 +237,9 @@ def read_stack(path: Path) -> xarray.Dataset:
     xarray.Dataset
         Dimensions shot, y, x and component. ``status`` is 0 where a shot is pending, 1 done,
         2 failed, 3 damaged, 4 skipped in a watched folder; the values of shots that are not done
-        are NaN, as are lost ones. Where shots have different setups, ``setup`` has one for each
-        shot, empty until the shot is done.
+        are NaN, as are lost ones. The numbers of each shot, such as ``image_residual``, come from
+        its ``report``. Where shots have different setups, ``setup`` has one for each shot, empty
+        until the shot is done.
 
     Raises
     ------
@@ -253,8 +254,12 @@ def read_stack(path: Path) -> xarray.Dataset:
     dataset.attrs.pop("store_id", None)  # of this folder, not of datasets derived from it
     setup = setup_from_dataset(dataset)
     complete = _with_fields(with_own_setups(dataset), setup)
+    reports = store.reports()
+    columns = {
+        column.key: (("shot",), column.values(reports), column.labels) for column in store.columns
+    }
+    complete = complete.assign(columns)
     # The folder's own order is arbitrary.
-    columns = (column.key for column in store.columns)
     order = [*_labels(dataset, setup), "status", *columns, "setup", "report"]
     order += sorted(map(str, complete.data_vars.keys() - {*order}))
     ordered = complete[[name for name in order if name in complete]]

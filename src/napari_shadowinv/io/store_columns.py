@@ -1,8 +1,8 @@
 """Numbers and words of each shot, as stores, tables and windows list them: `COLUMNS`.
 
-A column is described once. Every store has an array of each of its columns, ``shadowinv export
---format csv`` writes them all, ``shadowinv info --all`` and the window of a stack list those with
-a format.
+A column is described once. Who reads a store gets an array of each of its columns, ``shadowinv
+export --format csv`` writes them all, ``shadowinv info --all`` and the window of a stack list those
+with a format. A store itself holds them in the reports of its shots.
 
 - add a column: one entry of `COLUMNS`
 - the columns of a kind of stores: `columns_of`; their values from a result: `column_values`
@@ -11,12 +11,15 @@ a format.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from operator import attrgetter
 from typing import Any
 
+import numpy as np
+
+from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.physics.units import PIXEL, display_unit
 
 # Kinds of stores
@@ -52,11 +55,6 @@ class ShotColumn:
         return {str: "", float: math.nan}.get(self.kind, 0)
 
     @property
-    def dtype(self) -> type:
-        """Type of a numpy array of values."""
-        return object if self.kind is str else self.kind
-
-    @property
     def labels(self) -> dict[str, str]:
         """Attributes of the array."""
         return {"units": self.unit, "long_name": self.long_name}
@@ -66,9 +64,10 @@ class ShotColumn:
         """Heading of tables for programs."""
         return self.key if self.unit == "1" else f"{self.key} ({display_unit(self.unit)})"
 
-    def of(self, report: Mapping[str, Any]) -> Any:
-        """Return the value from a shot's report, or the fill value."""
-        return report.get(self.entry, self.fill)
+    def values(self, reports: Iterable[Mapping[str, Any]]) -> AnyArray:
+        """Return the values from the reports of shots, or the fill value."""
+        values = [report.get(self.entry, self.fill) for report in reports]
+        return np.array(values, object if self.kind is str else self.kind)
 
     def text(self, report: Mapping[str, Any]) -> str:
         """Return the value from a shot's report as text, empty without a value."""

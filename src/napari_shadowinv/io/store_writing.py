@@ -2,7 +2,7 @@
 
 - create a store with all shots pending: `create_store`, from its `Contents`
 - make room for more shots: `grow_store`
-- write a shot, or why it failed, also in a worker: `ShotWriter`; gather numbers: `summarise`
+- write a shot, or why it failed, also in a worker: `ShotWriter`
 
 The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
 by that copy. So a store changes its length in one moment: when that one file is replaced.
@@ -15,7 +15,7 @@ import os
 import secrets
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -37,10 +37,8 @@ from napari_shadowinv.io.store import (
     PENDING,
     STATUS_NAMES,
     StackStore,
-    columns_of_store,
     read_attributes,
 )
-from napari_shadowinv.io.store_columns import ShotColumn
 from napari_shadowinv.io.store_damage import chunk_file, fields_of, is_along_shots
 
 _TOGETHER = 1024  # values of a coordinate along shots that are one file
@@ -105,17 +103,6 @@ class ShotWriter:
             for name in ("report", *fields_of(group)):
                 chunk_file(self.path, group[name], index).unlink(missing_ok=True)
 
-    def write_columns(
-        self, columns: Sequence[ShotColumn], reports: Sequence[Mapping[str, Any]], shots: slice
-    ) -> None:
-        """Gather the columns of some shots from their reports, as far as the store has them."""
-        arrays = self.arrays()
-        with _as_store_errors(self.path):
-            for column in columns:
-                if column.key in arrays:
-                    values: Any = np.array([column.of(report) for report in reports], column.dtype)
-                    arrays[column.key][shots] = values
-
     def arrays(self) -> dict[str, Any]:
         return _open_arrays(self.path, self.store_id, self.shots)
 
@@ -138,11 +125,6 @@ def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
             "the file system is in sync on all machines, then run again to resume"
         )
     return arrays
-
-
-def summarise(store: StackStore) -> None:
-    """Gather the columns of all shots from their reports, for those who open the store."""
-    ShotWriter.of(store).write_columns(store.columns, store.reports(), slice(None))
 
 
 @dataclass(frozen=True)
@@ -218,14 +200,11 @@ def grow_store(path: Path, values: Mapping[str, AnyArray], attributes: Mapping[s
         length = before + len(values["shot"])
         for name in longer:
             array = arrays[name]
-            together = array.chunks[0]
             # Beyond the end stated in the folder's own copy: nobody sees it yet.
             if array.shape[0] < length:
                 array.resize((length, *array.shape[1:]))
             if name in values:
                 array[before:length] = values[name]
-            elif together > 1 and (before - 1) // together < (length - 1) // together:
-                array[before:length] = array.fill_value  # a file that is not there has been lost
         metadata["attributes"].update(attributes)
         for name in longer:
             metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
@@ -245,8 +224,7 @@ def _write_template(path: Path, contents: Contents) -> None:
     extra = " ".join(name for name in contents.coordinates if name not in contents.sizes)
     identity = {"format": FORMAT, "store_id": secrets.token_hex(8), "coordinates": extra}
     group = zarr.create_group(path, zarr_format=3, attributes={**contents.attributes, **identity})
-    shot_variables = _shot_variables(contents.sizes["shot"], contents.attributes)
-    arrays = {**contents.coordinates, **contents.variables, **shot_variables}
+    arrays = {**contents.coordinates, **contents.variables, **_record()}
     for name, variable in arrays.items():
         _create_array(group, name, variable, contents.sizes)
     with warnings.catch_warnings():
@@ -255,7 +233,7 @@ def _write_template(path: Path, contents: Contents) -> None:
         zarr.consolidate_metadata(path)
 
 
-def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, StoreArray]:
+def _record() -> dict[str, StoreArray]:
     status = {
         "units": "1",
         "long_name": "Status of the shot",
@@ -263,18 +241,10 @@ def _shot_variables(shots: int, attributes: Mapping[str, Any]) -> dict[str, Stor
         "flag_meanings": " ".join(STATUS_NAMES),
     }
     report = {"units": "1", "long_name": "Report, or reason for failure (JSON)"}
-    variables = {
+    return {
         "status": StoreArray(("shot",), np.dtype("int8"), status),
         "report": StoreArray(("shot",), str, report),
     }
-    columns = columns_of_store(attributes)
-    return variables | {column.key: _array_of(column, shots) for column in columns}
-
-
-def _array_of(column: ShotColumn, shots: int) -> StoreArray:
-    dtype = str if column.kind is str else np.dtype(column.kind)
-    fill: AnyArray = np.full(shots, column.fill, dtype=column.dtype)
-    return StoreArray(("shot",), dtype, column.labels, fill)
 
 
 def _create_array(

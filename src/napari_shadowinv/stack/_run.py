@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -49,7 +49,6 @@ from napari_shadowinv.io.store_writing import (
     create_store,
     grow_store,
     remove_unfinished,
-    summarise,
 )
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
@@ -227,7 +226,6 @@ def run_stack(
             reopen_damaged(path)
             filled = StoreRun(StackStore(path), again)
             if len(stack.shots) == len(filled.names) and PENDING not in filled.statuses:
-                summarise(StackStore(path))  # the last run may have been killed before it did
                 on_progress(replace(filled.status, scheduler="nothing to do"))
                 return read_stack(path)
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
@@ -249,13 +247,7 @@ def run_stack(
                 for index, shot in enumerate(stack.shots.items)
                 if filled.statuses[index] == PENDING
             }
-            try:
-                filled.run(pending, stack.task, chosen, report, should_stop)
-            except BaseException:
-                with suppress(OSError):
-                    summarise(StackStore(path))
-                raise
-            summarise(StackStore(path))
+            filled.run(pending, stack.task, chosen, report, should_stop)
     return read_stack(path)
 
 
@@ -287,7 +279,6 @@ class StoreRun:
     def __init__(self, store: StackStore, again: Collection[int] = ()) -> None:
         self.names = list(store.names)
         self.numbers = {name: index for index, name in enumerate(self.names)}
-        self._columns = store.columns
         self._path, self._store_id = store.path, store.attributes.get("store_id", "")
         self._failures: dict[int, str] = {}
         self._doubtful: set[int] = set()
@@ -368,10 +359,6 @@ class StoreRun:
         """Mark a shot as pending or skipped, and forget its report and fields."""
         self.writer.reopen(index, status)
         self._note(index, status)
-
-    def summarise(self, index: int) -> None:
-        """Gather the columns of one shot from its report."""
-        self.writer.write_columns(self._columns, [self.report(index)], slice(index, index + 1))
 
     def run(
         self,
@@ -488,12 +475,9 @@ def reopen_damaged(path: Path) -> None:
     A `FileFormatError` if there is damage that cannot be repaired from the shots.
     """
     store = StackStore(path, every_byte=True)
-    damage = store.damage
-    for index in damage.shots:
+    check_files(store)
+    for index in store.damage.shots:
         ShotWriter.of(store).reopen(index)
-    if damage.files:
-        summarise(StackStore(path))
-        check_files(StackStore(path, every_byte=True))
 
 
 def match_store(store: StackStore, stack: Stack) -> None:

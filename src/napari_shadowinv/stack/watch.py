@@ -29,7 +29,6 @@ from napari_shadowinv.io.store import DONE, FAILED, PENDING, SKIPPED, StackStore
 from napari_shadowinv.io.store_writing import (
     create_store,
     remove_unfinished,
-    summarise,
 )
 from napari_shadowinv.pipeline.run_options import WatchOptions
 from napari_shadowinv.preprocessing import Recipe
@@ -109,7 +108,6 @@ class Watch:
         if self._stack is not None:
             match_store(store, self._stack)
         remove_unfinished(self._path)
-        summarise(store)  # the last watch may have been killed before it did
         again = [PENDING] if self._options.latest else [PENDING, SKIPPED]
         self.filled = StoreRun(store, [*again, *([FAILED] * self._options.redo_failed)])
 
@@ -168,8 +166,7 @@ class Watch:
             self._arrivals.waiting.clear()
         if self.filled is not None:
             self._give_numbers(self.filled, ())
-            summarise(store := StackStore(self._path))
-            self.filled.refresh(store)
+            self.filled.refresh(StackStore(self._path))
 
     def _is_over(self) -> bool:
         idle, most = self._options.idle, self._options.max_shots
@@ -272,7 +269,6 @@ class Watch:
                 self._check_folder(filled, outcome)
             del self._running[outcome.index]
             self._last_end = time.monotonic()
-            filled.summarise(outcome.index)
             name = filled.names[outcome.index]
             self.report(name=name, outcome=outcome, result=result, again=name in again)
 
