@@ -27,8 +27,6 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import read_recipe
-from napari_shadowinv.plotting import fit_figure
-from napari_shadowinv.preprocessing import polynomial_source
 from napari_shadowinv.provenance import Origin, Provenance
 from napari_shadowinv.shot import Shot
 
@@ -236,13 +234,6 @@ def test_a_table_describes_each_image(folder: Path, fit_arguments: dict[str, Any
     assert [image.setup for image in provenance.images] == [FIRST, SECOND]
 
 
-def test_a_table_of_numbers_is_an_image(fit_arguments: dict[str, Any]) -> None:
-    image = np.random.default_rng(1).uniform(1, 2, SHAPE)
-    np.savetxt("numbers.csv", image, delimiter=",", fmt="%.17g")
-    assert shadowinv("fit", "numbers.csv").exit_code == 0
-    np.testing.assert_array_equal(of_each(fit_arguments["shots"], "image"), image[None])
-
-
 def test_binning_sums_pixels_and_enlarges_the_pixel_size(
     fit_arguments: dict[str, Any],
 ) -> None:
@@ -259,16 +250,6 @@ def test_binning_sums_pixels_and_enlarges_the_pixel_size(
     assert fit_arguments["shots"][0].psf == pytest.approx(point_spread(first, 1e-5, 4e-4))
 
 
-def test_strengths_replace_energies_and_keep_units(
-    fit_arguments: dict[str, Any],
-) -> None:
-    Path("shots.csv").write_text("file,energy,strength\na.tif,14.7,1 1\nb.tif,5,1.7 2.9\n")
-    arguments = ("fit", "shots.csv", "--setup", "setup.toml", "--set=fit.fields=B,E")
-    assert shadowinv(*arguments).exit_code == 0
-    assert of_each(fit_arguments["shots"], "strength") == [(1.0, 1.0), (1.7, 2.9)]
-    assert fit_in("a_fit.shadowinv")[0].setups == (FIRST, SECOND)
-
-
 def test_known_displacements_come_from_a_table(fit_arguments: dict[str, Any]) -> None:
     Path("mesh.csv").write_text("x;y;dx;dy;sigma\n20;10;0.5;-0.25;0.1\n30;12;0.4;0;0.2\n")
     assert shadowinv("fit", "a.tif", "--fiducials", "mesh.csv").exit_code == 0
@@ -277,20 +258,6 @@ def test_known_displacements_come_from_a_table(fit_arguments: dict[str, Any]) ->
     provenance = provenance_in("a_fit.shadowinv")
     assert provenance.fiducials == Origin(file="mesh.csv", sha256=sha256("mesh.csv"))
     assert provenance.fiducial_rows == rows
-
-
-def test_light_is_deflected_by_a_refractive_index_by_default(
-    fit_arguments: dict[str, Any],
-) -> None:
-    light = 'kind = "optical"\nobject_image_distance = 0.1\npixel_size = 1e-5\nwavelength = '
-    for name, wavelength in (("one", "532e-9"), ("two", "1064e-9")):
-        Path(f"{name}.toml").write_text(light + wavelength)
-    assert shadowinv("fit", "a.tif", "--setup", "one.toml").exit_code == 0
-    assert fit_arguments["fields"] == ("phase",)
-    Path("shots.csv").write_text("file,setup\na.tif,one.toml\nb.tif,two.toml\n")
-    result = shadowinv("fit", "shots.csv", "--overwrite")
-    assert result.exit_code == 2
-    assert "wavelengths differ" in result.stderr
 
 
 def test_settings_override_the_recipe_of_a_fit(fit_arguments: dict[str, Any]) -> None:
@@ -504,13 +471,6 @@ def test_the_setup_of_one_image_is_in_its_recipe(fit_arguments: dict[str, Any]) 
     assert read_recipe(Path("both.toml")).setup is None
 
 
-def test_the_source_can_be_estimated_by_the_recipe(fit_arguments: dict[str, Any]) -> None:
-    Path("r.toml").write_text('[source]\nmethod = "polynomial"\ndegree = 1\n')
-    assert shadowinv("fit", "a.tif", "--recipe", "r.toml").exit_code == 0
-    expected = polynomial_source(tifffile.imread("a.tif").astype(float), degree=1)
-    np.testing.assert_array_equal(fit_arguments["shots"][0].source, expected)
-
-
 RECIPES = {
     '[[steps]]\nstep = "low-pass"\n': ("low-pass", "what the forward model is fitted to"),
     '[fit]\nbeam = "unknown"\n[source]\nmethod = "gaussian"\n': ("source and a fit with an unk",),
@@ -640,34 +600,6 @@ def test_impossible_static_checks_are_refused(
     Path("two.csv").write_text("\n".join(rows[:3]))
     Path("three.csv").write_text("\n".join(rows))
     refused(*command.split(), names=names)
-
-
-def test_the_peak_of_a_fit_is_that_of_unmasked_pixels(
-    make_fit: Callable[..., Fit], proton_setup: ProtonSetup
-) -> None:
-    fit = make_fit()
-    field = fit.fields[0]
-    mask, move = fit.mask.copy(), field.displacement.copy()
-    mask[:, 5:9, 50:60] = False
-    move[:, 6, 55] = 1000.0  # only a continuation
-    hidden = dataclasses.replace(
-        fit,
-        mask=mask,
-        fields=(dataclasses.replace(field, displacement=move),),
-        setups=(proton_setup, proton_setup),
-    )
-    write("fit.shadowinv", hidden)
-    output = flat(shadowinv("info", "fit.shadowinv").stdout)
-    (peak,) = re.findall(r"peak \|d\|\s*([\d.]+)", output)
-    assert float(peak) == pytest.approx(np.hypot(*field.displacement).max(), rel=0.01)
-    # The largest value of the figure's colour scale, and the blank pixels.
-    (panel,) = [
-        axes for axes in fit_figure(hidden).axes if axes.get_title("left").startswith("Path")
-    ]
-    picture = panel.images[0]
-    np.testing.assert_array_equal(np.isnan(picture.get_array().filled(np.nan)), ~mask.any(axis=0))
-    in_si = proton_setup.path_integrated_b(field.displacement)
-    assert picture.get_clim()[1] == pytest.approx(1e6 * np.hypot(*in_si).max())
 
 
 def test_field_of_view_of_a_fit_is_in_its_table(

@@ -2,6 +2,7 @@ import json
 import os
 import platform
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable
@@ -28,7 +29,6 @@ from napari_shadowinv.cli import _info, app
 from napari_shadowinv.cli._inputs import setup_for
 from napari_shadowinv.cli._settings import with_steps
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import percent
 from napari_shadowinv.film import Pack
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.inversion import Inversion, invert, machine_code
@@ -206,79 +206,6 @@ def test_source_setup_and_options_are_used(folder: Path, shot: Path) -> None:
     assert "MG·µm" in result.stdout
 
 
-def test_a_mask_keeps_unusable_pixels_out(
-    folder: Path, shot: Path, refused: Callable[..., None]
-) -> None:
-    usable = np.full((24, 32), 255, np.uint8)
-    usable[:6, :8] = 0
-    iio.imwrite(folder / "mask.png", usable)
-    image = np.load(shot)
-    image[:6, :8] = 1e4
-    np.save(shot, image)
-    assert shadowinv("invert", shot, "--mask", folder / "mask.png", "-q").exit_code == 0
-    written = Inversion.from_dataset(read(folder / "shot.shadowinv"))
-    np.testing.assert_array_equal(written.mask, usable > 0)
-    np.testing.assert_array_equal(
-        written.potential, invert(np.load(shot), mask=usable > 0).potential
-    )
-    iio.imwrite(folder / "small.png", usable[1:])
-    refused(
-        "invert",
-        shot,
-        "--mask",
-        folder / "small.png",
-        "--overwrite",
-        names=("small.png", "(23, 32)"),
-    )
-
-
-def test_bin_sums_and_widens_pixels(folder: Path) -> None:
-    image = 100 * synthetic_image(gaussian_blob((50, 63), 20.0, 8.0).displacement)
-    np.save("fine.npy", image)
-    beam = np.random.default_rng(0).uniform(90, 110, image.shape)
-    np.save("beam.npy", beam)
-    (folder / "light.toml").write_text(
-        'kind = "optical"\nwavelength = 5e-7\nobject_image_distance = 0.1\npixel_size = 1e-5\n'
-    )
-    arguments = ["--bin", 2, "--setup", "light.toml", "--source", "beam.npy"]
-    result = shadowinv("invert", "fine.npy", *arguments)
-    assert result.exit_code == 0, result.output
-    saved = dataset("fine.shadowinv")
-    blocks = beam[:50, :62].reshape(25, 2, 31, 2).sum(axis=(1, 3))
-    np.testing.assert_allclose(saved["source"], blocks)
-    setup = setup_from_dataset(saved)
-    assert isinstance(setup, OpticalSetup)
-    assert setup.pixel_size == 2e-5
-    output = shadowinv("info", "fine.shadowinv").stdout
-    assert "binned 2 × 2, 0 rows and 1 columns cut off" in flat(output)
-
-
-def test_pradformat_in_and_out(folder: Path) -> None:
-    with h5py.File("shot.h5", "w") as file:
-        file["image"] = 100 * synthetic_image(BLOB.displacement)
-        file.attrs.update(
-            object_type="radiograph",
-            pixel_width=3.1e-4,
-            source_object_dist=0.01,
-            object_image_dist=0.3,
-        )
-    # The file contains the geometry, the setup only the missing values.
-    (folder / "energy.toml").write_text("energy = 14.7\n")
-    result = shadowinv("invert", "shot.h5", "--setup", "energy.toml", "--out", "field.h5")
-    assert result.exit_code == 0, result.output
-    setup = setup_from_dataset(dataset("field.h5"))
-    assert isinstance(setup, ProtonSetup)
-    assert setup.object_pixel_size == pytest.approx(1e-5)
-    with h5py.File("field.h5") as file:
-        assert file.attrs["radiograph_filename"] == "shot.h5"
-        np.testing.assert_allclose(
-            setup.displacement(file["defl_ax2"][()]),
-            invert(100 * synthetic_image(BLOB.displacement)).displacement[1],
-            rtol=1e-9,
-            atol=1e-12,
-        )
-
-
 def test_colour_film_by_channel(folder: Path) -> None:
     red = np.rint(100 * synthetic_image(BLOB.displacement)).astype(np.uint16)
     tifffile.imwrite("film.tif", np.stack([red, red // 2, red // 3], axis=-1), photometric="rgb")
@@ -293,17 +220,6 @@ def test_colour_film_by_channel(folder: Path) -> None:
     assert warnings[-1]["text"].startswith(
         "channel 'red' of a colour image was used as the fluence"
     )
-
-
-def test_grey_film_warns_but_a_linear_image_does_not(folder: Path) -> None:
-    counts = 1000 * synthetic_image(BLOB.displacement)
-    film = np.full(counts.shape, 60_000.0)
-    film[3:-3, 3:-3] *= 10 ** (-counts[3:-3, 3:-3] / 3000)
-    for name, image, said in (("film.tif", film, True), ("shot.tif", counts, False)):
-        tifffile.imwrite(name, image.astype(np.uint16))
-        for command in ("info", "invert"):
-            result = shadowinv(command, name)
-            assert ("the rim is as bright as anything" in flat(result.stdout)) == said
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="such names are not allowed there")
@@ -324,38 +240,6 @@ def test_file_names_are_printed_without_control_characters(folder: Path, name: s
     line = shadowinv("info", f"{name}.gone").stderr
     assert visible.replace(r"\n", " ") in line
     assert not set("\x1b\u202e") & set(line)
-
-
-def test_negative_pixels_are_clipped_counted_and_reported(folder: Path) -> None:
-    image = synthetic_image(BLOB.displacement)
-    image[3, 4:7] = -0.1
-    np.save("shot.npy", image)
-    result = shadowinv("invert", "shot.npy", "--set=options.negative=clip")
-    assert result.exit_code == 0, result.output
-    inversion = Inversion.from_dataset(dataset("shot.shadowinv"))
-    assert inversion.report.clipped_pixels == 3
-    assert (inversion.image[3, 4:7] == 0).all()
-    assert "3 clipped" in flat(shadowinv("info", "shot.shadowinv").stdout)
-
-
-def test_free_boundary_is_chosen_reported_and_kept(folder: Path) -> None:
-    large = synthetic_image(gaussian_blob((64, 64), 20.0, 6.0, (32, 12)).displacement)
-    np.save("shot.npy", large[10:-10, 10:-10])
-    result = shadowinv("invert", "shot.npy", "--boundary", "free", "--set=options.margin=6")
-    assert result.exit_code == 0, result.output
-    inversion = Inversion.from_dataset(dataset("shot.shadowinv"))
-    assert inversion.options.boundary == "free"
-    assert inversion.options.margin == 6
-    assert inversion.report.flux_left["left"] > 0.001
-    text = flat(shadowinv("info", "shot.shadowinv").stdout)
-    assert f"left {percent(inversion.report.flux_left['left'])}" in text
-    refused = shadowinv(
-        "invert", "shot.npy", "--set=options.flux=known", "--out", "other.shadowinv"
-    )
-    assert refused.exit_code == 2
-    assert "options.flux is 'known' and options.boundary is 'closed'" in " ".join(
-        refused.stderr.split()
-    )
 
 
 def test_unconverged_result_is_written_with_exit_code_3(folder: Path) -> None:
@@ -386,114 +270,6 @@ def test_existing_files_need_overwrite(
     refused("invert", shot, names="shot.png exists")
 
 
-def test_outputs_of_one_name_are_refused(shot: Path, refused: Callable[..., None]) -> None:
-    refused("invert", shot, "--out", "a.png", "--figure", "a.png", names="a.png")
-    refused("invert", shot, "--figure", "a.toml", "--save-recipe", "a.toml", names="a.toml")
-
-
-def test_outputs_without_a_folder_are_refused(
-    folder: Path, shot: Path, refused: Callable[..., None]
-) -> None:
-    refused("invert", shot, "--out", "nowhere/a.shadowinv", names="folder nowhere does not exist")
-    refused("invert", shot, "--figure", "nowhere/a.png", names="folder nowhere does not exist")
-    refused("invert", shot, "--out", "a.xlsx", names=".xlsx")
-    refused("invert", shot, "--out", folder, names="its ending is none")
-    refused("forward", shot, "--out", shot, "--overwrite", names="both read and written")
-    refused("invert", shot, "--out", "a.h5", names="needs a setup of kind 'proton'")
-
-
-def test_files_that_are_no_image_are_refused(
-    folder: Path, shot: Path, refused: Callable[..., None]
-) -> None:
-    refused("invert", "missing.tif", names=("missing.tif", "does not exist"))
-    refused("invert", shot, "--source", "missing.tif", names=("missing.tif", "does not exist"))
-    (folder / "empty.tif").write_bytes(b"")
-    refused("invert", "empty.tif", names=("empty.tif", "is empty"))
-    (folder / "notes.tif").write_text("not an image\n")
-    refused("invert", "notes.tif", names=("notes.tif", "text file"))
-    (folder / "cut.npy").write_bytes(shot.read_bytes()[:-100])
-    refused("invert", "cut.npy", names=("cut.npy", "incomplete"))
-    for place in (folder, "", "."):
-        refused("invert", place, names="is a folder")
-    for place in (".", "/"):
-        refused("invert", shot, "--out", place, names=(place, "is a folder", "--out"))
-    refused("info", "missing.tif", names="missing.tif")
-    refused("forward", "missing.tif", names="missing.tif")
-
-
-@pytest.mark.parametrize(
-    ("value", "name"), [(np.nan, "NaN"), (np.inf, "infinite"), (-1.0, "1 negative")]
-)
-def test_impossible_pixels_are_refused(
-    shot: Path, refused: Callable[..., None], value: float, name: str
-) -> None:
-    image = np.load(shot)
-    image[5, 6] = value
-    np.save(shot, image)
-    refused("invert", shot, names=("shot.npy", name))
-
-
-def test_impossible_images_and_sources_are_refused(
-    folder: Path, shot: Path, refused: Callable[..., None]
-) -> None:
-    np.save("zero.npy", np.zeros((24, 32)))
-    np.save("small.npy", np.ones((20, 20)))
-    refused("invert", "zero.npy", names=("zero.npy", "no positive pixel"))
-    refused("invert", shot, "--source", "zero.npy", names="source is zero")
-    refused("invert", shot, "--source", "small.npy", names=("(20, 20)", "(24, 32)"))
-    refused("invert", shot, "--bin", 0, names=("--bin", "is 0", "at least 1"))
-    refused("invert", shot, "--bin", 20, names="by 20")
-    np.save("pixel.npy", np.ones((1, 1)))
-    refused("invert", "pixel.npy", names=("pixel.npy", "(1, 1)", "at least 4 × 4"))
-
-
-def test_impossible_numbers_of_sites_are_refused(shot: Path, refused: Callable[..., None]) -> None:
-    names = ("options.margin", "needs --boundary free")
-    refused("invert", shot, "--set=options.margin=4", names=names)
-    refused(
-        "invert", shot, "--set=options.n_sites=3", names=("options.n_sites is '3'", "at least 4")
-    )
-    refused(
-        "invert", shot, f"--set=options.n_sites={10**12}", names=("1,000,000,000,000 sites", "GB")
-    )
-
-
-@pytest.mark.parametrize(
-    ("line", "names"),
-    [
-        ("energy = 0", ("'energy'", "0", "greater than")),
-        ("energy = -14.7", ("'energy'", "-14.7")),
-        ("object_image_distance = 0", ("'object_image_distance'", "0")),
-        ("source_object_distance = -0.01", ("'source_object_distance'", "-0.01")),
-        ("enerky = 14.7", ("enerky", "'energy'")),
-        ("energy = # MeV\n", ("not valid TOML", "line")),
-    ],
-)
-def test_mistakes_in_a_setup_are_named(
-    folder: Path,
-    shot: Path,
-    refused: Callable[..., None],
-    line: str,
-    names: tuple[str, ...],
-) -> None:
-    key = line.split()[0].replace("enerky", "energy")
-    lines = [entry for entry in PROTON_TOML.splitlines() if not entry.startswith(key)]
-    (folder / "setup.toml").write_text("\n".join([*lines, line]))
-    refused("invert", shot, "--setup", "setup.toml", names=("setup.toml", *names))
-
-
-def test_mistakes_in_options_are_named(
-    folder: Path, shot: Path, refused: Callable[..., None]
-) -> None:
-    for text, names in (
-        ("tolerence = 0.1", ("'options.tolerence'", "'tolerance'")),
-        ("tolerance = 2", ("'options.tolerance'", "2", "less than 1")),
-        ("tolerance 0.1\n", ("not valid TOML", "line 2")),
-    ):
-        (folder / "r.toml").write_text(f"[options]\n{text}")
-        refused("invert", shot, "--recipe", "r.toml", names=("r.toml", *names))
-
-
 def test_forward_predicts_the_image(folder: Path, shot: Path) -> None:
     np.save("d.npy", BLOB.displacement)
     source = np.linspace(1, 2, 24 * 32).reshape(24, 32)
@@ -513,14 +289,76 @@ def test_forward_predicts_the_image(folder: Path, shot: Path) -> None:
     np.testing.assert_allclose(np.load("again.npy"), saved["reprojection"], rtol=1e-12)
 
 
-def test_forward_refuses_files_without_a_field(folder: Path, refused: Callable[..., None]) -> None:
-    np.save("three.npy", np.zeros((3, 24, 32)))
-    refused("forward", "three.npy", names=("three.npy", "(3, 24, 32)"))
-    iio.imwrite("shot.png", np.zeros((24, 32), np.uint8))
-    refused("forward", "shot.png", names="a PNG picture")
-    np.save("d.npy", np.zeros((2, 24, 32)))
-    np.save("beam.npy", np.ones((9, 9)))
-    refused("forward", "d.npy", "--source", "beam.npy", names=("(9, 9)", "(24, 32)"))
+REFUSED = {
+    # outputs
+    "invert shot.npy --out a.png --figure a.png": "a.png",
+    "invert shot.npy --figure a.toml --save-recipe a.toml": "a.toml",
+    "invert shot.npy --out nowhere/a.shadowinv": "folder nowhere does not exist",
+    "invert shot.npy --figure nowhere/a.png": "folder nowhere does not exist",
+    "invert shot.npy --out a.xlsx": ".xlsx",
+    "invert shot.npy --out a.h5": "needs a setup of kind 'proton'",
+    "invert shot.npy --out .": "is a folder",
+    "forward shot.npy --out shot.npy --overwrite": "both read and written",
+    # inputs
+    "invert missing.tif": "missing.tif does not exist",
+    "invert .": "is a folder",
+    "invert shot.npy --source missing.tif": "missing.tif does not exist",
+    "invert shot.npy --source small.npy": "(20, 20)",
+    "invert shot.npy --mask small.npy": "small.npy",
+    "invert zero.npy": "zero.npy: image has no positive pixel",
+    "info missing.tif": "missing.tif",
+    "forward missing.tif": "missing.tif",
+    "invert shot.npy --variable shot": "neither a MATLAB nor an HDF5 file",
+    # flags and keys
+    "invert shot.npy --bin 0": "--bin is 0",
+    "invert shot.npy --bin 20": "by 20",
+    "invert shot.npy --set options.margin=4": "options.margin: it needs --boundary free",
+    "invert shot.npy --set options.n_sites=3": "options.n_sites is '3'",
+    "invert shot.npy --set options.n_sites=1000000000000": "1,000,000,000,000 sites",
+    "invert shot.npy --source-from gausian": "--source-from is 'gausian': did you mean 'gaussian'",
+    "invert shot.npy --source-from gaussian --source shot.npy": "choose one of them",
+    "invert shot.npy --source-from 'gaussian degree=3'": "'gaussian degree=3': unknown key",
+    "invert shot.npy --source-from interpolated": "without a source mask",
+    "invert shot.npy --source shot.npy": "the source is the image itself",
+    "invert shot.npy --step 'low-pas 3'": "--step is 'low-pas 3': did you mean 'low-pass'",
+    "invert shot.npy --step 'low-pass 3 4'": "expected name=value instead of '4'",
+    "invert shot.npy --step 'butterworth 9 kind=band'": "kind=band': 'kind' is 'band'",
+    "invert shot.npy --step 'low-pass -1'": "'width' is '-1': ",
+    # files of settings
+    "invert shot.npy --setup zero.toml": "zero.toml: 'energy' is 0",
+    "invert shot.npy --setup typo.toml": "unknown key 'enerky', did you mean 'energy'",
+    "invert shot.npy --setup prose.toml": "prose.toml is not valid TOML",
+    "invert shot.npy --recipe steps.toml": "'steps.0.width' is 0",
+    "invert shot.npy --recipe keys.toml": "keys.toml: unknown key 'enerky'",
+    "invert shot.npy --recipe mask.toml": "nowhere.png",
+    # fields
+    "forward three.npy": "three.npy is an array of shape (3, 24, 32)",
+    "forward d.npy --source small.npy": "(20, 20)",
+    "forward d.npy --deflector plasma": "--recorded-with",
+    "forward d.npy --set trace.counts=3": "d.npy is no 3-D field",
+    # the demo
+    "demo --noise -1": "--noise is -1",
+    "demo --set options.n_sites=2": "options.n_sites",
+    "demo --out shot.npy": "shot.npy cannot be created as a folder",
+}
+
+
+@pytest.mark.parametrize("command", REFUSED)
+def test_mistakes_give_one_sentence(shot: Path, refused: Callable[..., None], command: str) -> None:
+    arrays = {"small": np.ones((20, 20)), "zero": np.zeros((24, 32)), "d": BLOB.displacement}
+    for name, array in {**arrays, "three": np.zeros((3, 24, 32))}.items():
+        np.save(f"{name}.npy", array)
+    files = {
+        "zero": PROTON_TOML.replace("14.7", "0"),
+        "typo": PROTON_TOML.replace("energy", "enerky"),
+        "keys": "enerky = 14.7",
+        "prose": "energy = # MeV",
+        "steps": "[[steps]]\nstep = 'low-pass'\nwidth = 0",
+        "mask": "mask = 'nowhere.png'",
+    }
+    for name, text in files.items():
+        Path(f"{name}.toml").write_text(text)
+    refused(*shlex.split(command), names=REFUSED[command])
 
 
 @pytest.fixture
@@ -564,63 +402,6 @@ def test_forward_refuses_choices_that_do_not_fit_a_3d_field(
     refused(*trace, "--variable", "4", names="no openPMD file")
     np.save("d.npy", BLOB.displacement)
     refused("forward", "d.npy", "--set=trace.counts=3", names="d.npy is no 3-D field")
-
-
-LOW_ENERGY_TOML = PROTON_TOML.replace("14.7", "3.0")
-
-
-def test_forward_to_another_energy(folder: Path, shot: Path) -> None:
-    (folder / "high.toml").write_text(PROTON_TOML)
-    (folder / "low.toml").write_text(LOW_ENERGY_TOML)
-    shadowinv("invert", shot, "--setup", "high.toml")
-    displacement = dataset("shot.shadowinv")["displacement"].values
-    arguments = ["forward", "shot.shadowinv", "--setup", "low.toml", "--out"]
-    result = shadowinv(*arguments, "low.npy")
-    assert result.exit_code == 0, result.output
-    assert "only a magnetic field deflects the beam" in flat(result.stdout)
-    assert "3 MeV proton" in result.stdout
-    # Momenta in MeV/c, from T (T + 2 m c²).
-    ratio = (14.7 * (14.7 + 2 * 938.27209) / (3.0 * (3.0 + 2 * 938.27209))) ** 0.5
-    np.testing.assert_allclose(np.load("low.npy"), synthetic_image(ratio * displacement), 1e-6)
-    result = shadowinv(*arguments, "e.npy", "--deflector", "electric-field")
-    ratio *= ratio * (3.0 + 938.27209) / (14.7 + 938.27209)
-    np.testing.assert_allclose(np.load("e.npy"), synthetic_image(ratio * displacement), 1e-6)
-
-
-def test_forward_to_other_pixels_keeps_the_picture(folder: Path) -> None:
-    (folder / "first.toml").write_text(PROTON_TOML)
-    (folder / "second.toml").write_text(PROTON_TOML.replace("1e-5", "5e-6"))
-    np.save("d.npy", BLOB.displacement)
-    arguments = ["--recorded-with", "first.toml", "--setup", "second.toml", "--out", "fine.tif"]
-    result = shadowinv("forward", "d.npy", *arguments)
-    assert result.exit_code == 0, result.output
-    fine = tifffile.imread("fine.tif")
-    assert fine.shape == (48, 64)
-    blocks = fine.reshape(24, 2, 32, 2).mean(axis=(1, 3))
-    np.testing.assert_allclose(blocks, synthetic_image(BLOB.displacement), atol=2e-3)
-    with tifffile.TiffFile("fine.tif") as tiff:
-        tags = tiff.pages[0].aspage().tags
-        pixels, units = tags["XResolution"].value
-        # Pixels per centimetre of the second experiment.
-        assert pixels / units == pytest.approx(1e-2 / 5e-6, rel=1e-6)
-
-
-def test_forward_refuses_mismatched_setups(folder: Path, refused: Callable[..., None]) -> None:
-    np.save("d.npy", BLOB.displacement)
-    (folder / "high.toml").write_text(PROTON_TOML)
-    (folder / "low.toml").write_text(LOW_ENERGY_TOML)
-    light = 'kind = "optical"\nwavelength = 5e-7\nobject_image_distance = 0.1\npixel_size = 1e-5\n'
-    (folder / "green.toml").write_text(light)
-    (folder / "red.toml").write_text(light.replace("5e-7", "7e-7"))
-    both = ["forward", "d.npy", "--recorded-with", "high.toml", "--setup"]
-    refused(*both, "green.toml", names=("kind 'proton'", "kind 'optical'"))
-    refused(*both, "low.toml", "--deflector", "gravity", names=("'gravity'", "magnetic field"))
-    refused("forward", "d.npy", "--deflector", "plasma", names="--recorded-with")
-    colours = ["forward", "d.npy", "--recorded-with", "green.toml", "--setup", "red.toml"]
-    refused(*colours, names=("wavelengths differ", "'plasma'"))
-    assert shadowinv(*colours, "--deflector", "plasma", "--out", "red.npy").exit_code == 0
-    expected = synthetic_image((7 / 5) ** 2 * BLOB.displacement)
-    np.testing.assert_allclose(np.load("red.npy"), expected, rtol=1e-9)
 
 
 def test_variables_of_matlab_and_hdf5(folder: Path, refused: Callable[..., None]) -> None:
@@ -751,87 +532,6 @@ def test_filters_match_the_library(folder: Path) -> None:
     # A measured source is blurred as its shot is.
     beam = prepared("shot.npy", source="beam.npy", steps=["low-pass 2"]).source
     np.testing.assert_array_equal(beam, filters.low_pass(ramp, 2.0))
-
-
-@pytest.mark.parametrize(
-    ("flags", "names"),
-    [
-        (["--source-from", "gausian"], ("--source-from is 'gausian'", "'gaussian'")),
-        (["--source-from", "interpolated"], "without a source mask"),
-        (["--source-from", "isotropic"], "'isotropic' without a setup"),
-        (["--source", "shot.npy"], ("shot.npy", "the source is the image itself")),
-        (["--source-from", "gaussian", "--source", "shot.npy"], "choose one of them"),
-        (["--source-from", "gaussian degree=3"], ("'gaussian degree=3': unknown key", "'degree'")),
-        (["--set=source_mask=shot.npy"], "got a source mask but no source estimate"),
-        (["--source", "shot.npy", "--step=background degree=0"], ("got a source", "flatten")),
-        (["--source", "shot.npy", "--step=high-pass 3"], ("got a source", "high-pass")),
-        (["--source", "shot.npy", "--step=butterworth 9"], ("got a source", "Butterworth")),
-        (["--step=low-pas 3"], ("--step is 'low-pas 3'", "'low-pass'")),
-        (["--step=low-pass 3 4"], ("expected name=value instead of '4'",)),
-        (
-            ["--step=butterworth 9 kind=band"],
-            ("--step 'butterworth 9 kind=band': 'kind' is 'band'", "'high'"),
-        ),
-        (["--step=hot-pixels 0"], ("--step 'hot-pixels 0': 'threshold' is '0'", "greater than 0")),
-        (["--step=low-pass -1"], ("'width' is '-1'", "greater than 0")),
-        (["--step=background degree=11"], ("'degree' is '11'", "at most 10")),
-        (["--variable", "shot"], ("shot.npy", "neither a MATLAB nor an HDF5 file")),
-    ],
-)
-def test_contradictory_flags_are_refused(
-    shot: Path, refused: Callable[..., None], flags: list[object], names: str | tuple[str, ...]
-) -> None:
-    refused("invert", shot, *flags, names=names)
-
-
-def test_one_mask_for_bad_pixels_and_for_the_object_is_refused(
-    folder: Path, shot: Path, refused: Callable[..., None]
-) -> None:
-    y, x = np.mgrid[:24, :32]
-    iio.imwrite("bare.png", (np.hypot(y - 10, x - 18) > 7).astype(np.uint8))
-    for estimate in ("polynomial", "interpolated"):
-        flags = ["--source-from", estimate, "--mask", "bare.png", "--set=source_mask=bare.png"]
-        refused("invert", shot, *flags, names=("shot.npy", "excluded from the inversion"))
-
-
-def test_a_point_source_is_used_or_suggested(folder: Path, shot: Path) -> None:
-    near = ProtonSetup(
-        energy=14.7, source_object_distance=1e-3, object_image_distance=0.28, pixel_size=1e-5
-    )
-    text = "".join(f"{name} = {value!r}\n" for name, value in near.model_dump().items())
-    (folder / "setup.toml").write_text(text)
-    flags = ["--setup", "setup.toml", "--out", "result.shadowinv", "--overwrite"]
-    for chosen, warned in (
-        ([], True),
-        (["--source-from", "uniform"], True),
-        (["--source-from", "isotropic centre_y=2"], False),
-    ):
-        result = shadowinv("invert", shot, *flags, *chosen)
-        assert result.exit_code == 0, result.output
-        assert ("choose the source 'isotropic'" in " ".join(result.stdout.split())) == warned
-        report = Inversion.from_dataset(dataset("result.shadowinv")).report
-        assert ("'isotropic'" in str(report.cautions)) == warned
-    expected = sources.isotropic_source(np.load(shot), near, centre_y=2)
-    np.testing.assert_array_equal(dataset("result.shadowinv")["source"], expected)
-
-
-def test_mistakes_in_a_recipe_are_named(
-    folder: Path, shot: Path, refused: Callable[..., None]
-) -> None:
-    for text, names in (
-        ("step = []\n", ("'step'", "'steps'")),
-        ("[[steps]]\nstep = 'low-pas'\n", ("steps", "'low-pas'", "'low-pass'")),
-        ("[[steps]]\nstep = 'low-pass'\nwith = 2\n", ("'steps.0.with'", "'width'")),
-        ("[[steps]]\nstep = 'low-pass'\nwidth = 0\n", ("'steps.0.width' is 0", "greater than 0")),
-        ("[[steps]]\nwidth = 2\n", ("steps", "'step'")),
-        ("[source]\nmethod = 'polynomial'\ndegree = 11\n", ("'source.degree' is 11", "at most 10")),
-        ("[setup]\nkind = 'proton'\nenergy = -1\n", ("'setup.energy' is -1",)),
-        ("[options]\nn_site = 1\n", ("'options.n_site'", "'n_sites'")),
-        ("steps = 6\n", ("'steps' is 6",)),
-        ("mask = 'nowhere.png'\n", ("nowhere.png",)),
-    ):
-        (folder / "recipe.toml").write_text(text)
-        refused("invert", shot, "--recipe", "recipe.toml", names=names)
 
 
 def test_a_saved_recipe_gives_the_same_result(folder: Path, shot: Path) -> None:
@@ -1121,14 +821,6 @@ def test_demo_recovers_its_field(folder: Path) -> None:
     # The demo may repeat itself.
     again = shadowinv("demo", "--set=options.n_sites=200", "--noise", 0, "--out", "tour")
     assert again.exit_code == 0, again.output
-
-
-def test_demo_refuses_invalid_numbers(folder: Path, refused: Callable[..., None]) -> None:
-    refused("demo", "--noise", -1, names="--noise is -1")
-    assert not (folder / "demo").exists()
-    refused("demo", "--set=options.n_sites=2", names="options.n_sites")
-    (folder / "demo").write_text("a file")
-    refused("demo", names=("demo", "cannot be created as a folder"))
 
 
 @pytest.mark.parametrize("command", [["invert", "shot.npy"], ["batch", "*.npy", "--out", "a.zarr"]])
