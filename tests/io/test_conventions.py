@@ -1,4 +1,4 @@
-"""Values in HDF5 files mean what CF, NeXus and HDF5 Image say."""
+"""Values in HDF5 files mean what CF and NeXus say."""
 
 from __future__ import annotations
 
@@ -110,48 +110,6 @@ def test_pixel_size_of_a_nexus_detector_is_in_metres(file: Any, unit: str, size:
         detector[name].attrs["units"] = unit
     geometry = shot_in(file, "entry/data/data").metadata["geometry"]
     assert geometry == {"detector_pixel_size": pytest.approx(75e-6)}
-
-
-@pytest.mark.parametrize("place", ["entry/data", "entry/instrument/detector"])
-def test_flat_and_dark_frames_are_no_shots(file: Any, place: str) -> None:
-    frames = np.stack([COUNTS + frame for frame in range(4)])
-    file["entry/data/image"], file[f"{place}/image_key"] = frames, [2, 1, 0, 0]
-    file.require_group(place).attrs["NX_class"] = "NXdetector"
-    path = Path(file.filename)
-    file.close()
-    with pytest.raises(FileFormatError, match="1 flat, 1 dark among the 4 frames") as error:
-        read(f"{path}::entry/data/image")
-    assert "'/entry/data/image[2]'" in str(error.value)
-    shot = read_shot(f"{path}::entry/data/image[2]")
-    np.testing.assert_array_equal(shot.image, frames[2])
-    with h5py.File(path, "a") as content:
-        content[f"{place}/image_key"][:] = 0
-    assert len(read(f"{path}::entry/data/image").name) == 4
-
-
-def test_white_as_zero_is_inverted(file: Any) -> None:
-    file["data"] = COUNTS.astype(np.uint8)
-    file["data"].attrs.update(CLASS=np.bytes_("IMAGE"), IMAGE_WHITE_IS_ZERO=np.uint8(1))
-    np.testing.assert_array_equal(shot_in(file).image, 255 - COUNTS)
-
-
-@pytest.mark.parametrize(
-    ("origin", "expected"),
-    [("UL", COUNTS), ("LL", COUNTS[::-1]), ("UR", COUNTS[:, ::-1]), ("LR", COUNTS[::-1, ::-1])],
-)
-def test_origin_of_the_display_is_turned_to_the_top_left(
-    file: Any, origin: str, expected: Any
-) -> None:
-    file["data"] = COUNTS
-    file["data"].attrs["DISPLAY_ORIGIN"] = np.bytes_(origin)
-    np.testing.assert_array_equal(shot_in(file).image, expected)
-
-
-def test_pictures_in_colour_are_refused(file: Any) -> None:
-    file["data"] = np.zeros((3, 8, 8), np.uint8)
-    file["data"].attrs["IMAGE_SUBCLASS"] = np.bytes_("IMAGE_TRUECOLOR")
-    with pytest.raises(FileFormatError, match="as a picture in colour"):
-        shot_in(file, "data[0]")
 
 
 @pytest.mark.parametrize("as_dataset", [True, False])

@@ -2,19 +2,15 @@
 
 - values without packing: `decode_values`; an image with its mask, notes and pixel size:
   `read_meaning`
-- refuse pictures in colour: `check_grey`; frames of which some are no shots: `check_shots`
 
 Each convention is applied where a file uses it: packed and missing values of CF (NetCDF); factors,
-pixel masks, limits and pixel sizes of NeXus; white as zero and the origin of HDF5 Image; the order
-of axes of MATLAB 7.3.
+pixel masks, limits and pixel sizes of NeXus; the order of axes of MATLAB 7.3.
 
 References
 ----------
 NetCDF Climate and Forecast Metadata Conventions, section 8.1 and 2.5.1, https://cfconventions.org
 
-NeXus definitions of NXdata, NXdetector, NXmx and NXtomo, https://manual.nexusformat.org
-
-HDF5 Image and Palette Specification 1.2, https://support.hdfgroup.org
+NeXus definitions of NXdata, NXdetector and NXmx, https://manual.nexusformat.org
 """
 
 from __future__ import annotations
@@ -34,8 +30,6 @@ from napari_shadowinv.io.hdf5 import load_dataset, member, plain_value
 
 _PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value", "_Unsigned")
 _LIMITS = ("valid_range", "valid_min", "valid_max")
-_FRAME_KINDS = {1: "flat", 2: "dark", 3: "invalid"}  # by the image_key of NXtomo; 0 is a shot
-_FLIPS = {"LL": (0,), "UR": (1,), "LR": (0, 1)}  # axes to reverse, by the corner of the first pixel
 
 
 def decode_values(path: Path, dataset: Any, values: AnyArray, number: int | None) -> AnyArray:
@@ -64,33 +58,6 @@ def decode_values(path: Path, dataset: Any, values: AnyArray, number: int | None
 def is_of_matlab(dataset: Any) -> bool:
     """Return whether MATLAB 7.3 wrote an array: with its axes turned round, columns first."""
     return "MATLAB_class" in dataset.attrs
-
-
-def check_grey(path: Path, dataset: Any) -> None:
-    """Refuse an array that HDF5 Image declares to be a picture in colour."""
-    kind = plain_value(dataset.attrs.get("IMAGE_SUBCLASS", ""))
-    if kind == "IMAGE_TRUECOLOR" or (kind == "IMAGE_INDEXED" and "PALETTE" in dataset.attrs):
-        raise FileFormatError(
-            f"{path} holds {dataset.name!r} as a picture in colour ({kind}): expected numbers "
-            "proportional to the fluence; save one plane of it"
-        )
-
-
-def check_shots(path: Path, dataset: Any) -> None:
-    """Refuse frames among which NXtomo lists some without the object."""
-    for group in _detectors(path, dataset):
-        item = member(path, group, "image_key")
-        if item is None or item.size != math.prod(dataset.shape[:-2]):
-            continue
-        keys = np.ravel(load_dataset(path, item))
-        counts = {kind: int((keys == key).sum()) for key, kind in _FRAME_KINDS.items()}
-        if keys.size > 1 and any(counts.values()):
-            others = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-            raise FileFormatError(
-                f"{path} has {others} among the {keys.size} frames of {dataset.name!r} "
-                f"(image_key): expected shots only; name one, '{dataset.name}[{keys.argmin()}]', "
-                "or list the shots in a table, each with a flat frame as its source"
-            )
 
 
 def _unpack(values: AnyArray, attributes: dict[str, Any]) -> AnyArray:
@@ -132,15 +99,6 @@ def read_meaning(
     image, notes = decode_values(path, dataset, stored, number), []
     if image is not stored:
         notes.append("values converted as the file says (scale, offset, missing values)")
-    marks = _attributes(dataset, ("IMAGE_WHITE_IS_ZERO", "DISPLAY_ORIGIN"))
-    if np.any(marks.get("IMAGE_WHITE_IS_ZERO", 0)):
-        if stored.dtype.kind not in "u":
-            raise FileFormatError(
-                f"{path} holds {dataset.name!r} with 0 as white and {stored.dtype} values, which "
-                "do not say what black is: save it with 0 as black"
-            )
-        image = np.iinfo(stored.dtype).max - image
-        notes.append("0 is white in the file: values inverted")
     usable: BoolArray = np.isfinite(image)
     for detector in _detectors(path, dataset):
         unusable = _unusable_pixels(path, detector, dataset, stored, number)
@@ -150,10 +108,6 @@ def read_meaning(
                 notes.append(f"{int(pixels.sum())} pixels left out, {name} of the file")
     if not usable.all():
         image = np.where(usable, image, np.nan)
-    origin = str(plain_value(marks.get("DISPLAY_ORIGIN", "")))
-    if origin in _FLIPS:
-        image, usable = np.flip(image, _FLIPS[origin]), np.flip(usable, _FLIPS[origin])
-        notes.append(f"first pixel in the corner {origin} (DISPLAY_ORIGIN): turned to the top left")
     metadata: dict[str, Any] = {"dtype": str(stored.dtype), "bits": 8 * stored.dtype.itemsize}
     if notes:
         metadata["notes"] = tuple(notes)

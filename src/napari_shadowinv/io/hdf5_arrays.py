@@ -23,8 +23,6 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.arrays import FRAME_INDEX, frame_axes, frame_number
 from napari_shadowinv.io.conventions import (
-    check_grey,
-    check_shots,
     decode_values,
     is_of_matlab,
     read_meaning,
@@ -60,7 +58,6 @@ def read_plane(path: Path, name: str, number: int = 0) -> tuple[AnyArray, dict[s
     with open_hdf5(path) as file:
         dataset, frame_in_name = _find_array(path, file, name)
         frame_axes(path, repr(name), dataset.shape)
-        check_grey(path, dataset)
         number = number if frame_in_name is None else frame_in_name
         stored = _stored(path, dataset, number)
         image, metadata = read_meaning(path, dataset, stored, number)
@@ -75,10 +72,7 @@ def count_frames(path: Path, name: str | None = None) -> tuple[int, ...]:
     with open_hdf5(path) as file:
         dataset, number = _find_array(path, file, name)
         axes = frame_axes(path, repr(name), dataset.shape)
-        if number is not None:
-            return ()
-        check_shots(path, dataset)
-        return axes
+        return axes if number is None else ()
 
 
 @as_file_errors
