@@ -89,7 +89,7 @@ def test_default_that_leads_to_itself_is_no_array(nexus):
         ("entry/data/data[1,3]", r"frames from \[0,0\] to \[1,2\]"),
         (
             "entry/datum",
-            r"has no array 'entry/datum': it holds 'entry/data/data' \(2×3×5×7 uint16\)",
+            r"has no array 'entry/datum': did you mean 'entry/data/data'\? it holds 'entry/single'",
         ),
         ("entry/times", r"with shape \(6,\): expected an image"),
     ],
@@ -235,7 +235,7 @@ def test_arrays_of_a_deep_file_are_counted_and_loops_end(tmp_path):
         file["elsewhere"] = h5py.ExternalLink("other.h5", "/data")
     with pytest.raises(InputError) as error:
         read(f"{path}::a/b/c/d/shot_17/imge")
-    assert "it holds 'a/b/c/d/shot_17/image' (5×7 uint16)" in str(error.value)
+    assert "did you mean 'a/b/c/d/shot_17/image'? it holds" in str(error.value)
     assert str(error.value).endswith("and 13 more")
 
 

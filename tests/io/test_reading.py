@@ -196,7 +196,7 @@ def test_any_hdf5_gives_the_array_that_is_named(tmp_path: Path) -> None:
         np.testing.assert_array_equal(radiograph.image, expected)
         assert radiograph.metadata["variable"] == name
     for wrong, nearest in (("shots/bean", "shots/beam"), ("shots/3/imag", "shots/3/image")):
-        with pytest.raises(InputError, match=f"no array '{wrong}': it holds '{nearest}'"):
+        with pytest.raises(InputError, match=f"no array '{wrong}': did you mean '{nearest}'"):
             read(path, variable=wrong)
     with pytest.raises(InputError, match="holds 'note' as text"):
         read(path, variable="note")

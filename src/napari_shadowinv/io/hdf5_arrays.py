@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import math
 from collections import deque
@@ -19,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from napari_shadowinv._system.safety import as_file_errors, check_regular
+from napari_shadowinv._system.validation import nearest
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.arrays import FRAME_INDEX, frame_axes, frame_number
@@ -132,11 +132,14 @@ def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
     if frame is not None:
         item = _member_or_default(path, file, frame["name"])
     if item is None:
-        raise InputError(f"{path} has no array {name!r}: it holds {list_arrays(file, name)}")
+        images = [each.name for each in _objects(file) if not each.reason]
+        similar = nearest(name.strip("/"), images)
+        hint = f"did you mean {similar!r}? " if similar else ""
+        raise InputError(f"{path} has no array {name!r}: {hint}it holds {list_arrays(file)}")
     if item.dtype.kind not in "buif" or not item.shape:
         raise InputError(
             f"{path} holds {name!r} as {_KINDS.get(item.dtype.kind, 'one number')}: expected an "
-            f"array of real numbers; the file holds {list_arrays(file, name)}"
+            f"array of real numbers; the file holds {list_arrays(file)}"
         )
     return item, None if frame is None else frame_number(path, frame, item.shape[:-2])
 
@@ -183,17 +186,9 @@ def list_sizes(path: Path, *, most: int = 40) -> list[tuple[str, str]]:
         return [(each.name, each.size) for each in itertools.islice(_objects(file), most)]
 
 
-def list_arrays(file: Any, name: str = "", *, most: int = 8) -> str:
-    """Describe the first arrays of an open file, or those with a name most like `name`."""
+def list_arrays(file: Any, *, most: int = 8) -> str:
+    """Describe the first arrays of an open file, images first."""
     entries = list(_objects(file))
-    if name:
-        matcher = difflib.SequenceMatcher(b=name.strip("/").lower())
-
-        def likeness(entry: _HDF5Object) -> float:
-            matcher.set_seq1(entry.name.lower())
-            return matcher.ratio()
-
-        entries.sort(key=likeness, reverse=True)
     entries.sort(key=lambda entry: (bool(entry.reason), entry.reason == _ONE_AXIS))
     # Times and names are no choice where there are images.
     count = sum(entry.reason != _ONE_AXIS for entry in entries) or len(entries)
