@@ -79,8 +79,8 @@ class WatchOptions(_StoreOptions):
     )
     status_file: Path | None = Field(
         default=None,
-        description="JSON file with the newest shot and its field, the numbers of shots, the rate "
-        "and the last warning, replaced after each shot, for another program to show.",
+        description="JSON file with the newest shot, its peak and warnings, the numbers of shots "
+        "and the rate, replaced after each shot, for another program to show.",
     )
     skip_existing: bool = Field(
         default=False,

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import check_output, replacing
-from napari_shadowinv.io.store_columns import FITS, INVERSIONS, column_values
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.stack._arrivals import Arrivals
 from napari_shadowinv.stack._run import WATCHING, OnStatus, RunStatus
@@ -38,7 +34,7 @@ def status_file(
         )
     content: dict[str, Any] = {"state": "watching", "reason": "", "time": ""}
     content |= {"folder": str(arrivals.folder), "store": str(store), **_numbers(RunStatus())}
-    content |= {"newest": None, "last_warning": None}
+    content |= {"newest": None}
     has_failed = False
 
     def write() -> None:
@@ -58,9 +54,6 @@ def status_file(
         content.update(_numbers(status))
         if status.outcome is not None:
             content["newest"] = _newest(status, arrivals.folder)
-        for caution in () if status.result is None else status.result.cautions[-1:]:
-            warning = {"name": status.name, "code": caution.code, "text": caution.text}
-            content["last_warning"] = warning
         if status.outcome is not None or not status.ended:
             write()
         on_progress(status)
@@ -102,19 +95,12 @@ def _newest(status: RunStatus, folder: Path) -> dict[str, Any]:
 
 
 def _result_entries(result: Any) -> dict[str, Any]:
-    """Return the peak, the facts in a few words and the numbers of a result."""
-    is_fit = hasattr(result, "fields")
-    displacement = (result.fields[0] if is_fit else result).displacement
+    """Return the peak of a result, its headline and its warnings."""
+    displacement = (result.fields[0] if hasattr(result, "fields") else result).displacement
     (field,) = shown_fields([displacement], result.setup)
-    numbers = column_values(FITS if is_fit else INVERSIONS, result)
     return {
         "peak": {"symbol": field.symbol, "value": field.largest, "unit": field.unit},
-        "facts": {fact.key: fact.short for fact in result.facts if fact.short},
-        "numbers": {key: _as_json(value) for key, value in numbers.items()},
+        "headline": str(result.headline),
+        "level": result.headline.level.value,
+        "warnings": {caution.code: caution.text for caution in result.cautions},
     }
-
-
-def _as_json(value: Any) -> Any:
-    """Return a number as JSON knows it, without NaN."""
-    plain = value.item() if isinstance(value, np.generic) else value
-    return None if isinstance(plain, float) and not math.isfinite(plain) else plain
