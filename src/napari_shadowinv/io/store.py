@@ -11,7 +11,7 @@ be written again. So workers can write at the same time, and any of them may die
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
@@ -132,37 +132,28 @@ class StackStore:
             raise FileFormatError(f"{path} is not a stack of shots: expected name{STORE_SUFFIX}")
         self.field, self.columns = _contents(path, self.attributes)
         self._arrays = _open_readable(path)
-        self.names = tuple(map(str, self._values("name").tolist()))
+        names = read_values(path / "name", self._arrays["name"])
+        self.names = tuple(map(str, names.tolist()))
 
     def statuses(self) -> AnyArray:
         """Return PENDING, DONE, FAILED, DAMAGED or SKIPPED for each shot."""
-        damaged = self.damage.shots
-        if not damaged:
-            return self._values("status")
-        shots = range(len(self.names))
-        statuses = [DAMAGED if i in damaged else self._values("status", i) for i in shots]
-        return np.array(statuses, np.int8)
+        return np.array(self.damage.statuses, np.int8)
 
     def report(self, index: int) -> dict[str, Any]:
         """Return a shot's report; ``reason`` says why it failed, or how it is damaged."""
         if index in self.damage.shots:
             return {"reason": self.damage.shots[index]}
-        return _parse_reports(self.path, [str(self._values("report", index))])[0]
+        return _parse_report(self.path, self.damage.reports[index])
 
-    def reports(self) -> Sequence[dict[str, Any]]:
+    def reports(self) -> list[dict[str, Any]]:
         """Return the report of each shot, as `report` does."""
-        if self.damage.shots:
-            return [self.report(index) for index in range(len(self.names))]
-        return _parse_reports(self.path, self._values("report").tolist())
+        return [self.report(index) for index in range(len(self.names))]
 
     @cached_property
     def damage(self) -> Damage:
-        """Return the lost and damaged files."""
+        """Return the lost and damaged files, with the record of all shots."""
         is_copy = "store_id" not in self.attributes  # by another program, of what was read here
         return find_damage(self.path, self._arrays, every_byte=self._every_byte, is_copy=is_copy)
-
-    def _values(self, name: str, which: Any = ...) -> AnyArray:
-        return read_values(self.path / name, self._arrays[name], which)
 
 
 def check_files(store: StackStore) -> None:
@@ -195,8 +186,8 @@ def _open_readable(path: Path) -> dict[str, Any]:
 
 
 @as_file_errors
-def _parse_reports(path: Path, texts: Sequence[str]) -> list[dict[str, Any]]:
-    return [dict(json.loads(text)) if text else {} for text in texts]
+def _parse_report(path: Path, text: str) -> dict[str, Any]:
+    return dict(json.loads(text)) if text else {}
 
 
 def open_dataset(path: Path) -> xarray.Dataset:

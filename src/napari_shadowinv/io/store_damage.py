@@ -45,10 +45,12 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Damage:
-    """Damage to a store."""
+    """Damage to a store, and the record of its shots."""
 
     shots: Mapping[int, str]  # shots that cannot be trusted, with the reason
     files: tuple[str, ...]  # damage to files that belong to no single shot, in words
+    statuses: list[int]  # of each shot, damaged or not
+    reports: list[str]  # the same, as JSON
 
 
 def is_along_shots(array: Any) -> bool:
@@ -136,7 +138,8 @@ def find_damage(
             if text := problem(array, index):
                 file = chunk_file(path, array, index).relative_to(path)
                 files.append(f"{file.as_posix()} {text}")
-    return Damage(shots, tuple(files))
+    statuses = [Status.DAMAGED if k in shots else each for k, each in enumerate(statuses)]
+    return Damage(shots, tuple(files), statuses, reports)
 
 
 def _record(path: Path, array: Any, damaged: dict[int, str]) -> list[Any]:
