@@ -11,7 +11,7 @@ shots against early ones for many small frames.
 
 Then a watch of the latest of small simulated frames, written by another process faster than they
 can be inverted: the age of a result when it is stored, from the time stamp of its file, in s and in
-the time of a shot, and whether each skipped shot has this status in the store. Last, a stack of
+the time of a shot, and how many were passed over. Last, a stack of
 frames of 512 × 512 px from one HDF5 file on all cores: the rate, and that of six cores by the
 processor time of a shot; 0 sites stand for as many as the accuracy needs.
 
@@ -38,7 +38,7 @@ import psutil
 import tifffile
 
 from napari_shadowinv import InversionOptions, Recipe, Shot, run_stack
-from napari_shadowinv.io.store import DONE, SKIPPED, StackStore
+from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.pipeline import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.stack import RunStatus, read_pixels, watch_stack
@@ -215,10 +215,7 @@ def latest(folder: Path, seconds: float, rate: float, side: int, sites: int) -> 
     cpu = time.process_time() - cpu
     writer.join()
     store = StackStore(out)
-    statuses = dict(zip(store.names, store.statuses(), strict=True))
-    skipped = sum(status == SKIPPED for status in statuses.values())
     names = {name for name, _ in stored}
-    is_complete = len(statuses) == count and skipped == count - len(names)
     written = {name: (live / name).stat().st_mtime for name, _ in stored}
     late = stored[5:]  # the first ones read the kernels
     ages = np.array([end - written[name] for name, end in late])
@@ -232,8 +229,7 @@ def latest(folder: Path, seconds: float, rate: float, side: int, sites: int) -> 
     print(
         f"| inverted | {len(names)}, {(len(late) - 1) / (late[-1][1] - late[0][1]):.1f} a second |"
     )
-    complete = "each of the others" if is_complete else "NOT each of the others"
-    print(f"| skipped | {skipped}, {complete} |")
+    print(f"| passed over | {count - len(names)} |")
     print(f"| time of a shot until it is written, median | {1e3 * shot:.0f} ms |")
     print(f"| its processor time, all of the watch included | {1e3 * cpu / len(names):.0f} ms |")
     for label, values in (("when stored", ages), ("when replaced", replaced)):

@@ -79,7 +79,7 @@ def test_read_opens_it_and_so_does_plain_xarray(night, out, recwarn):
     assert json.loads(dataset.attrs["options"])["n_sites"] == 100
     plain = xr.open_zarr(out)
     assert list(plain.status.values) == [DONE] * 6
-    assert plain.status.attrs["flag_meanings"] == "pending done failed damaged skipped"
+    assert plain.status.attrs["flag_meanings"] == "pending done failed damaged"
     np.testing.assert_array_equal(plain.potential, dataset.potential)
     assert not [w for w in recwarn if "zarr" in str(w.message).lower()]
 

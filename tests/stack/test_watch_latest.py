@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.command_line import flat, shadowinv
+from helpers.command_line import shadowinv
 from helpers.night import OPTIONS
 from helpers.watched import SETTLE, SOURCE, Watched, put, watched_once
 from napari_shadowinv import InputError, Instrument, Shot, read, run_stack
-from napari_shadowinv.io.store import DONE, FAILED, SKIPPED, StackStore
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.pipeline import WatchOptions
 from napari_shadowinv.stack import watch_stack
 
@@ -43,7 +43,7 @@ def numbers_of(stored) -> list[tuple[str, int]]:
     return list(zip(names, stored.status.values.tolist(), strict=True))
 
 
-def test_latest_shot_is_next_and_the_others_are_skipped(folder, out):
+def test_latest_shot_is_next_and_the_others_are_passed_over(folder, out):
     gate = Gate()
     put(folder, 0)
     with Watched(folder, out, reader=gate, latest=True, instrument=EXACT) as watch:
@@ -58,28 +58,19 @@ def test_latest_shot_is_next_and_the_others_are_skipped(folder, out):
     assert [event.name for event in watch.shots[:2]] == ["shot_0.npy", "shot_4.npy"]
     assert (last.done, last.skipped, last.waiting) == (2, 2, 0)
     assert last.text == "2 done, 2 with warnings, 2 skipped"
-    expected = [("0", DONE), ("2", SKIPPED), ("3", SKIPPED), ("4", DONE), ("5", DONE)]
-    assert numbers_of(watch.result) == expected
-    assert np.isnan(watch.result.displacement[2]).all()
-    assert "skipped" in watch.result.status.attrs["flag_meanings"].split()
-    assert not StackStore(out, every_byte=True).damage.files
+    assert numbers_of(watch.result) == [("0", DONE), ("4", DONE), ("5", DONE)]
     assert not StackStore(out, every_byte=True).damage.shots
-
-    listed = flat(shadowinv("info", out).output)
-    assert "3 done, 0 failed, 0 pending, 2 skipped" in listed
-    assert "shot_2.npy, shot_3.npy: a watch without --latest inverts them" in listed
-
     again = watched_once(folder, out, reader=gate, instrument=EXACT)
-    assert numbers_of(again) == [(name, DONE) for name, _ in expected]
+    assert numbers_of(again) == [(name, DONE) for name in "04523"]
 
 
-def test_existing_files_are_skipped_but_the_newest_and_done_ones(folder, out, tmp_path):
+def test_existing_files_are_passed_over_but_the_newest_and_done_ones(folder, out, tmp_path):
     put(folder, 1)
     watched_once(folder, out)
     put(folder, 0, 2, 3)
     (folder / "shot_4.npy").write_bytes(b"")
     stored = watched_once(folder, out, latest=True)
-    expected = [("1", DONE), ("0", SKIPPED), ("2", SKIPPED), ("3", SKIPPED), ("4", FAILED)]
+    expected = [("1", DONE), ("4", FAILED)]
     assert numbers_of(stored) == expected
     status = (out / "status/c/1").stat()
     stored = watched_once(folder, out, latest=True)
@@ -89,7 +80,7 @@ def test_existing_files_are_skipped_but_the_newest_and_done_ones(folder, out, tm
     put(folder, 4)
     files = [folder / f"shot_{number}.npy" for number in range(5)]
     later = run_stack(Shot(files, source=SOURCE), out, recipe_of_watch(), run={"redo_failed": True})
-    assert numbers_of(later) == [(name, DONE) for name, _ in expected]
+    assert numbers_of(later) == [(name, DONE) for name in "14023"]
 
 
 def recipe_of_watch():
@@ -98,7 +89,7 @@ def recipe_of_watch():
     return Recipe(options=OPTIONS)
 
 
-def test_shots_in_work_are_skipped_when_the_watch_ends(folder, out):
+def test_shot_in_work_is_pending_when_the_watch_ends(folder, out):
     gate = Gate()
     put(folder, 0)
     with Watched(folder, out, reader=gate, latest=True) as watch:
@@ -110,10 +101,12 @@ def test_shots_in_work_are_skipped_when_the_watch_ends(folder, out):
         watch._stop.set()
         gate.opened.set()
     assert (watch.events[-1].skipped, watch.events[-1].waiting) == (1, 0)
-    assert numbers_of(watch.result) == [("0", DONE), ("1", SKIPPED)]
+    assert numbers_of(watch.result) == [("0", DONE), ("1", PENDING)]
+    again = watched_once(folder, out, reader=gate)
+    assert numbers_of(again) == [("0", DONE), ("1", DONE)]
 
 
-def test_command_counts_skipped_shots_and_ends_well(folder, out):
+def test_command_counts_what_it_passes_over_and_ends_well(folder, out):
     put(folder, 0, 1, 2)
     result = shadowinv(
         "watch", folder, "--pattern", "*.npy", "--out", out, "--set=options.n_sites=100",
@@ -121,7 +114,7 @@ def test_command_counts_skipped_shots_and_ends_well(folder, out):
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "Stopped: 1 done, 2 skipped; repeat" in result.stdout
-    assert numbers_of(read(out)) == [("0", SKIPPED), ("1", SKIPPED), ("2", DONE)]
+    assert numbers_of(read(out)) == [("2", DONE)]
 
 
 def test_status_file_describes_the_newest_shot(folder, out, tmp_path, monkeypatch):

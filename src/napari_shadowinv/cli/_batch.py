@@ -42,7 +42,6 @@ from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
     FAILED,
-    SKIPPED,
     STATUS_NAMES,
     StackStore,
     check_store_path,
@@ -212,10 +211,10 @@ def run_batch(
 def exit_unless_reliable(store: StackStore) -> None:
     """Exit with an error code if a shot is not done, or its result is not reliable.
 
-    Shots that were skipped on purpose do not count.
+    Shots that wait, of a watch that has ended, do not count.
     """
     statuses = store.statuses()
-    if not np.isin(statuses, (DONE, SKIPPED)).all():
+    if np.isin(statuses, (FAILED, DAMAGED)).any():
         raise typer.Exit(EXIT_FAILED_SHOTS)
     for status, report in zip(statuses, store.reports(), strict=True):
         if status != DONE:
@@ -235,7 +234,7 @@ def _counts_text(store: StackStore) -> str:
     statuses = store.statuses()
     counts = {name: np.sum(statuses == status) for status, name in enumerate(STATUS_NAMES)}
     names = ["done", "failed", "pending"]
-    names += [name for name in ("skipped", "damaged") if counts[name]]
+    names += ["damaged"] if counts["damaged"] else []
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
@@ -278,8 +277,6 @@ def _troubles(store: StackStore) -> Iterator[tuple[int, str, str, str]]:
         if status in (FAILED, DAMAGED):
             reason = report.get("reason", "its report is missing")
             yield index, STATUS_NAMES[status], reason, reason
-        elif status == SKIPPED:
-            yield index, STATUS_NAMES[SKIPPED], "", "a watch without --latest inverts them"
         for caution in map(Caution.from_json, report.get("warnings", ())):
             code = caution.text if caution.code == "other" else caution.code
             yield index, "warning", code, caution.text
@@ -302,7 +299,7 @@ def _trouble_rows(store: StackStore) -> Rows:
     for each, names in verdicts.items():
         if not _is_success(each):
             rows.append(("warning", f"{len(names)} {each}: {_list_text(names)}"))
-    for label in (STATUS_NAMES[FAILED], STATUS_NAMES[DAMAGED], STATUS_NAMES[SKIPPED], "warning"):
+    for label in (STATUS_NAMES[FAILED], STATUS_NAMES[DAMAGED], "warning"):
         listed = [
             f"{_list_text([*names])}: {text}"
             for (each, _), (text, names) in found.items()

@@ -49,7 +49,7 @@ FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
 PENDING: int  # mypy does not infer these for defaults of parameters
 DONE: int
-PENDING, DONE, FAILED, DAMAGED, SKIPPED = map(int, Status)
+PENDING, DONE, FAILED, DAMAGED = map(int, Status)
 STATUS_NAMES = tuple(status.name.lower() for status in Status)
 # Attribute of a store whose shots are rows of a table, each with its own setup in its report.
 OWN_SETUPS = "table_of_shots"
@@ -136,7 +136,7 @@ class StackStore:
         self.names = tuple(map(str, names.tolist()))
 
     def statuses(self) -> AnyArray:
-        """Return PENDING, DONE, FAILED, DAMAGED or SKIPPED for each shot."""
+        """Return PENDING, DONE, FAILED or DAMAGED for each shot."""
         return np.array(self.damage.statuses, np.int8)
 
     def report(self, index: int) -> dict[str, Any]:
@@ -227,10 +227,9 @@ def read_stack(path: Path) -> xarray.Dataset:
     -------
     xarray.Dataset
         Dimensions shot, y, x and component. ``status`` is 0 where a shot is pending, 1 done,
-        2 failed, 3 damaged, 4 skipped in a watched folder; the values of shots that are not done
-        are NaN, as are lost ones. The numbers of each shot, such as ``image_residual``, come from
-        its ``report``. Where shots have different setups, ``setup`` has one for each shot, empty
-        until the shot is done.
+        2 failed, 3 damaged; the values of shots that are not done are NaN, as are lost ones. The
+        numbers of each shot, such as ``image_residual``, come from its ``report``. Where shots have
+        different setups, ``setup`` has one for each shot, empty until the shot is done.
 
     Raises
     ------

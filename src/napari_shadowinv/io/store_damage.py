@@ -30,17 +30,12 @@ RECORD = ("status", "report")  # arrays with an entry for each shot that are no 
 
 
 class Status(IntEnum):
-    """Status of a shot; damage is noticed when a store is opened, and never stored.
-
-    A skipped shot came to a watched folder while another was inverted, and is as empty as a pending
-    one.
-    """
+    """Status of a shot; damage is noticed when a store is opened, and never stored."""
 
     PENDING = 0
     DONE = 1
     FAILED = 2
     DAMAGED = 3
-    SKIPPED = 4
 
 
 @dataclass(frozen=True)

@@ -95,11 +95,11 @@ class ShotWriter:
             group["report"][index : index + 1] = np.array([json.dumps(report)], dtype=object)
             group["status"][index : index + 1] = np.int8(status)
 
-    def reopen(self, index: int, status: int = PENDING) -> None:
+    def reopen(self, index: int) -> None:
         """Mark a shot as pending that is to be done again, and forget its report and fields."""
         group = self.arrays()
         with _as_store_errors(self.path):
-            group["status"][index : index + 1] = np.int8(status)
+            group["status"][index : index + 1] = np.int8(PENDING)
             for name in ("report", *fields_of(group)):
                 chunk_file(self.path, group[name], index).unlink(missing_ok=True)
 

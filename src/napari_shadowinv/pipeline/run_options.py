@@ -74,8 +74,8 @@ class WatchOptions(_StoreOptions):
     )
     latest: bool = Field(
         default=False,
-        description="Invert the newest file first and skip those that came while others were "
-        "inverted. A watch without this choice inverts skipped shots later.",
+        description="Invert the newest file first and pass over those that came while others "
+        "were inverted. A watch without this choice inverts them later.",
     )
     status_file: Path | None = Field(
         default=None,

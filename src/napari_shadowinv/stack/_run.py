@@ -37,7 +37,6 @@ from napari_shadowinv.io.store import (
     FAILED,
     OWN_SETUPS,
     PENDING,
-    SKIPPED,
     StackStore,
     check_files,
     check_store_path,
@@ -82,7 +81,7 @@ class RunStatus:
     doubtful : int
         Shots that are done, with warnings.
     skipped : int
-        Shots of a watched folder that came while newer ones were inverted.
+        Files of a watched folder that came while newer ones were inverted, and are in no store.
     waiting : int
         Shots that have not ended; of a watched folder, files that have arrived.
     ended : int
@@ -208,7 +207,7 @@ def run_stack(
     variables = stored_variables(run.variables, recipe)
     stack = describe_stack(shots, recipe, reader, variables)
     stack = replace(stack, dtype=run.dtype)
-    again = (PENDING, SKIPPED, *([FAILED] if run.redo_failed else []))
+    again = [FAILED] if run.redo_failed else []
     on_progress = on_progress or (lambda _: None)
     if is_local(scheduler):
         # Once, instead of in all workers during their first shot.
@@ -308,7 +307,6 @@ class StoreRun:
             done=self.statuses.count(DONE),
             failed=len(self._failures),
             doubtful=len(self._doubtful),
-            skipped=self.statuses.count(SKIPPED),
             waiting=self.statuses.count(PENDING),
             ended=self._ended,
             seconds=self._seconds,
@@ -355,10 +353,11 @@ class StoreRun:
         text = stack.source_text(None)
         self.append(stack.shots.names[count:], numbers[count:], source_image=text)
 
-    def write(self, index: int, status: int) -> None:
-        """Mark a shot as pending or skipped, and forget its report and fields."""
-        self.writer.reopen(index, status)
-        self._note(index, status)
+    def reopen(self, index: int) -> None:
+        """Mark a shot as pending, and forget its report and fields."""
+        if self.statuses[index] != PENDING:
+            self.writer.reopen(index)
+            self._note(index, PENDING)
 
     def run(
         self,

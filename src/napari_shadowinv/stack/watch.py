@@ -25,7 +25,7 @@ from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.files import sha256, text_of
 from napari_shadowinv.io.frames import counts_text
-from napari_shadowinv.io.store import DONE, FAILED, PENDING, SKIPPED, StackStore, check_store_path
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
 from napari_shadowinv.io.store_writing import (
     create_store,
     remove_unfinished,
@@ -67,7 +67,7 @@ _CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
 class Watch:
     """The loop over a folder: files that are complete are run like the shots of any stack.
 
-    With `latest`, the newest file is next, and all others that wait are skipped.
+    With `latest`, the newest file is next, and all others that wait are passed over.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Watch:
         self.filled: StoreRun | None = None  # once a shot can be read
         self._stack: Stack | None = None
         self._unreadable: list[str] = []  # files by which the stack could not be described
-        self._skipped: dict[str, None] = {}  # not in the store yet, in order of arrival
+        self._skipped: set[str] = set()  # names of files that were passed over, not in the store
         self._running: dict[int, str] = {}  # files of the shots in work
         self._last_end = time.monotonic()
         self._left_out: Counter[str] = Counter()
@@ -94,7 +94,7 @@ class Watch:
         """Report the numbers of shots, and some news."""
         status = RunStatus() if self.filled is None else self.filled.status
         waiting = len(self._arrivals.waiting) + len(self._running)
-        skipped = status.skipped + len(self._skipped)
+        skipped = len(self._skipped)
         status = replace(status, skipped=skipped, waiting=waiting, scheduler=WATCHING)
         self._on_progress(replace(status, **news))
 
@@ -108,8 +108,7 @@ class Watch:
         if self._stack is not None:
             match_store(store, self._stack)
         remove_unfinished(self._path)
-        again = [PENDING] if self._options.latest else [PENDING, SKIPPED]
-        self.filled = StoreRun(store, [*again, *([FAILED] * self._options.redo_failed)])
+        self.filled = StoreRun(store, [FAILED] if self._options.redo_failed else ())
 
     def _stack_of(self, files: Iterable[str]) -> Stack:
         stack = self._describe(Shots([self._shot(file) for file in files], (0, 0)))
@@ -155,7 +154,7 @@ class Watch:
         self.report(note=f"Left out: {counts}; choose others by a pattern of names")
 
     def _close(self) -> None:
-        """Note what was skipped, and the shots that were still running."""
+        """Note what was passed over, and the shots that were still running."""
         if self.filled is not None:
             statuses = self.filled.writer.arrays()["status"]
             unfinished = [file for k, file in self._running.items() if statuses[k] == PENDING]
@@ -165,7 +164,6 @@ class Watch:
             self._skip(self._arrivals.waiting)
             self._arrivals.waiting.clear()
         if self.filled is not None:
-            self._give_numbers(self.filled, ())
             self.filled.refresh(StackStore(self._path))
 
     def _is_over(self) -> bool:
@@ -222,9 +220,8 @@ class Watch:
 
     def _skip(self, files: Iterable[str]) -> None:
         """Note shots that are not inverted, unless an earlier version of them was."""
-        for name in map(text_of, files):
-            if self._status_of(name) not in (DONE, FAILED, SKIPPED):
-                self._skipped[name] = None
+        names = map(text_of, files)
+        self._skipped |= {name for name in names if self._status_of(name) not in (DONE, FAILED)}
 
     def _status_of(self, name: str) -> int | None:
         """Return the status of a shot; None if it is not in the store."""
@@ -251,17 +248,18 @@ class Watch:
         assert self._stack is not None
         shots = {text_of(file): self._shot(file) for file in files}
         again = {name for name in shots if self._status_of(name) in (DONE, FAILED)}
-        for name in shots:
-            self._skipped.pop(name, None)
+        self._skipped -= shots.keys()
         with defer_interrupts():
             if self.filled is None:
-                items = [self._shot(name) for name in (*self._skipped, *shots)]
-                shots_so_far = replace(self._stack.shots, items=items)
-                contents = contents_of(replace(self._stack, shots=shots_so_far))
+                first = replace(self._stack.shots, items=list(shots.values()))
+                contents = contents_of(replace(self._stack, shots=first))
                 overwrite = self._options.overwrite
                 self.filled = StoreRun(create_store(self._path, contents, overwrite=overwrite))
             filled = self.filled
-            self._give_numbers(filled, shots)
+            new = [name for name in shots if name not in filled.numbers]
+            filled.append(new, len(filled.names) + np.arange(len(new)))
+            for name in shots:
+                filled.reopen(filled.numbers[name])
         self._running = {filled.numbers[text_of(file)]: file for file in files}
 
         def end(outcome: ShotOutcome, result: Any) -> None:
@@ -276,23 +274,12 @@ class Watch:
         task = self._stack.task
         filled.run(numbered, task, scheduler, end, self._should_stop, keeps_results=True)
 
-    def _give_numbers(self, filled: StoreRun, shots: Iterable[str]) -> None:
-        """Give all shots a place in the store; those to run are pending, others skipped."""
-        new = [name for name in (*self._skipped, *shots) if name not in filled.numbers]
-        filled.append(new, len(filled.names) + np.arange(len(new)))
-        for name in self._skipped:
-            filled.write(filled.numbers[name], SKIPPED)
-        self._skipped.clear()
-        for name in shots:
-            if filled.status_of(name) != PENDING:
-                filled.write(filled.numbers[name], PENDING)
-
     def _check_folder(self, filled: StoreRun, outcome: ShotOutcome) -> None:
         """Raise an error if a shot failed because the folder disappeared; it stays pending."""
         try:
             self._arrivals.check()
         except FileFormatError:
-            filled.write(outcome.index, PENDING)
+            filled.reopen(outcome.index)
             raise
 
 
@@ -310,7 +297,7 @@ def watch_stack(
 
     Existing files come first, in counting order of their names, then new ones in the order in
     which they were completed; each gets the next number of the store. With `WatchOptions.latest`,
-    the newest file comes first, and those that came meanwhile are skipped until a call without it.
+    the newest file comes first, and those that came meanwhile are left to a call without it.
     A file that cannot be inverted fails alone, with its reason. A file that is written again later
     is inverted again, under the same number. Another call with the same store resumes it, without
     repeating shots.
