@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.optimize import nnls
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import (
@@ -14,7 +13,6 @@ from napari_shadowinv.preprocessing import (
     remove_hot_pixels,
 )
 from napari_shadowinv.preprocessing.filters import LowPassFilter
-from napari_shadowinv.preprocessing.pixels import nonnegative_fit
 
 SHAPE = (48, 60)
 FILTERS = {
@@ -297,18 +295,3 @@ def test_a_function_with_further_keywords_receives_the_mask():
 
     LowPassFilter(width=2.0).call(record, np.ones((4, 4)), mask=mask, should_stop=None)
     assert received == {"width": 2.0, "mask": mask, "should_stop": None}
-
-
-def test_a_nonnegative_fit_agrees_with_another_program():
-    draw = np.random.default_rng(3)
-    columns_used = set()
-    for _ in range(1000):
-        counts = np.sort(draw.uniform(0, 10 ** draw.uniform(0, 5), 12))
-        columns = counts[:, None] ** np.arange(3) / counts.mean() ** np.arange(3)
-        values = columns @ draw.normal(size=3) + 0.1 * draw.normal(size=12)
-        terms, distance = nonnegative_fit(columns, values)
-        expected, expected_distance = nnls(columns, values)
-        np.testing.assert_allclose(terms, expected, atol=1e-9)
-        assert distance == pytest.approx(expected_distance, rel=1e-12)
-        columns_used.add(tuple(terms > 0))
-    assert len(columns_used) == 8

@@ -8,7 +8,6 @@
 
 from __future__ import annotations
 
-import itertools
 import operator
 from typing import Literal
 
@@ -276,37 +275,13 @@ def fit_polynomial(
 
 
 def nonnegative_fit(columns: FloatArray, values: FloatArray) -> tuple[FloatArray, float]:
-    """Fit values by columns whose coefficients are not negative, by least squares.
+    """Fit values by columns of any size whose coefficients are not negative, by least squares.
 
-    Every subset of the columns is tried, which suits the two or three terms of a detector's noise.
-
-    Parameters
-    ----------
-    columns : ndarray of float64, shape (N, K)
-    values : ndarray of float64, shape (N,)
-
-    Returns
-    -------
-    coefficients : ndarray of float64, shape (K,)
-        One in the values' unit over the column's.
-    distance : float
-        Root of the sum of squared residuals, in the values' unit.
+    Returns the coefficients, shape (K,), and the root of the sum of squared residuals.
     """
     norms = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(np.float64).tiny)
-    scaled = columns / norms
-    best, least = np.zeros(len(norms)), float(np.linalg.norm(values))
-    for subset in itertools.product((True, False), repeat=len(norms)):
-        used = np.flatnonzero(subset)
-        terms = np.linalg.lstsq(scaled[:, used], values, rcond=None)[0]
-        if (terms < 0).any():
-            continue
-        distance = float(np.linalg.norm(values - scaled[:, used] @ terms))
-        if distance < least:
-            best, least = np.zeros(len(norms)), distance
-            best[used] = terms
-        if all(subset):  # no subset fits better than all
-            break
-    return best / norms, least
+    terms, distance = scipy.optimize.nnls(columns / norms, values)
+    return terms / norms, float(distance)
 
 
 def _weighted_fit(
