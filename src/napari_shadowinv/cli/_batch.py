@@ -238,21 +238,14 @@ def _counts_text(store: StackStore) -> str:
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
-def _report_rows(store: StackStore) -> Rows:
-    """Return the beams and sources of shots that have their own, their sites and their time."""
+def _beam_rows(store: StackStore) -> Rows:
+    """Return the energies or wavelengths of shots that have their own."""
     rows: Rows = []
     reports = store.reports()
-    provenances = [each for each in map(Provenance.of, reports) if each is not None]
-    sources = [each.image.source for each in provenances]
-    files = dict.fromkeys(source.file for source in sources if source and source.file)
-    rows += [("own sources", _list_text(list(files)))] if files else []
     for name, quantity in beam_quantities().items():
         values = sorted({report[name] for report in reports if name in report})
         rows += [(quantity.plural, quantity.text(*values, digits=6))] if values else []
-    if seconds := [report["seconds"] for report in reports if "stages" in report]:
-        text = f"{sum(seconds) / len(seconds):.2f} s on one worker, on average"
-        rows.append(("time per shot", text))
-    return [*rows, *_site_rows(store)]
+    return rows
 
 
 def _site_rows(store: StackStore) -> Rows:
@@ -375,7 +368,8 @@ def _store_rows(store: StackStore) -> Rows:
         ("shots", _counts_text(store)),
         ("size", str(attributes["image_size"])),
         *provenance_rows(Provenance.of(attributes)),
-        *_report_rows(store),
+        *_beam_rows(store),
+        *_site_rows(store),
         ("stored", str(attributes["stored"])),
         ("options", options_text(json.loads(attributes["options"]))),
     ]
