@@ -270,12 +270,6 @@ def test_settings_override_the_recipe_of_a_fit(fit_arguments: dict[str, Any]) ->
 
 TABLES = {
     "file,enrgy\na.tif,3\n": ("column 'enrgy'", "did you mean 'energy'?"),
-    "name,energy\na.tif,3\n": ("column 'name'", "expected one of file, setup, energy"),
-    "energy,psf\n3,1\n": ("no column 'file'",),
-    "file,psf,psf\na.tif,3,3\n": ("column 'psf' twice",),
-    "file,psf\n": ("no rows",),
-    "file,psf\na.tif,1,2\n": ("line 2 has 3 values, expected 2",),
-    "file,psf\na.tif,wide\n": ("line 2", "'psf' is 'wide'"),
     "file,noise\na.tif,loud\n": ("line 2", "'noise' is 'loud': expected 'poisson'"),
     "file,strength\na.tif,1\nb.tif,\n": ("b.tif has no strength, other images have",),
     "file,source\na.tif,unknown\nb.tif,\n": ("b.tif has no unknown source",),
@@ -380,8 +374,8 @@ def test_forward_asks_which_of_two_fields(
     refused: Callable[..., None], make_fit: Callable[..., Fit]
 ) -> None:
     write("fit.shadowinv", make_fit(names=("B", "E")))
-    refused("forward", "fit.shadowinv", names=("the fields B, E", "--variable displacement_B"))
-    result = shadowinv("forward", "fit.shadowinv", "--variable", "displacement_E")
+    refused("forward", "fit.shadowinv", names=("the fields B, E", "fit.shadowinv::displacement_B"))
+    result = shadowinv("forward", "fit.shadowinv::displacement_E")
     assert result.exit_code == 0, result.output
 
 

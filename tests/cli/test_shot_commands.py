@@ -308,7 +308,7 @@ REFUSED = {
     "invert zero.npy": "zero.npy: image has no positive pixel",
     "info missing.tif": "missing.tif",
     "forward missing.tif": "missing.tif",
-    "invert shot.npy --variable shot": "neither a MATLAB nor an HDF5 file",
+    "invert shot.npy::shot": "neither a MATLAB nor an HDF5 file",
     # flags and keys
     "invert shot.npy --bin 0": "--bin is 0",
     "invert shot.npy --bin 20": "by 20",
@@ -399,7 +399,7 @@ def test_forward_refuses_choices_that_do_not_fit_a_3d_field(
     refused(*trace, "--set=trace.source_size=1e-5", names="use output 'counts'")
     refused(*trace, "--set=trace.step=3", names="trace.step is '3'")
     refused(*trace, "--deflector", "plasma", names="leave them out")
-    refused(*trace, "--variable", "4", names="no openPMD file")
+    refused("forward", f"{grid}::4", *trace[2:], names="no openPMD file")
     np.save("d.npy", BLOB.displacement)
     refused("forward", "d.npy", "--set=trace.counts=3", names="d.npy is no 3-D field")
 
@@ -414,23 +414,23 @@ def test_variables_of_matlab_and_hdf5(folder: Path, refused: Callable[..., None]
     for name, group, remedy in (("shots.mat", "", "::shot"), ("shots.h5", "day/", "::/name")):
         refused("invert", name, "--overwrite", names=(name, remedy, f"{group}shot"))
         refused("info", name, names=(name, remedy, f"'{group}shot' (24×32"))
-        refused("info", name, "--variable", "shop", names=(name, "'shop'", f"{group}beam"))
-        arguments = ["--variable", f"{group}shot", "--source", f"{name}::{group}beam"]
-        result = shadowinv("invert", name, *arguments, "--overwrite")
+        refused("info", f"{name}::shop", names=(name, "'shop'", f"{group}beam"))
+        arguments = [f"{name}::{group}shot", "--source", f"{name}::{group}beam"]
+        result = shadowinv("invert", *arguments, "--overwrite")
         assert result.exit_code == 0, result.output
         np.testing.assert_array_equal(dataset("shots.shadowinv")["displacement"], expected)
     refused("invert", "shots.shadowinv", "--out", "again.shadowinv", names="is the result")
-    from_mat = shadowinv("forward", "shots.mat", "--variable", "phi", "--out", "a.npy")
-    from_h5 = shadowinv("forward", "shots.h5", "--variable", "day/d", "--out", "b.npy")
+    from_mat = shadowinv("forward", "shots.mat::phi", "--out", "a.npy")
+    from_h5 = shadowinv("forward", "shots.h5::day/d", "--out", "b.npy")
     assert (from_mat.exit_code, from_h5.exit_code) == (0, 0), from_mat.output + from_h5.output
     np.testing.assert_allclose(np.load("b.npy"), synthetic_image(BLOB.displacement))
     np.testing.assert_allclose(np.load("a.npy"), np.load("b.npy"), atol=0.05)
-    text = " ".join(shadowinv("info", "shots.mat", "--variable", "beam").stdout.split())
+    text = " ".join(shadowinv("info", "shots.mat::beam").stdout.split())
     assert "array 'beam' of a MATLAB file" in text
     assert "90, 100, 110" in text
-    text = " ".join(shadowinv("info", "shots.h5", "--variable", "day/d").stdout.split())
+    text = " ".join(shadowinv("info", "shots.h5::day/d").stdout.split())
     assert "(2, 24, 32)" in text
-    refused("info", "shots.h5", "--variable", "day", names=("no array 'day'", "day/beam"))
+    refused("info", "shots.h5::day", names=("no array 'day'", "day/beam"))
 
 
 GEOMETRY_TEXT = "# source_object_distance = 1 cm\n# object_image_distance = 30 cm\n# bin_um = 310\n"
@@ -779,7 +779,6 @@ print(sorted({"napari", "qtpy", "PyQt6", "PySide6"} & set(sys.modules)))
 def test_info_needs_a_file_or_report(refused: Callable[..., None]) -> None:
     refused("info", names="--system")
     refused("info", "shot.npy", "--system", names="no file")
-    refused("info", "--variable", "beam", "--system", names="no file")
 
 
 def test_info_of_a_result_shows_options_and_peak(folder: Path, shot: Path) -> None:

@@ -223,13 +223,13 @@ def test_other_files_are_no_scans(tmp_path: Path) -> None:
 def test_the_command_inverts_a_scan(scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(scan.parent)
     chosen = "diameter=:12 contrast=:40 bin=100"
-    done = shadowinv("invert", scan, "--variable", chosen, "--out", "a.shadowinv")
+    done = shadowinv("invert", f"{scan}::{chosen}", "--out", "a.shadowinv")
     assert done.exit_code == 0, done.output
     image = read_shot(scan, variable=chosen).image
     assert image.shape == (12, 24)
     np.testing.assert_allclose(read(Path("a.shadowinv"))["residual"].shape, image.shape)
     assert rerun("a.shadowinv").is_identical
-    report = flat(shadowinv("info", scan, "--variable", chosen).output)
+    report = flat(shadowinv("info", f"{scan}::{chosen}").output)
     assert "CR-39 tracks" in report
     assert "288 of 432 tracks counted in bins of 100 µm" in report
     assert "detector pixel size (m)" in report

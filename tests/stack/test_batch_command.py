@@ -145,20 +145,6 @@ def test_existing_store_is_neither_resumed_nor_replaced(store):
     assert batch("--overwrite").exit_code == 0
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
-def test_names_that_are_no_text_are_kept_as_their_bytes(night, folder):
-    os.rename(night.path(0), b"shots/shot_\xf6.npy")
-    Path(os.fsdecode(b"shots/shot_\xfc.npy")).write_bytes(b"no image")
-    assert batch().exit_code == 1
-    names = StackStore(Path("n.shadowinv.zarr")).names
-    assert {r"shot_\xf6.npy", r"shot_\xfc.npy"} <= set(names)
-    result = shadowinv("export", "n.shadowinv.zarr", "--format", "csv", "--out", "n.csv")
-    assert result.exit_code == 0, result.output
-    rows = list(csv.DictReader(Path("n.csv").read_text(encoding="utf-8").splitlines()))
-    (failed,) = [row for row in rows if row["status"] == "failed"]
-    assert failed["name"] == r"shot_\xfc.npy"
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -191,31 +177,6 @@ def test_nothing_is_written_among_the_files_of_a_store(store):
     assert sorted(store.rglob("*")) == before
 
 
-def test_a_tiff_with_pages_a_mask_and_bins(night, folder):
-    tifffile.imwrite("film.tif", night.images.astype(np.float32), photometric="minisblack")
-    mask = np.ones(night.source.shape, np.uint8)
-    mask[:2, :2] = 0
-    iio.imwrite("mask.png", mask)
-    result = shadowinv(
-        "batch", "film.tif", "--source", "reference.npy", "--mask", "mask.png", "--bin", 2,
-        "--setup", "setup.toml", "--out", "f.shadowinv.zarr", "--scheduler", "threads",
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
-    dataset = read("f.shadowinv.zarr")
-    recorded = {"input_y_0": 24, "input_x_0": 28}  # of the mask
-    assert dict(dataset.sizes) == {"shot": 6, "y": 12, "x": 14, "component": 2, **recorded}
-    assert float(dataset.x[1]) == pytest.approx(4e-5)
-
-    def binned(image: np.ndarray) -> np.ndarray:
-        return image.reshape(12, 2, 14, 2).sum(axis=(1, 3))
-
-    usable = np.ones((12, 14), bool)
-    usable[0, 0] = False
-    shot = binned(night.images[3].astype(np.float32).astype(float))
-    alone = invert(shot, source=binned(night.source), mask=usable)
-    np.testing.assert_allclose(dataset.potential[3], alone.potential, rtol=1e-6, atol=1e-6)
-
-
 def test_shots_are_exported_as_tiff(store):
     result = shadowinv(
         "export", store, "--format", "tiff", "--shots", "1:3,5", "--variables",
@@ -230,29 +191,6 @@ def test_shots_are_exported_as_tiff(store):
     again = shadowinv("export", store, "--format", "tiff", "--shots", "1", "--out", "tiffs")
     assert again.exit_code == 2
     assert "exists" in again.output
-
-
-def test_exported_tiff_has_the_size_of_its_pixels(store):
-    def pixel_size(path: str) -> float | None:
-        with tifffile.TiffFile(path) as tiff:
-            tags = tiff.pages[0].aspage().tags
-            if tags["ResolutionUnit"].value != tifffile.RESUNIT.CENTIMETER:
-                return None
-            count, per = tags["XResolution"].value
-            return 0.01 * per / count
-
-    assert batch("--overwrite").exit_code == 0
-    shadowinv("export", store, "--format", "tiff", "--shots", "1", "--out", "pixels")
-    assert pixel_size("pixels/0001_shot_1_potential.tif") is None
-    for setup, in_object_plane in ((OPTICAL, 2e-5), (PROTON, 1e-5)):
-        Path("setup.toml").write_text(setup)
-        assert batch("--setup", "setup.toml", "--overwrite").exit_code == 0
-        result = shadowinv(
-            "export", store, "--format", "tiff", "--shots", "1", "--out", "tiffs", "--overwrite"
-        )
-        assert result.exit_code == 0, result.output
-        size = pixel_size("tiffs/0001_shot_1_potential.tif")
-        assert size == pytest.approx(in_object_plane, rel=1e-6)
 
 
 def test_shots_are_exported_as_pradformat_for_particle_beams(store):
@@ -457,25 +395,6 @@ def test_without_its_package_mp4_is_refused_in_one_sentence(store, monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
-@pytest.mark.parametrize("source", ["reference.npy", "reference.h5"])
-def test_the_variable_of_the_shots_is_not_asked_of_a_source_without_names(
-    make_night, tmp_path, monkeypatch, source
-):
-    monkeypatch.chdir(tmp_path)
-    night = make_night(2)
-    np.save("reference.npy", night.source)
-    shots = sorted(tmp_path.glob("shots/shot_*.npy"))
-    for path in (*shots, tmp_path / "reference.npy"):
-        with h5py.File(path.with_suffix(".h5"), "w") as file:
-            file["plane"], file["other"] = np.load(path), np.zeros((2, 2))
-    result = shadowinv(
-        "batch", "shots/shot_*.h5", "--variable", "plane", "--source", source,
-        "--set=options.n_sites=100", "--out", "n.shadowinv.zarr", "--quiet",
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
-    assert (StackStore(tmp_path / "n.shadowinv.zarr").statuses() == DONE).all()
-
-
 def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     night = make_night(60)

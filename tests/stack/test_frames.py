@@ -104,6 +104,6 @@ def test_batch_and_info_take_arrays_of_hdf5(any_night, run_file, out, tmp_path):
     listed = flat(shadowinv("info", f"{run_file}::/entry/data/data").output)
     assert "6 frames, run.h5[0] to run.h5[5]" in listed
     assert "(6, 24, 28), [shot, y, x]" in listed
-    result = shadowinv("invert", run_file, "--variable", "entry/data/data")
+    result = shadowinv("invert", f"{run_file}::entry/data/data")
     assert result.exit_code == 2
     assert "such as 'entry/data/data[0]'" in flat(result.output)

@@ -178,8 +178,8 @@ def test_arrays_of_matlab_files_and_a_free_boundary(night, tmp_path, monkeypatch
         savemat(f"shot_{index}.mat", {"shot": image, "dark": 0 * image, "beam": night.source})
     keys = ["options.n_sites=100", "options.margin=5", "options.flux=known"]
     flags = ["--boundary", "free", *(f"--set={key}" for key in keys)]
-    batch = ["batch", "shot_*.mat", "--scheduler", "threads", "--quiet", *flags]
-    result = CliRunner().invoke(app, [*batch, "--variable", "shot", "--out", "n.shadowinv.zarr"])
+    batch = ["batch", "shot_*.mat::shot", "--scheduler", "threads", "--quiet", *flags]
+    result = CliRunner().invoke(app, [*batch, "--out", "n.shadowinv.zarr"])
     assert result.exit_code == 0, result.output
     options = InversionOptions(n_sites=100, boundary="free", margin=5, flux="known")
     image = night.images[1] / night.images[1].mean()

@@ -22,6 +22,7 @@ from napari_shadowinv.cli._summary import fact_rows, result_rows, two_columns
 from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import RESULT
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def fit(
     rows = shot_rows(
         images, {"setup": flags.setup}, {"energy": flags.energies}, {"energy": "--energies"}
     )
-    first, outputs = rows[0].file, Outputs(overwrite, quiet)
+    first, outputs = split_address(rows[0].file)[0], Outputs(overwrite, quiet)
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
     result, figure = result_and_figure(first, target, figure)
     figures = [figure]
@@ -81,7 +82,7 @@ def fit(
     stated = settings_of(settings or (), FIT_SECTIONS, flags.by_key, FILE_KEYS[:1])
     recipe = recipe_from(flags, stated)
     outputs.protect_files_of(recipe)
-    shots = read_row_images(rows, recipe, channel=flags.channel, variable=flags.variable)
+    shots = read_row_images(rows, recipe, channel=flags.channel)
     shots = (replace(shots[0], fiducials=flags.fiducials), *shots[1:])
     check_setup(result, shots[0].setup, recipe.fit.fields if recipe.fit else None)
     outputs.warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)

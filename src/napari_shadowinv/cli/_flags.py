@@ -33,7 +33,6 @@ RecipeFile = Annotated[Path | None, Option(help="TOML file of steps, files and o
 SaveRecipe = Annotated[Path | None, Option(help="Write the recipe to a TOML file.")]
 SetupFile = Annotated[Path | None, Option(help="TOML file of the geometry, for SI units.")]
 Channel = Annotated[str | None, Option(help="red, green, blue, mean or an index.")]
-Variable = Annotated[str | None, Option(metavar="NAME", help="Array of the file, as file::name.")]
 ChosenShots = Annotated[str | None, Option(help="Shots such as 3, 3:20, ::10 or 1,4,9.")]
 Figure = Annotated[Path | None, Option(help=".png, .pdf or .svg. Default: a PNG.")]
 Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
@@ -71,7 +70,6 @@ class ShotFlags:
     instrument: InstrumentNames = None
     recipe: RecipeFile = None
     channel: Channel = None
-    variable: Variable = None
     bin: Annotated[int | None, Option(metavar="N", help="Sum blocks of N × N pixels.")] = None
     steps: Annotated[
         list[str] | None,

@@ -19,6 +19,7 @@ from napari_shadowinv.cli._summary import Rows, fact_rows, setup_text, size_text
 from napari_shadowinv.cli._terminal import notify_errors, work_callbacks
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import percent
+from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import IMAGE_WRITERS, NETCDF_SUFFIX, TIFF, kind_of
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.trace_options import SizedView, TraceOptions
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 # Help of arguments, where it is longer than a line.
 HELP = {
     "field": "Result, displacement (2, H, W) in px, potential (H, W) in px², or 3-D field "
-    "(openPMD, NetCDF).",
+    "(openPMD, also fields.h5::iteration, NetCDF).",
     "truth": "NetCDF file of line integrals.",
     "setup": "TOML file of the geometry to predict for.",
     "recorded_with": "TOML file of the geometry in which the field was measured.",
@@ -60,7 +61,6 @@ class ExperimentFlags:
     dispersion: Annotated[float, Option(help=HELP["dispersion"])] = 1.0
     source: _flags.SourceFile = None
     channel: _flags.Channel = None
-    variable: _flags.Variable = None
 
 
 @notify_errors
@@ -92,7 +92,7 @@ def forward(
     beam = None
     if flags.source is not None:
         beam = read_shot(flags.source, channel=flags.channel).image
-    if is_field_grid(field):
+    if is_field_grid(split_address(field)[0]):
         with work_callbacks(quiet) as callbacks:
             traced = _trace(field, setup, beam, flags, chosen, callbacks)
         image, setup, rows = traced.image, traced.setup, fact_rows(traced.facts)
@@ -134,8 +134,9 @@ def _trace(
     view = settings.change("view", SizedView())
     shape: Any = (view.height, view.width) if source is None else source.shape
     particles = check_particles(setup)
+    file, iteration = split_address(path)
     return trace(
-        view.apply(read_field_grid(path, iteration=flags.variable)),
+        view.apply(read_field_grid(file, iteration=iteration)),
         particles,
         shape,
         options=settings.change("trace", TraceOptions()),
@@ -151,7 +152,7 @@ def _predict(
     from napari_shadowinv.physics.forward import synthetic_image
     from napari_shadowinv.physics.projection import default_deflector, predict_image
 
-    field = field_from(path, flags.variable)
+    field = field_from(path)
     stated = read_setup(flags.recorded_with)
     if stated is not None and field.setup is not None and stated != field.setup:
         raise InputError(
@@ -194,14 +195,13 @@ class Field:
     setup: Setup | None = None
 
 
-def field_from(path: Path, variable: str | None = None) -> Field:
+def field_from(path: Path) -> Field:
     """Read a displacement from a result, or from an array in px or px²."""
     from napari_shadowinv.io import read_dataset, read_shot
     from napari_shadowinv.io.arrays import read_npy
-    from napari_shadowinv.io.files import split_address
     from napari_shadowinv.io.hdf5_arrays import read_hdf5
 
-    path, variable = split_address(path, variable)
+    path, variable = split_address(path)
     kind = kind_of(path)
     if variable is not None and kind in ("hdf5", "pradformat", "shadowinv"):
         return Field(_displacement(path, read_hdf5(path, variable)))
@@ -223,8 +223,8 @@ def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
     names = json.loads(dataset.attrs.get("fields", "[]"))
     if len(names) > 1:
         raise InputError(
-            f"{path} has the fields {', '.join(names)}: choose one with --variable "
-            f"displacement_{names[0]}"
+            f"{path} has the fields {', '.join(names)}: choose one, such as "
+            f"{path.name}::displacement_{names[0]}"
         )
     if "displacement" not in dataset:
         raise _no_field(path, f"a {result.kind.noun}")

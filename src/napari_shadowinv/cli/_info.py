@@ -36,24 +36,24 @@ QT_BINDINGS = ("PyQt6", "PySide6", "PySide6_Essentials", "PyQt5", "PySide2")
 
 
 @as_file_errors
-def file_table(path: Path, variable: str | None = None) -> Table:
+def file_table(path: Path) -> Table:
     """Build a table of a file's kind and contents."""
-    return _summary.two_columns(str(path), _rows(path, variable))
+    return _summary.two_columns(str(path), _rows(path))
 
 
-def _rows(path: Path, variable: str | None) -> _summary.Rows:
+def _rows(path: Path) -> _summary.Rows:
     from napari_shadowinv.io import read
     from napari_shadowinv.io.field_grids import is_field_grid
     from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.frames import find_frames
     from napari_shadowinv.io.hdf5_arrays import list_sizes, read_hdf5
 
-    if variable is None and is_field_grid(path):
+    if is_field_grid(path):
         kind = "fields on a grid: trace particles with shadowinv forward"
         return [("kind", kind), *list_sizes(path)]
-    frames = find_frames(path, variable)
+    frames = find_frames(path)
     if len(frames) > 1:
-        return _frame_rows(read(path, variable=variable), frames[0].variable)
+        return _frame_rows(read(path), frames[0].variable)
     path, variable = frames[0].path, frames[0].variable
     form = format_of(path)
     if variable is not None and form.name in ("pradformat", "shadowinv"):

@@ -210,6 +210,7 @@ def flaw_of(converged: bool, verdict: str | None, codes: Collection[str]) -> str
 
 def result_and_figure(image: Path, out: Path | None, figure: Path | None) -> tuple[Path, Path]:
     """Choose the names of result and figure; the figure never replaces the image."""
+    image, _ = split_address(image)
     if not image.stem:
         raise InputError(f"{image} is a folder: expected an image; give the name of a file")
     result = Path(f"{image.stem}{RESULT.suffix}") if out is None else out

@@ -87,7 +87,7 @@ def invert(
         flags, settings_of(settings or (), INVERSION_SECTIONS, flags.by_key, FILE_KEYS)
     )
     outputs.protect_files_of(recipe)
-    shot = read_part(image, flags.channel, flags.variable)
+    shot = read_part(image, flags.channel)
     recipe = recipe.model_copy(update={"setup": setup_for(flags.setup, shot, recipe)})
     check_setup(result, recipe.setup)
     measured = recipe.source
@@ -150,7 +150,6 @@ def rerun(
 @notify_errors
 def info(
     file: Annotated[Path | None, _flags.argument(help="An image, a result or a store.")] = None,
-    variable: _flags.Variable = None,
     every: Annotated[bool, Option("--all", help=HELP["all"])] = False,
     verify: Annotated[bool, Option("--verify", help=HELP["verify"])] = False,
     system: Annotated[bool, Option("--system", help=HELP["system"])] = False,
@@ -160,8 +159,8 @@ def info(
     from napari_shadowinv.io import is_stack
 
     if system:
-        if file is not None or variable is not None:
-            raise InputError("--system describes the installation: it takes no file or variable")
+        if file is not None:
+            raise InputError("--system describes the installation: it takes no file")
         echo(_info.system_report())
         return
     if file is None:
@@ -177,7 +176,7 @@ def info(
         return
     if every or verify:
         raise InputError(f"{file} is not a stack of shots: --all and --verify describe a store")
-    say(_info.file_table(file, variable))
+    say(_info.file_table(file))
 
 
 @notify_errors

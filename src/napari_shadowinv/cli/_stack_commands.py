@@ -85,9 +85,7 @@ def _stack_inputs(flags: _flags.InversionFlags, settings: Settings, quiet: bool)
     Outputs(overwrite=False, quiet=quiet).warn_of_setups([(chosen.setup, None)])
     from napari_shadowinv.stack import read_pixels
 
-    # A reader is part of a store's identity: only a variable that is there names itself.
-    variable: dict[str, Any] = {} if flags.variable is None else {"variable": flags.variable}
-    reader = partial(read_pixels, channel=flags.channel, **variable)
+    reader = partial(read_pixels, channel=flags.channel)
     return {"recipe": chosen, "reader": reader, "quiet": quiet}
 
 

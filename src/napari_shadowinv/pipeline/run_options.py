@@ -68,9 +68,9 @@ class WatchOptions(_StoreOptions):
     pattern: str = Field(
         default="*",
         title="Names",
-        description="File name pattern of the shots, in quotes on the command line; without an "
-        "ending, images of the most frequent or first kind. Names that begin with a dot are "
-        "ignored.",
+        description="File name pattern of the shots, in quotes on the command line, such as "
+        "*.tif, or *.h5::/entry/data of an array in each; without an ending, images of the most "
+        "frequent or first kind. Names that begin with a dot are ignored.",
     )
     latest: bool = Field(
         default=False,

@@ -27,7 +27,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, split_address, text_of
-from napari_shadowinv.io.formats import format_of
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
@@ -205,7 +204,8 @@ def _describe_inputs(
     shots = common.image
     measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
     source = measured.file if common.source is None else common.source
-    source_reader = _reader_of_source(source, measured, reader)
+    named = measured.variable is not None
+    source_reader = partial(reader, variable=measured.variable) if named else reader
     lit = None
     if getattr(source, "ndim", None) == 2:
         source, lit = unpack_array(source, "source")
@@ -269,16 +269,6 @@ def _checked_beam(sources: Any, blank: AnyArray) -> AnyArray:
     return sources if getattr(sources, "ndim", None) == 2 else blank.cumsum(axis=0)
 
 
-def _reader_of_source(source: Any, measured: MeasuredSource, reader: Reader) -> Reader:
-    """The reader with the source's variable; a file without names has none of the shots' either."""
-    if measured.variable is not None:
-        return partial(reader, variable=measured.variable)
-    is_file = isinstance(source, (str, Path)) and os.path.isfile(source)
-    if is_file and getattr(reader, "func", reader) is read_pixels:
-        return reader if format_of(Path(source)).named_reader else partial(reader, variable=None)
-    return reader
-
-
 def _find_table(shots: Any) -> Path | Sequence[ShotRow] | None:
     """Return the table of the shots, or its rows; None if they are no table."""
     if isinstance(shots, Sequence) and shots and all(isinstance(row, ShotRow) for row in shots):
@@ -292,12 +282,13 @@ def _describe_table(
     table: Path | Sequence[ShotRow], recipe: Recipe, reader: Reader, shape: tuple[int, int] | None
 ) -> tuple[Shots, Setup | None]:
     """Return the shots of a table, and the setup of the first image."""
-    if getattr(reader, "func", reader) is not read_pixels:
-        raise InputError(
-            f"received a reader for the table {table}, which names files: leave the reader out"
-        )
     part = getattr(reader, "keywords", {})
-    items = table_shots(table, recipe, part.get("channel"), part.get("variable"))
+    if getattr(reader, "func", reader) is not read_pixels or "variable" in part:
+        raise InputError(
+            f"received a reader for the table {table}, which names files and their arrays: leave "
+            "the reader out"
+        )
+    items = table_shots(table, recipe, part.get("channel"))
     if recipe.fit is not None:
         image = first_image(items)
         return Shots(items, image.shape), image.setup

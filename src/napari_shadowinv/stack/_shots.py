@@ -169,7 +169,6 @@ class RowsExposure(Exposure):
 
     recipe: Recipe
     channel: str | None = None
-    variable: str | None = None
     setup: Setup | None = None  # of the image to invert as recorded
 
     def __dask_tokenize__(self) -> tuple[Any, ...]:
@@ -178,13 +177,11 @@ class RowsExposure(Exposure):
         stamps = [stamp(path) for path in self._files().values() if path.exists()]
         setup = None if self.setup is None else self.setup.model_dump_json()
         content = json.dumps([self._summaries(), files, setup, stamps])
-        return content, str(self.channel), str(self.variable)
+        return content, str(self.channel)
 
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         """Return the images, and the files of their rows."""
-        images = read_row_images(
-            self.rows, self.recipe, channel=self.channel, variable=self.variable
-        )
+        images = read_row_images(self.rows, self.recipe, channel=self.channel)
         files = {
             name: {**stamp(path), "sha256": sha256(path)} for name, path in self._files().items()
         }
@@ -200,7 +197,7 @@ class RowsExposure(Exposure):
         return (replace(image, setup=self.setup),), metadata
 
     def shape(self) -> tuple[int, ...]:
-        return read_part(self.rows[0].file, self.channel, self.variable).shape
+        return read_part(self.rows[0].file, self.channel).shape
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare the rows, and existing files by size and time or checksum."""
@@ -552,22 +549,22 @@ def find_source(source: Any, *, reader: Reader = read_pixels) -> AnyArray | Shot
 
 
 def table_shots(
-    table: Path | Sequence[ShotRow], recipe: Recipe, channel: str | None, variable: str | None
+    table: Path | Sequence[ShotRow], recipe: Recipe, channel: str | None
 ) -> list[Exposure]:
     """Return the shots of a table, or of its rows: to fit if the recipe says so, or to invert."""
     if recipe.fit is not None:
         if not isinstance(table, Path):
             raise InputError("received rows of a table to fit, expected its file: write it first")
         return [
-            RowsExposure(name, recipe, channel, variable, rows=_with_absolute_paths(rows))
+            RowsExposure(name, recipe, channel, rows=_with_absolute_paths(rows))
             for name, rows in rows_by_shot(table, {}).items()
         ]
     rows = rows_to_invert(table)
     shots = list[Exposure]()
     files = [FileFrame(row.file, name_of(row.file)) for row in rows]
     for name, row in zip(_distinct_names(files), _with_absolute_paths(rows), strict=True):
-        setup = row_setup(row, _read_geometry(row, channel, variable), recipe)
-        shots.append(RowsExposure(name, recipe, channel, variable, setup, rows=(row,)))
+        setup = row_setup(row, _read_geometry(row, channel), recipe)
+        shots.append(RowsExposure(name, recipe, channel, setup, rows=(row,)))
     return shots
 
 
@@ -576,11 +573,11 @@ def _with_absolute_paths(rows: Sequence[ShotRow]) -> tuple[ShotRow, ...]:
     return tuple(map_paths(row, Path.absolute) for row in rows)
 
 
-def _read_geometry(row: ShotRow, channel: str | None, variable: str | None) -> Shot:
+def _read_geometry(row: ShotRow, channel: str | None) -> Shot:
     """Read an image if its file may contain a geometry; return an empty one otherwise."""
     try:
         if format_of(row.file) in (PRADFORMAT, HDF5, TEXT):
-            return read_part(row.file, channel, variable)
+            return read_part(row.file, channel)
     except (OSError, ValueError):
         pass  # its shot fails, by name
     return Shot(np.zeros((1, 1)))

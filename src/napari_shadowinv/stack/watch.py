@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -336,14 +337,17 @@ def watch_stack(
     """
     watch = as_model(WatchOptions, watch, "watch")
     common = folder if isinstance(folder, Shot) else Shot(folder)
-    place = checked_folder(common.image, watch.pattern)
+    pattern, _, variable = watch.pattern.partition("::")
+    if variable:
+        reader = partial(reader, variable=variable)
+    place = checked_folder(common.image, pattern)
     path = check_store_path(out)
     variables = stored_variables(watch.variables, recipe)
 
     def describe(arrived: Shots) -> Stack:
         return describe_stack(replace(common, image=arrived), recipe, reader, variables)
 
-    arrivals = Arrivals(place, watch.pattern, settle=watch.settle, existing=not watch.skip_existing)
+    arrivals = Arrivals(place, pattern, settle=watch.settle, existing=not watch.skip_existing)
     on_progress = on_progress or (lambda _: None)
     with ExitStack() as opened:
         if watch.status_file is not None:
