@@ -93,9 +93,9 @@ def test_particles_are_traced_through_a_field_on_a_grid(folder):
 
 
 def test_the_object_of_a_file_is_a_displacement(folder):
-    np.save(folder / "field.npy", gaussian_blob((64, 64), 15, 6).displacement)
+    np.save(folder / "c:field.npy", gaussian_blob((64, 64), 15, 6).displacement)
     answer = shadowinv(
-        *("plan", "field.npy", "--set=plan.draws=2"),
+        *("plan", "c:field.npy", "--set=plan.draws=2"),
         *("--set=instrument.beam_rms=0", "--counts", 10_000, "--quiet"),
     )
     assert answer.exit_code == 0, answer.output
@@ -113,6 +113,7 @@ def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):
     ("arguments", "message"),
     [
         (("plan", "torroid"), "did you mean 'toroid'"),
+        (("plan", "torroid:peak=1.5"), "did you mean 'toroid'"),
         (("plan", "toroid"), "particles"),
         (("plan", "blob", "--energies", "3,15"), "--energies: it needs --setup"),
         (("plan", "toroid", "--setup", "setup.toml", "--energies", "3;15"), "separated by commas"),
