@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from helpers import public_data
-from helpers.public_data import SHARED_DATA, public_file
+from helpers.public_data import SHARED_DATA
 from napari_shadowinv.io import public_images
 from napari_shadowinv.io.public_images import PUBLIC_FILES, fetch_burner
 
@@ -80,37 +80,6 @@ def test_one_sentence_says_what_is_missing(
     assert "\n" not in str(error.value)
     assert Path(name).name in str(error.value)
     assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
-
-
-@pytest.fixture
-def only_downloads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty cache, and no data next to the project."""
-    cache = tmp_path / "cache"
-    monkeypatch.setattr(public_data, "SHARED_DATA", tmp_path / "absent")
-    monkeypatch.setattr(public_data, "_failures", [])
-    monkeypatch.setattr(public_data, "CACHE", cache)
-    return cache
-
-
-def test_tests_get_what_is_published(published: Path, only_downloads: Path) -> None:
-    path = public_file(NAMES[0])
-    assert path == only_downloads / NAMES[0]
-    assert path.read_bytes() == CONTENT[NAMES[0]]
-
-
-def test_tests_skip_with_the_sentence(published: Path, only_downloads: Path) -> None:
-    public_file(NAMES[1])
-    (published / NAMES[0]).unlink()
-    with pytest.raises(
-        pytest.skip.Exception, match=rf"{Path(NAMES[0]).name} could not be downloaded"
-    ):
-        public_file(NAMES[0])
-    # No other download is tried, but files in the cache are used.
-    with pytest.raises(
-        pytest.skip.Exception, match=rf"{Path(NAMES[0]).name} could not be downloaded"
-    ):
-        public_file(NAMES[2])
-    assert public_file(NAMES[1]).read_bytes() == CONTENT[NAMES[1]]
 
 
 def test_every_public_file_can_be_used() -> None:

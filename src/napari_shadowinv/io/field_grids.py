@@ -29,7 +29,6 @@ from napari_shadowinv.io.hdf5 import (
 )
 from napari_shadowinv.physics.field_grid import AXES, FieldGrid, field_grid
 
-_HDF5_MARK = b"\x89HDF\r\n\x1a\n"
 _COMPONENT = re.compile(r"[BE]_?[xyz]", re.IGNORECASE)
 _EXPECTED = "an openPMD file or a NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez"
 _SAME_PLACE = 1e-6  # of a cell
@@ -38,11 +37,10 @@ _SAME_PLACE = 1e-6  # of a cell
 @as_file_errors
 def is_field_grid(path: Path) -> bool:
     """Return whether a file holds fields on a 3-D grid; false for a file that cannot be read."""
-    if not path.is_file():
+    import h5py
+
+    if not path.is_file() or not h5py.is_hdf5(path):
         return False
-    with path.open("rb") as file:
-        if file.read(len(_HDF5_MARK)) != _HDF5_MARK:
-            return False
     with open_hdf5(path) as content:
         return "openPMD" in content.attrs or any(
             _COMPONENT.fullmatch(name) and getattr(item, "ndim", 0) >= len(AXES)
@@ -76,10 +74,11 @@ def read_field_grid(path: Path, *, iteration: str | int | None = None) -> FieldG
     InputError
         If it holds no Cartesian 3-D field, several iterations, or no units.
     """
+    import h5py
+
     check_regular(path, _EXPECTED)
-    with path.open("rb") as file:
-        if file.read(len(_HDF5_MARK)) != _HDF5_MARK:
-            raise FileFormatError(f"{path} is no HDF5 file: expected {_EXPECTED}")
+    if not h5py.is_hdf5(path):
+        raise FileFormatError(f"{path} is no HDF5 file: expected {_EXPECTED}")
     with open_hdf5(path) as content:
         if "openPMD" in content.attrs:
             return _read_openpmd(path, content, iteration)
