@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
@@ -122,6 +123,14 @@ def test_moved_and_linked_files_count_and_other_files_do_not(folder, out, tmp_pa
         (folder / "shot_4.npy.part").rename(folder / "shot_4.npy")
         watch.ended(1)
     assert list(watch.result.name.values) == [f"shot_{i}.npy" for i in (0, 1, 4)]
+
+
+def test_pattern_may_name_an_array_in_each_file(folder, out):
+    for index in (0, 1):
+        with h5py.File(folder / f"shot_{index}.h5", "w") as file:
+            file["entry/data"], file["entry/dark"] = IMAGES[index], 0 * IMAGES[index]
+    stored = watched_once(folder, out, pattern="*.h5::entry/data")
+    assert list(stored.status.values) == [DONE, DONE]
 
 
 def test_a_store_inside_the_folder_does_not_set_it_off(folder):
