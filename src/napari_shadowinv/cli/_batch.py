@@ -279,10 +279,10 @@ def _troubles(store: StackStore) -> Iterator[tuple[int, str, str, str]]:
 
 def _trouble_rows(store: StackStore) -> Rows:
     """Count the verdicts, and list the shots that failed, are damaged or doubtful, by reason."""
-    found: dict[tuple[str, str], tuple[str, dict[str, None]]] = {}
+    troubles: dict[tuple[str, str], tuple[str, dict[str, None]]] = {}
     for index, label, code, text in _troubles(store):
         if code != "verdict":  # it is counted below
-            found.setdefault((label, code), (text, {}))[1][store.names[index]] = None
+            troubles.setdefault((label, code), (text, {}))[1][store.names[index]] = None
     verdicts: dict[str, list[str]] = {Verdict.DETERMINED.value: []}
     for name, report in zip(store.names, store.reports(), strict=True):
         if "verdict" in report:
@@ -295,7 +295,7 @@ def _trouble_rows(store: StackStore) -> Rows:
     for label in (STATUS_NAMES[FAILED], STATUS_NAMES[DAMAGED], "warning"):
         listed = [
             f"{_list_text([*names])}: {text}"
-            for (each, _), (text, names) in found.items()
+            for (each, _), (text, names) in troubles.items()
             if each == label
         ]
         rows += [(label, text) for text in listed[:_MAX_LISTED]]

@@ -86,19 +86,19 @@ def fit(
     shots = (replace(shots[0], fiducials=flags.fiducials), *shots[1:])
     check_setup(result, shots[0].setup, recipe.fit.fields if recipe.fit else None)
     outputs.warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
-    wanted = _wanted_fields(recipe, stated, shots[0].setup) if flags.compare else set()
+    fields = _wanted_fields(recipe, stated, shots[0].setup) if flags.compare else set()
     names, left_out = [str(row.file) for row in rows], None
     with work_callbacks(quiet) as callbacks:
         if flags.compare:
             fits = run_comparison(recipe, shots, **callbacks)
         else:
             fits = (run_fit(recipe, shots, **callbacks),)
-        found = next((each for each in fits if _fields_of(each) == wanted), fits[0])
+        written = next((each for each in fits if _fields_of(each) == fields), fits[0])
         if flags.leave_one_out:
             left_out = run_leave_one_out(
-                recipe, _named(shots, rows), [*_fields_of(found)], **callbacks
+                recipe, _named(shots, rows), [*_fields_of(written)], **callbacks
             )
-    outputs.write_result(found, names, result, figure, left_out)
+    outputs.write_result(written, names, result, figure, left_out)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
@@ -107,8 +107,8 @@ def fit(
         say(_comparison_table(fits))
     if left_out is not None and not quiet:
         say(two_columns("Left out", fact_rows(left_out.facts)))
-    outputs.show("Fit", result_rows(found, outputs.printed, names=names))
-    outputs.exit_unless_sound(found, result, left_out)
+    outputs.show("Fit", result_rows(written, outputs.printed, names=names))
+    outputs.exit_unless_sound(written, result, left_out)
 
 
 def _fields_of(fit: Fit) -> set[str]:
@@ -123,14 +123,14 @@ def _wanted_fields(recipe: Recipe, stated: Settings, setup: Setup | None) -> set
     if written is None or recipe.fit is None:
         return set()
     compared = compared_fields(None if setup is None else [setup])
-    wanted = set(recipe.fit.fields or ())
-    if wanted not in map(set, compared):
+    fields = set(recipe.fit.fields or ())
+    if fields not in map(set, compared):
         choices = "; ".join(",".join(choice) for choice in compared)
         raise InputError(
             f"received fit.fields={written} and --compare, which compares {choices}: write one of "
             "these, or leave out fit.fields to write the likeliest"
         )
-    return wanted
+    return fields
 
 
 def _comparison_table(fits: Sequence[Fit]) -> Table:
@@ -176,8 +176,8 @@ def _named(shots: Sequence[Shot], rows: Sequence[ShotRow]) -> list[Shot]:
     """
     stems = [row.file.stem for row in rows]
     names = stems if len({*stems}) == len(stems) else [str(row.file) for row in rows]
-    named = []
+    renamed = []
     for name, shot, row in zip(names, shots, rows, strict=True):
         beam = "" if shot.setup else row.beam_text
-        named.append(replace(shot, name=f"{name} ({beam})" if beam else name))
-    return named
+        renamed.append(replace(shot, name=f"{name} ({beam})" if beam else name))
+    return renamed

@@ -89,15 +89,15 @@ class Outputs:
     def protect(self, inputs: Iterable[Path | None]) -> None:
         """Refuse to overwrite an input, even with --overwrite, or to write a file twice."""
         sources = {resolved_path(split_address(file)[0]) for file in inputs if file is not None}
-        seen: set[Path] = set()
+        targets: set[Path] = set()
         for path in self.files:
             file = resolved_path(path)
             if file in sources:
                 text = f"{path} is both read and written: choose another name for the output"
                 raise InputError(text)
-            if file in seen:
+            if file in targets:
                 raise InputError(f"{path} would be written twice: choose two names")
-            seen.add(file)
+            targets.add(file)
 
     def protect_files_of(self, recipe: Recipe) -> None:
         """Refuse to overwrite a file that a recipe names."""

@@ -127,9 +127,9 @@ def setup_text(
         return f"{text}, field of view {field_of_view_text(setup, (shape[0], shape[1]))}"
     geometry = {} if shot is None else shot.metadata.get("geometry", {})
     if geometry:
-        known = {name.removeprefix("detector_") for name in geometry}
+        stated = {name.removeprefix("detector_") for name in geometry}
         needed = ("energy", "source_object_distance", "object_image_distance", "pixel_size")
-        missing = [name.replace("_", " ") for name in needed if name not in known]
+        missing = [name.replace("_", " ") for name in needed if name not in stated]
         return (
             f"none: the file gives the geometry but not the {', nor the '.join(missing)}; give it "
             "with --setup"

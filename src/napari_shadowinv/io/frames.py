@@ -81,8 +81,8 @@ def matching_files(pattern: str | Path) -> list[Path]:
     if pattern.name == "**":
         names = glob.glob(os.path.join(within, "**"), recursive=True)
     else:
-        found = glob.glob(os.path.join(within, every), recursive=True)
-        names = [name for name in found if name_matches(os.path.basename(name), pattern.name)]
+        paths = glob.glob(os.path.join(within, every), recursive=True)
+        names = [name for name in paths if name_matches(os.path.basename(name), pattern.name)]
     return in_counting_order(map(Path, names))
 
 

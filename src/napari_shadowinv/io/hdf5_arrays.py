@@ -201,7 +201,7 @@ def _objects(file: Any, most_visits: int = 10_000) -> Iterator[_HDF5Object]:
     """Yield the arrays of a file once each, from the top down; others' files are not followed."""
     import h5py
 
-    groups, known, visited = deque([("", file)]), set(), 0
+    groups, addresses, visited = deque([("", file)]), set(), 0
     while groups:
         prefix, group = groups.popleft()
         for name in group:
@@ -218,9 +218,9 @@ def _objects(file: Any, most_visits: int = 10_000) -> Iterator[_HDF5Object]:
                 continue
             item = group[name]
             address = h5py.h5o.get_info(item.id).addr
-            if address in known:
+            if address in addresses:
                 continue
-            known.add(address)
+            addresses.add(address)
             if isinstance(item, h5py.Group):
                 groups.append((f"{prefix}{name}/", item))
             elif isinstance(item, h5py.Dataset) and item.shape:

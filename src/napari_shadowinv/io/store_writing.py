@@ -159,8 +159,8 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
     new, old = hidden_name(path, ".new"), hidden_name(path, ".old")
-    for left in (new, old):  # by a killed process
-        shutil.rmtree(left, ignore_errors=True)
+    for leftover in (new, old):  # by a killed process
+        shutil.rmtree(leftover, ignore_errors=True)
     try:
         with _as_store_errors(path):
             # Zarr writes in a thread of its own, which would go on behind our back.

@@ -204,8 +204,8 @@ def _describe_inputs(
     shots = common.image
     measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
     source = measured.file if common.source is None else common.source
-    named = measured.variable is not None
-    source_reader = partial(reader, variable=measured.variable) if named else reader
+    has_name = measured.variable is not None
+    source_reader = partial(reader, variable=measured.variable) if has_name else reader
     lit = None
     if getattr(source, "ndim", None) == 2:
         source, lit = unpack_array(source, "source")

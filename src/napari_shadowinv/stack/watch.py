@@ -203,13 +203,13 @@ class Watch:
         """Describe the stack by its first shots, if one of them can be read."""
         if not waiting or waiting == self._unreadable:
             return False
-        known: Iterable[str] = ()
+        earlier: Iterable[str] = ()
         if self.filled is not None:
             # Earlier shots are a better reference for the size of the images.
             done = self.filled.names_of(DONE)
-            known = (name for name in done if (self._arrivals.folder / name).exists())
+            earlier = (name for name in done if (self._arrivals.folder / name).exists())
         try:
-            self._stack = self._stack_of([*islice(known, most), *waiting[:most], *self._skipped])
+            self._stack = self._stack_of([*islice(earlier, most), *waiting[:most], *self._skipped])
         except NoShotError as error:
             self._unreadable = list(waiting)
             self.report(note=str(error))
