@@ -8,7 +8,6 @@ The names follow from the file's, so who writes it next finds what a killed proc
 
 from __future__ import annotations
 
-import hashlib
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -21,14 +20,12 @@ from napari_shadowinv.errors import FileFormatError
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-MAX_NAME_BYTES = 255  # of almost all file systems
+MAX_NAME_BYTES = 230  # almost all file systems take 255, with what hidden names add
 
 
 def hidden_name(path: Path, ending: str) -> Path:
-    """Return the hidden name of a path with another ending, however long the path's name is."""
-    name = os.fsencode(path.name)
-    is_long = len(name) + len(os.fsencode(ending)) >= MAX_NAME_BYTES
-    return path.with_name(f".{hashlib.sha256(name).hexdigest() if is_long else path.name}{ending}")
+    """Return the hidden name of a path with another ending."""
+    return path.with_name(f".{path.name}{ending}")
 
 
 @contextmanager
