@@ -279,7 +279,8 @@ class Inversion(Summarised):
     def headline(self) -> Headline:
         """The peak of the main field, its limit, and the next step."""
         errors, report = self.field_errors, self.report
-        peaks = [self.main_field.short_peak_text(errors and errors.of_peak)]
+        error = None if errors is None else errors.of_peak
+        peaks = [self.main_field.short_peak_text(error)]
         return Headline.of(peaks, self.assessment, report.cautions, converged=report.converged)
 
     @property
@@ -307,7 +308,7 @@ class Inversion(Summarised):
                 self.displacement,
                 self.setup,
                 mask=self.lit,
-                error=errors and errors.of_peak,
+                error=None if errors is None else errors.of_peak,
             ),
             *(error_fact(name, text) for name, text in error_rows.items()),
             Fact(
