@@ -183,10 +183,10 @@ def test_the_comparison_of_pairs_is_that_of_all_their_samples():
     linear = rng.normal(size=(9, 3, 4))
     solved = 1.1 * linear + 0.2 + 0.1 * rng.normal(size=(9, 3, 4))
     pairs, length = pairs_of(linear, solved), np.linalg.norm
-    found = pairs.linearity
-    assert found.nonlinearity == pytest.approx(length(linear - solved) / length(solved))
-    assert found.spread_ratio == pytest.approx(length(solved) / length(linear))
+    linearity = pairs.linearity
+    assert linearity.nonlinearity == pytest.approx(length(linear - solved) / length(solved))
+    assert linearity.spread_ratio == pytest.approx(length(solved) / length(linear))
     spread = length(solved - solved.mean(axis=0)) / np.sqrt(8)
-    assert found.mean_shift == pytest.approx(length((linear - solved).mean(axis=0)) / spread)
+    assert linearity.mean_shift == pytest.approx(length((linear - solved).mean(axis=0)) / spread)
     assert pairs.part(np.s_[1:]).count == 9
     np.testing.assert_array_equal(pairs.part(np.s_[1:]).shift, pairs.shift[1:])

@@ -169,7 +169,7 @@ def test_dataset_of_something_else_is_refused() -> None:
     ("entry", "value", "reason"),
     [
         ("levels", None, r"\(levels: Field required\)"),
-        ("warnings", None, r"\('warnings' is missing\)"),
+        ("cautions", None, r"\('cautions' is missing\)"),
         ("iterations", "many", r"\(iterations: Input should be a valid integer"),
     ],
 )

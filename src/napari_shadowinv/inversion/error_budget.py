@@ -312,8 +312,8 @@ class ErrorBudget:
                 (unit, size, part.rms / self.rms, part.at_peak / self.peak)
                 for unit, size, part in assumed.values()
             ]
-            known = rest.rms / self.rms, rest.at_peak / self.peak
-            condition = Condition.within(share, known, sizes, subject=subject)
+            measured_shares = rest.rms / self.rms, rest.at_peak / self.peak
+            condition = Condition.within(share, measured_shares, sizes, subject=subject)
             if condition:
                 at_peak = self.total.at_peak / self.peak
                 return condition._replace(peak_if_off=at_peak, field_if_off=self.share)
@@ -383,10 +383,10 @@ class ErrorBudget:
         if not is_beam and name not in self.sizes:
             return f"{factor:.1g} times the {title} error", factor
         size = self.beam_variation if is_beam else self.sizes[name]
-        known = {each.key: each for each in EFFECTS}.get(title)
+        effect = {each.key: each for each in EFFECTS}.get(title)
         unit, scale, power = "%", 100.0, 1.0
-        if known is not None:
-            unit, scale, power = known.unit, known.factor, 2.0 if known.is_even else 1.0
+        if effect is not None:
+            unit, scale, power = effect.unit, effect.factor, 2.0 if effect.is_even else 1.0
         rounded = round_down(scale * size * factor ** (1 / power))
         text = f"the {title} known to {to_figures(rounded)} {unit}".rstrip()
         return text, (rounded / scale / size) ** power

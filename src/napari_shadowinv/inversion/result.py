@@ -256,8 +256,8 @@ class Inversion(Summarised):
     @property
     def main_field(self) -> ShownField:
         """The main field of the setup, where rays start."""
-        (shown,) = shown_fields([self.displacement], self.setup, mask=self.lit)
-        return shown
+        (field_in_units,) = shown_fields([self.displacement], self.setup, mask=self.lit)
+        return field_in_units
 
     @property
     def field_errors(self) -> ErrorBudget | None:
@@ -485,11 +485,11 @@ class Inversion(Summarised):
         fields = np.stack([self.potential, *self.displacement])
         by_edge = resampling.changes_by_edge(errors, fields, self.mask)
         sampler = resampling.Sampler.of(images, int(n), fields, by_edge, quantities)
-        drawn = sampler.draw(method, described, Reporter(on_progress, should_stop))
-        std, causes = drawn.displacement_std, sampler.causes
-        errors = replace(errors, per_pixel=std, causes=causes, samples=drawn)
+        error_samples = sampler.draw(method, described, Reporter(on_progress, should_stop))
+        std, causes = error_samples.displacement_std, sampler.causes
+        errors = replace(errors, per_pixel=std, causes=causes, samples=error_samples)
         earlier = (each for each in self.report.cautions if each.code != "samples")
-        report = replace(self.report, cautions=(*earlier, *sampler.cautions(drawn)))
+        report = replace(self.report, cautions=(*earlier, *sampler.cautions(error_samples)))
         return replace(self, errors=errors, report=report)
 
     def with_cautions(self, cautions: Iterable[Caution]) -> Inversion:
