@@ -304,7 +304,6 @@ class FitTask(Task):
             "strengths": result.strengths.tolist(),
             "objective": result.report.objective,
             "stages": result.report.seconds,
-            "warnings": [dataclasses.asdict(caution) for caution in result.cautions],
         }
         provenance = result.provenance
         if provenance is not None and any(image.file for image in provenance.images):
@@ -411,8 +410,8 @@ def run_shot(
         # No error of a reader or a solver may stop the other shots.
         failure = failure_text(error)
         entries = {"reason": failure}
-    cautions = [dataclasses.asdict(caution) for caution in origin.get("warnings", ())]
-    warnings = [*entries.get("warnings", ()), *cautions]
+    cautions = () if result is None else result.cautions
+    warnings = list(map(dataclasses.asdict, (*cautions, *origin.get("warnings", ()))))
     seconds = time.perf_counter() - began
     report = {**entries, "seconds": seconds, **origin, "warnings": warnings}
     if context.results is not None:
