@@ -175,26 +175,13 @@ def hdf5_in_memory(path: Path, *, seal: bool = False) -> Iterator[BytesIO]:
     path.write_bytes(content.getvalue())
 
 
-def check_hdf5_seal(path: Path, *, block_bytes: int = 1 << 20) -> None:
+def check_hdf5_seal(path: Path) -> None:
     """Refuse a file that has changed since `hdf5_in_memory` sealed it; others pass.
 
     A program that changes the file by the HDF5 library removes the seal.
     """
-    length = len(_SEAL) + 2 * hashlib.sha256().digest_size
-    remaining = path.stat().st_size - length
-    if remaining <= 0:
-        return
-    with path.open("rb") as file:
-        file.seek(remaining)
-        end = file.read(length)
-        if not end.startswith(_SEAL):
-            return
-        file.seek(0)
-        checksum = hashlib.sha256()
-        while remaining > 0 and (block := file.read(min(block_bytes, remaining))):
-            checksum.update(block)
-            remaining -= len(block)
-    if checksum.hexdigest().encode() != end.removeprefix(_SEAL):
+    content, seal, checksum = path.read_bytes().rpartition(_SEAL)
+    if seal and hashlib.sha256(content).hexdigest().encode() != checksum:
         raise FileFormatError(
             f"{path} is damaged: its content does not match its checksum; copy it again"
         )
