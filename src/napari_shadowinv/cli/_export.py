@@ -116,11 +116,11 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
         for name, values in statistics.data_vars.items()
         if str(name).endswith("_peak")
     }
-    headings = {column.entry: column.heading for column in content.columns} | {"reason": "reason"}
+    headings = {column.key: column.heading for column in content.columns} | {"reason": "reason"}
     statuses, reports, count = content.statuses(), content.reports(), len(content.names)
     rows = [
         {"shot": index, "name": content.names[index], "status": STATUS_NAMES[statuses[index]]}
-        | {headings[entry]: reports[index].get(entry, "") for entry in headings}
+        | {heading: reports[index].get(key, "") for key, heading in headings.items()}
         | {heading: f"{values[index]:.9g}" for heading, values in peaks.items()}
         for index in (range(count) if shots is None else parse_shots(shots, count))
     ]

@@ -43,16 +43,9 @@ class ShotColumn:
     value: Callable[[Any], Any] | None = None
     format: str = ""  # specification in tables for people, which omit columns without one
     width: int = 0  # least number of characters of a table's column
-    entry: str = ""  # name of its entry in a shot's report, if it is not the key
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "title", self.title or self.key.replace("_", " "))
-        object.__setattr__(self, "entry", self.entry or self.key)
-
-    @property
-    def fill(self) -> Any:
-        """Value of a shot that has none yet."""
-        return {str: "", float: math.nan}.get(self.kind, 0)
 
     @property
     def labels(self) -> dict[str, str]:
@@ -65,13 +58,14 @@ class ShotColumn:
         return self.key if self.unit == "1" else f"{self.key} ({display_unit(self.unit)})"
 
     def values(self, reports: Iterable[Mapping[str, Any]]) -> AnyArray:
-        """Return the values from the reports of shots, or the fill value."""
-        values = [report.get(self.entry, self.fill) for report in reports]
+        """Return the values from the reports of shots; NaN, 0 or no text without one."""
+        fill: Any = {str: "", float: math.nan}.get(self.kind, 0)
+        values = [report.get(self.key, fill) for report in reports]
         return np.array(values, object if self.kind is str else self.kind)
 
     def text(self, report: Mapping[str, Any]) -> str:
         """Return the value from a shot's report as text, empty without a value."""
-        return format(report[self.entry], self.format) if self.entry in report else ""
+        return format(report[self.key], self.format) if self.key in report else ""
 
 
 _of_inversions = partial(ShotColumn, stores=(INVERSIONS, ROWS))
