@@ -294,6 +294,7 @@ class ExperimentPlan(Summarised):
         return tuple(self._facts())
 
     def _facts(self) -> Iterator[Fact]:
+        yield from self._gain_facts()
         level = Level.SOUND if self.is_determined else Level.DOUBTFUL
         counts = ", ".join(f"{name} {n}" for name, n in self.verdicts.items())
         yield Fact("verdicts", "Verdicts", f"of {len(self.shots)} shots: {counts}", level)
@@ -321,7 +322,6 @@ class ExperimentPlan(Summarised):
                 if share >= least
             )
             yield Fact("limits", "Limited by", ranking)
-        yield from self._gain_facts()
         yield from self._caveat_facts()
         yield time_fact(self.seconds)
 
