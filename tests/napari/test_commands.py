@@ -160,7 +160,7 @@ def test_a_crop_keeps_place_setup_source_and_mask(
     layer = placed_shot(viewer, shot, proton_setup)
     rectangle = outline(viewer, layer, 5, 14)
     if selected == "rectangle":
-        rectangle.name = "shot crop"  # drawn for it, whatever lies above
+        rectangle.name = "crop – shot"  # drawn for it, whatever lies above
         viewer.add_image(np.ones((50, 50)), name="other")
     ((data, keywords, _),) = commands.crop(
         {"image": layer, "rectangle": rectangle}[selected], viewer

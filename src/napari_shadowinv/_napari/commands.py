@@ -16,7 +16,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
 from napari_shadowinv._napari.events import without_proxy
-from napari_shadowinv._napari.layer_metadata import Frame, frame_of, main_layers
+from napari_shadowinv._napari.layer_metadata import Frame, frame_of, layer_name, main_layers
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.shots import shot_layer, shot_of_layer
@@ -137,6 +137,7 @@ def crop(
     """Cut the selected image to the rectangle of the topmost shapes, or begin to draw one."""
     from napari.utils.notifications import show_info
 
+    from napari_shadowinv._napari.jobs import name_of_result
     from napari_shadowinv._napari.widgets._layers import crop_of, image_of, new_shapes
 
     layer, viewer = without_proxy(layer), without_proxy(viewer)
@@ -144,7 +145,9 @@ def crop(
     shapes = [each for each in shown if _has_outline(each)]
     if layer in shapes:
         shapes, images = [layer], [each for each in shown if _is_image(each)]
-        drawn_for = [each for each in images if layer.name == f"{each.name} crop"]
+        drawn_for = [
+            each for each in images if layer.name == layer_name("crop", name_of_result(each))
+        ]
         layer = next(reversed(drawn_for or images), None)
     selection = _select_image(layer, viewer, about.may_be_source)
     image_of(layer)

@@ -106,7 +106,7 @@ def test_the_spectrum_follows_the_region(evaluated: Any, pack_doses: Any, qtbot:
     tool = evaluated
     tool._draw_region()
     scale = tool.packs.layer.scale[1:]
-    assert tool.regions.layer.name.endswith("region")
+    assert tool.regions.layer.name.startswith("region – trio")
 
     def mean(rows: slice, columns: slice) -> list[float]:
         used = pack_doses.usable[:, rows, columns]

@@ -58,7 +58,7 @@ def test_the_selected_image_is_plotted_along_a_line(
     analyse = docked(window, Analyse)
     assert analyse.tabs.currentIndex() == 0
     assert analyse.checked() == [image]
-    assert analyse.lines.layer.name == "shot profile"
+    assert analyse.lines.layer.name == "profile – shot"
     assert analyse.lines.layer.mode == "add_line"
 
 

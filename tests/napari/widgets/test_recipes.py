@@ -371,7 +371,7 @@ def test_the_window_does_what_the_command_saves(
     reloaded = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
     tool = opened()
     tool.recipes.load(tmp_path / "how.toml")
-    assert tool.crop.layer.name == "shot crop"
+    assert tool.crop.layer.name == "crop – shot"
     assert tool.steps.steps() == (Bin(factor=2), LowPassFilter(width=1.5))
     assert tool.setup.setup().pixel_size == 2e-6
     tool.request()

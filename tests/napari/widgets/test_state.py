@@ -364,7 +364,7 @@ def test_both_masks_can_be_chosen(
     tool.source.set_kind("polynomial")
     assert not tool.source_masks.isHidden()
     tool.source_masks.paint()
-    assert tool.source_masks.layer.name == "shot source mask"
+    assert tool.source_masks.layer.name == "source mask – shot"
     assert role_of(tool.source_masks.layer) == "mask"
     tool.source_masks.layer.data = is_object.astype(int)
     tool.masks.paint()
@@ -457,7 +457,7 @@ def test_a_result_says_where_everything_came_from(
     rows = texts_of(tool.report)
     assert rows["Image"] == "measured"
     assert rows["Source"].startswith("estimate: fitted polynomial")
-    assert rows["Source mask"] == "layer 'measured source mask', excludes 17 % of the pixels"
+    assert rows["Source mask"] == "layer 'source mask – measured', excludes 17 % of the pixels"
     assert "Mask" not in rows
     assert rows["Setup"] == "particles (protons, …), came with experiment.h5"
     field = next(layer for layer in viewer.layers if role_of(layer) == "field")

@@ -14,6 +14,7 @@ from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.form import SteadyComboBox, labelled
+from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.placement import labels_on, mapped, matrix_between
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._system.arrays import complete_block_means, join_masks
@@ -157,7 +158,7 @@ def _corners_in_pixels(layer: Any, image: Any) -> list[FloatArray]:
 
 
 def new_mask(viewer: Any, image: Any, title: str, painted: BoolArray | None = None) -> Any:
-    """Add labels of an image's or stack's size, painted or empty; their name ends with `title`."""
+    """Add labels of the size of an image or stack, painted or empty, with a title."""
     if painted is not None:
         labels = _add_layer(viewer, image, "labels", painted.astype(np.uint8), title)
     else:
@@ -179,7 +180,7 @@ def new_crop(viewer: Any, image: Any, region: tuple[slice, slice]) -> Any:
 
 
 def new_shapes(viewer: Any, image: Any, title: str, mode: str) -> Any:
-    """Add empty shapes in a mode such as ``"add_rectangle"``; their name ends with `title`."""
+    """Add empty shapes with a title, in a mode such as ``"add_rectangle"``."""
     shapes = _add_layer(viewer, image, "shapes", None, title, ndim=2)
     shapes.current_face_color = "transparent"
     shapes.current_edge_color = "yellow"
@@ -191,7 +192,8 @@ def new_shapes(viewer: Any, image: Any, title: str, mode: str) -> Any:
 def _add_layer(viewer: Any, image: Any, kind: str, data: Any, title: str, **keywords: Any) -> Any:
     keywords["name"] = title
     if image is not None:  # None for files
-        keywords |= {"name": f"{image.name} {title}", **about.frame_of(image).keywords()}
+        name = about.layer_name(title, name_of_result(image))
+        keywords |= {"name": name, **about.frame_of(image).keywords()}
     layer = Layer.create(data, keywords, kind)
     viewer.layers.append(layer)
     viewer.layers.selection.active = layer
@@ -350,12 +352,12 @@ def likely_beam(image: Any, offered: Sequence[Any], *, estimates: bool = False) 
         # 'shot high-pass' is a filtered copy, while napari itself adds ' [1]'.
         and (_is_beam(layer) or not re.match(rf"{re.escape(image.name)} [^\[]", layer.name))
     ]
-    named = [layer for layer in fitting if _is_beam(layer)]
-    if len(named or fitting) != 1:
+    beams = [layer for layer in fitting if _is_beam(layer)]
+    if len(beams or fitting) != 1:
         return None
-    (beam,) = named or fitting
+    (beam,) = beams or fitting
     is_of_series = re.sub(r"\d", "", beam.name) == re.sub(r"\d", "", image.name)
-    return beam if named or _is_rather_shot(image, beam, is_pair=not is_of_series) else None
+    return beam if beams or _is_rather_shot(image, beam, is_pair=not is_of_series) else None
 
 
 def _is_rather_shot(layer: Any, other: Any, *, is_pair: bool = False) -> bool:
