@@ -258,11 +258,11 @@ def series_window() -> None:
         widget = open_widget(viewer, "Analyse")
         form = widget.products
         widget.tabs.setCurrentWidget(form)
-        form.product.setCurrentIndex(form.product.findData("region"))
+        form.product.set_kind("region")
         form._draw()
         form.shapes.layer.add_ellipses(np.array([[47.5, 47.5], [26.0, 26.0]]))
         form.shapes.layer.mode = "pan_zoom"
-        form.times.setText("1 ns")
+        form.shots.restore({"times": "1 ns"})
         form.panel.button.click()
         while form.panel.running:
             settle(0.2)

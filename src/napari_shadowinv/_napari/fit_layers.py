@@ -8,7 +8,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.layer_metadata import Frame, Result, layer_name, metadata_for, role_of
+from napari_shadowinv._napari.layer_metadata import Frame, Result, role_of
 from napari_shadowinv._napari.layers import (
     LayerData,
     View,
@@ -117,7 +117,6 @@ def _image_layers(
     fit: Fit, frame: Frame, name: str, facts: dict[str, Any], *, with_images: bool
 ) -> LayerData:
     """Describe hidden layers of the re-projections, the residuals and a non-uniform beam."""
-    setup = fit.setup
     grey = intensity_limits(fit.images[0])
     means = [image[use].mean() for image, use in zip(fit.images, fit.mask, strict=True)]
     percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)
@@ -138,15 +137,13 @@ def _image_layers(
             # With beam and mask, the image can be inverted again.
             usable = None if fit.mask.all() else fit.mask[0]
             more |= {"source": fit.source[0], "usable": usable}
-        keywords = {
-            "name": layer_name(kind.title, name, fit.headline.level),
-            "metadata": metadata_for(role, kind.unit, setup, **more),
+        look = {
             "visible": False,
-            **frame.keywords(stacked=data.ndim == 3, stack_axis="image"),
             "colormap": colour_map(kind.colormap),
             "contrast_limits": limits or symmetric_limits(planes[0]),
         }
-        layers.append((data, keywords, "image"))
+        more |= {"level": fit.headline.level, "stack_axis": "image" if data.ndim == 3 else ""}
+        layers.append(kind.layer(data, name, frame, fit.setup, look, **more))
     return layers
 
 

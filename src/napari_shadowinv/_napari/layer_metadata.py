@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
@@ -153,6 +154,30 @@ class Kind:
     visible: bool = False
     main: bool = False  # shown by default, as visible ones are; the others by *More layers*
     shown_of: Literal["shot", "stack", "both"] = "both"
+
+    def layer(
+        self,
+        data: Any,
+        name: str,
+        frame: Frame,
+        setup: Setup | None,
+        look: Mapping[str, Any],
+        /,
+        *,
+        words: Mapping[str, str] = MappingProxyType({}),
+        stack_axis: str = "",
+        level: Level | None = None,
+        **facts: Any,
+    ) -> _LayerTuple:
+        """Describe a layer of a result, of which `name` is the shot's; `words` are in its title."""
+        keywords = {
+            "name": layer_name(self.title.format(**words), name, level),
+            "metadata": metadata_for(self.role, words.get("unit", self.unit), setup, **facts),
+            "visible": self.visible,
+            **frame.keywords(stacked=bool(stack_axis), stack_axis=stack_axis),
+            **look,
+        }
+        return data, keywords, self.type
 
 
 KINDS = (
@@ -310,6 +335,15 @@ def result_of(layer: Any) -> Result[AnyResult] | None:
     """Return the result that a layer belongs to, or None."""
     result = metadata_of(layer).get("result")
     return result if isinstance(result, Result) else None
+
+
+def layers_of(viewer: Any, layer: Any) -> list[Any]:
+    """Return the layers of a viewer that show the same result, or the same store, as a layer."""
+
+    def shown(each: Any) -> tuple[Any, Any]:
+        return result_of(each), metadata_of(each).get("store")
+
+    return [each for each in viewer.layers if shown(each) == shown(layer)]
 
 
 def belongs_to_result(layer: Any) -> bool:

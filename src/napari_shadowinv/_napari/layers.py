@@ -195,15 +195,9 @@ def dataset_layers(
         if kind.role in about.MASKED_ROLES and view.masked is not None:
             # On lazy arrays, numpy's functions are dask's.
             data = np.where(view.masked, np.nan, data)
-        unit = words.get("unit", kind.unit)
-        keywords = {
-            "name": about.layer_name(kind.title.format(**words), name, level),
-            "metadata": about.metadata_for(kind.role, unit, view.setup, **facts),
-            "visible": kind.visible,
-            **frame.keywords(stacked=view.shot is not None),
-            **look,
-        }
-        layers.append((data, keywords, kind.type))
+        axis = "" if view.shot is None else "shot"
+        choices: Any = {"words": words, "stack_axis": axis, "level": level, **facts}
+        layers.append(kind.layer(data, name, frame, view.setup, look, **choices))
     return layers
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, metadata_for
+from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for
 from napari_shadowinv._napari.layers import LayerData, Limits, label_colours
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.shots import shot_layer
@@ -73,7 +73,7 @@ def pack_layers(
     plane: int = 0,
     **facts: Any,
 ) -> LayerData:
-    """Describe the layers of a pack, the lowest first; their names start with the pack's.
+    """Describe the layers of a pack, the lowest first; their names end with the pack's.
 
     Painted pixels, `by_hand`, shape (n, H, W), are not usable. The displayed film, `plane`, sets
     the contrast. `facts` are metadata of each layer.
@@ -87,7 +87,7 @@ def pack_layers(
     }
     layers = []
     for kind in KINDS:
-        metadata: dict[str, Any] = {**films, **facts, "result": result, "main": True}
+        more: dict[str, Any] = {**films, **facts, "name": name, "result": result, "main": True}
         if kind.type == "labels":
             data: AnyArray = np.where(doses.usable, 0, EXCLUDED).astype(np.uint8)
             if by_hand is not None:
@@ -96,16 +96,10 @@ def pack_layers(
         else:
             data = getattr(doses, kind.variable)
             limits = [_limits(film, used) for film, used in zip(data, doses.usable, strict=True)]
-            metadata["limits"] = limits
+            more["limits"] = limits
             look = {"colormap": colour_map(kind.colormap), "contrast_limits": limits[plane]}
-        keywords = {
-            "name": f"{name} {kind.title}".strip(),
-            "metadata": metadata_for(kind.role, kind.unit, result.setup, **metadata),
-            "visible": kind.visible,
-            **frame.keywords(stacked=True, stack_axis="layer"),
-            **look,
-        }
-        layers.append((data, keywords, kind.type))
+        more["stack_axis"] = "layer"
+        layers.append(kind.layer(data, name, frame, result.setup, look, **more))
     return layers
 
 
@@ -207,7 +201,6 @@ class PackJob(Job):
             plane=self.plane,
             path=self.path,
             pack=self.pack,
-            pack_name=self.name,
             corners=self.corners,
         )
 

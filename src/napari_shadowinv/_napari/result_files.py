@@ -29,23 +29,11 @@ from napari_shadowinv.results import result_from_dataset
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.results import AnyResult
 
 _LOOKS, _NAME = "napari_layers", "napari_name"
 _MAX_NAMES = 3  # in a message
-
-# Attributes that are recomputed when a result is saved.
-_COMPUTED_ATTRIBUTES = {_LOOKS, _NAME, "format", "options", "report", "image_residual"}
-_COMPUTED_ATTRIBUTES |= {"instrument", "setup", "provenance", "package_version", "created"}
-_COMPUTED_ATTRIBUTES |= {"verdict", "explanation", "folded", "fields", "setups"}
-_COMPUTED_ATTRIBUTES |= {
-    "errors",
-    "error_causes",
-    "errors_si",
-    "warnings",
-    "seen_from",
-    "scan_pixel_size",
-}
 
 _PLACEMENT = ("scale", "translate", "units")
 _TRANSFORM = ("rotate", "shear", "affine")
@@ -74,11 +62,9 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
     looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
     content = result_from_dataset(dataset)
     setup = content.setup
-    result = Result(
-        content,
-        setup,
-        {key: value for key, value in dataset.attrs.items() if key not in _COMPUTED_ATTRIBUTES},
-    )
+    computed = {*_content_dataset(content, setup, {}).attrs, _LOOKS, _NAME}
+    attributes = {key: value for key, value in dataset.attrs.items() if key not in computed}
+    result = Result(content, setup, attributes)
     placement = next(iter(looks.values()), {})
     shape = dataset.sizes["y"], dataset.sizes["x"]
     places = {key: placement.get(key) for key in _PLACEMENT}
@@ -116,12 +102,7 @@ def missing_layers(viewer: Any, layer: Any) -> LayerData:
         raise InputError(
             f"'{layer.name}' shows no result: select a layer of a result, or press Run first"
         )
-    present = [
-        layer
-        for layer in viewer.layers
-        if about.metadata_of(layer).get("result") is result
-        and about.metadata_of(layer).get("store") == store
-    ]
+    present = about.layers_of(viewer, layer)
     keys = {about.layer_key(layer) for layer in present} | _shown_inputs(viewer, result)
     missing = [entry for entry in layer_data if about.layer_key(entry[1]) not in keys]
     for _, keywords, _ in missing:
@@ -149,18 +130,24 @@ def _shown_inputs(viewer: Any, result: Result[AnyResult] | None) -> set[str]:
 
 def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]) -> xarray.Dataset:
     """Return the dataset of a result with its layers' appearance and painted caustics."""
-    content = result.content
+    content: Any = result.content
     looks = {about.layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
     name = next((about.metadata_of(keywords).get("name") for _, keywords, _ in layers), None)
     attributes = {**result.attributes, _LOOKS: json.dumps(looks, default=_plain)}
     if name is not None:
         attributes[_NAME] = name
-    if not isinstance(content, Inversion):
-        return content.to_dataset(attributes=attributes)
     for data, keywords, _ in layers:
-        if about.role_of(keywords) == "caustic":
+        if about.role_of(keywords) == "caustic":  # of an inversion
             content = replace(content, caustic=np.asarray(data) > 0)
-    return content.in_units(result.setup).to_dataset(attributes=attributes)
+    return _content_dataset(content, result.setup, attributes)
+
+
+def _content_dataset(
+    content: AnyResult, setup: Setup | None, attributes: dict[str, str]
+) -> xarray.Dataset:
+    if isinstance(content, Inversion):
+        content = content.in_units(setup)
+    return content.to_dataset(attributes=attributes)
 
 
 def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:

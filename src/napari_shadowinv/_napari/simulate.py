@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from pydantic import Field, create_model
+from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
@@ -25,73 +27,25 @@ from napari_shadowinv._napari.simulations import (
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, SaveButton
-from napari_shadowinv._napari.widgets._inputs import ChoiceBox, InstrumentForm, SetupPicker
+from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of
-from napari_shadowinv._napari.widgets._qt import COLOURS, Plot, notify_errors
-from napari_shadowinv._system.validation import validate
+from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors
+from napari_shadowinv._system.validation import CheckedModel, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.beam import number_in_unit
 from napari_shadowinv.physics.phantom_models import PHANTOMS
 from napari_shadowinv.physics.setup import Setup, deflector_titles
-from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline.experiment import SWEPT
 from napari_shadowinv.pipeline.experiment_object import shape_of_text
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
-from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
+from napari_shadowinv.plotting import draw_errors
 
 _IMAGE, _PLAN = "image", "plan"  # tasks
 _GRID, _LAYER = "grid", "layer"  # objects that are no phantoms
-_SHAPE = (200, 200)
+_NOTHING = ""  # of the quantities
+_SIZE = " x ".join(map(str, ForwardJob.shape))
 _PLOT_HEIGHT_PX = 260
-_LOG_RANGE = 8.0
-
-
-class PlanPlot(Plot):
-    """Errors of the draws of a plan, or the error over the quantity of a sweep."""
-
-    def __init__(self) -> None:
-        super().__init__(_PLOT_HEIGHT_PX)
-        self.setFixedHeight(_PLOT_HEIGHT_PX)
-        self.setVisible(False)
-
-    def show_errors(self, content: ExperimentPlan | ExperimentSweep) -> None:
-        """Draw the errors made and reported."""
-        self.setVisible(True)
-        (axis,) = self.fresh_axes()
-        if isinstance(content, ExperimentSweep):
-            name = self._draw_sweep(axis, content)
-        else:
-            name = self._draw_plan(axis, content)
-        axis.set_ylim(bottom=0)
-        axis.set_xlabel(name, color=self.ink, fontsize=8)
-        axis.set_ylabel("error of the field (%)", color=self.ink, fontsize=8)
-        self.add_legend(axis)
-        self.draw()
-
-    def _draw_plan(self, axis: Any, plan: ExperimentPlan) -> str:
-        """Draw the errors of each draw; return the label of the axis."""
-        numbers = [shot.number for shot in plan.shots]
-        axis.bar(numbers, [100 * shot.error for shot in plan.shots], color=COLOURS[0], label="made")
-        totals = [100 * shot.total for shot in plan.shots]
-        axis.plot(numbers, totals, "_", color=self.ink, markersize=8, label="reported")
-        return "draw"
-
-    def _draw_sweep(self, axis: Any, sweep: ExperimentSweep) -> str:
-        """Draw the median errors, with the band of 68 % of the draws."""
-        order = np.argsort(sweep.values)
-        values = np.array(sweep.values)[order]
-        chosen = [sweep.plans[k] for k in order]
-        spreads = [plan.error for plan in chosen]
-        low, high = ([100 * getattr(each, end) for each in spreads] for end in ("low", "high"))
-        axis.fill_between(values, low, high, color=COLOURS[0], alpha=0.25)
-        medians = [100 * each.median for each in spreads]
-        axis.plot(values, medians, "o-", color=COLOURS[0], label="made")
-        totals = [100 * plan.total.median for plan in chosen]
-        axis.plot(values, totals, "--", color=self.ink, label="reported")
-        if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
-            axis.set_xscale("log")
-        return f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title
 
 
 class Simulate(panels.ToolPanel):
@@ -102,42 +56,23 @@ class Simulate(panels.ToolPanel):
         super().__init__(napari_viewer, "simulate", Run("Simulate", "Run", tip))
         self._predicted: Any = None  # layers of the last image; plans have others
         self._build_object()
-        self._build_plan()
+        self._build_task()
         self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
-        self.verdict, self.report, self.plot = panels.VerdictLine(), panels.ReportView(), PlanPlot()
+        self.verdict, self.report = panels.VerdictLine(), panels.ReportView()
+        self.plot = Plot(_PLOT_HEIGHT_PX, fixed=True)
         self.save_result = SaveButton(
             self,
             self._image_to_save,
             "Save the predicted image with its pixel size (.tif, .npy or .png).",
         )
-        self.add(forms.labelled("Simulate", self.task), self.object, self._file_row)
-        self.add(*self._layer_rows, self._size_row, self.setup, self._source_row)
-        self.add(*self._plan_rows, self._values_row, self.keep_earlier, self.panel)
-        self.add(self.warning, self.verdict, self.save_result, self.plot, self.report)
+        self.add(self.object, self._size_row, self.setup, self.task, self.keep_earlier)
+        self.add(self.panel, self.warning, self.verdict, self.save_result, self.plot, self.report)
         self._connect()
         self.restore_last()
         self._ready = True
         self._on_change()
 
     def _build_object(self) -> None:
-        self.task = ChoiceBox(
-            {_IMAGE: "the image", _PLAN: "shots, to plan an experiment"},
-            "The image that the object casts, or shots with random imperfections, whose fields are "
-            "compared with the object.",
-        )
-        kinds: forms.Kinds = {
-            **forms.kinds_of(PHANTOMS),
-            _GRID: ("a 3-D field from a file", GridView),
-            _LAYER: ("a result or potential", None),
-        }
-        self.object = forms.ModelPicker("Object", kinds, "Object that deflects the beam.")
-        self.file = forms.PathEdit(
-            "Choose a 3-D field",
-            "openPMD or NetCDF file",
-            "openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; particles are "
-            "traced through it.",
-            "3-D fields (*.h5 *.hdf5 *.nc)",
-        )
         self.potential = LayerPicker(
             self.viewer,
             "<qt>The field or potential of a result, or a potential in px² from a file; for a "
@@ -145,53 +80,65 @@ class Simulate(panels.ToolPanel):
             suits=may_be_field,
         )
         self.interpretation = forms.WrappingLabel()
+        layer = QWidget()
+        column(layer, forms.labelled("Layer", self.potential), self.interpretation)
+        self.object = forms.ModelPicker(
+            "Object",
+            {
+                **forms.kinds_of(PHANTOMS),
+                _GRID: ("a 3-D field from a file", GridFile),
+                _LAYER: ("a result or potential", layer),
+            },
+            "Object that deflects the beam.",
+        )
+        tip = "Height and width of an image in px, such as 200 x 200."
+        self.side = forms.SavedLine(_SIZE, tip)
+        self._size_row = forms.labelled("Size (px)", self.side)
+        self.setup = SetupPicker()
+
+    def _build_task(self) -> None:
+        tip = "Image layer of the undisturbed beam."
+        self.source = LayerPicker(self.viewer, tip, "uniform", about.may_be_source)
         self.deflector = forms.SteadyComboBox(
             {None: "default for the beam", **{name: name for name in deflector_titles().values()}},
             "Field that deflects the beam. Used only to predict the object's image in another "
             "experiment, when the setup differs from the result's setup.",
         )
-        tip = "Height and width of an image in px, such as 200 x 200."
-        self.side = forms.SavedLine("200 x 200", tip)
-        self.setup = SetupPicker()
-        tip = "Image layer of the undisturbed beam."
-        self.source = LayerPicker(self.viewer, tip, "uniform", about.may_be_source)
-        self._file_row = forms.labelled("File", self.file)
         self._deflector_row = forms.labelled("Deflected by", self.deflector)
-        layer = forms.labelled("Layer", self.potential)
-        self._layer_rows = (layer, self.interpretation, self._deflector_row)
-        self._size_row = forms.labelled("Size (px)", self.side)
-        self._source_row = forms.labelled("Source", self.source)
-
-    def _build_plan(self) -> None:
+        image, plan = QWidget(), QWidget()
+        column(image, forms.labelled("Source", self.source), self._deflector_row)
         self.energies = forms.SavedLine(
             "14.7, 30",
             "Energies of several images of a shot in MeV (of light: wavelengths in m), separated "
             "by commas. Empty: one image with the setup's.",
         )
         self.instrument, self.options = InstrumentForm(), forms.ModelForm(ExperimentOptions)
-        self.quantity = ChoiceBox(
-            {"": "nothing", **{key: swept.title for key, swept in SWEPT.items()}},
+        self.quantity = forms.ModelPicker(
+            "Vary",
+            {_NOTHING: ("nothing", None), **{key: _values_of(key) for key in SWEPT}},
             "Quantity of the experiment that is varied.",
         )
-        self.values = forms.SavedLine(
-            "100, 300, 1000", "Values of the quantity, separated by commas, in its unit."
-        )
-        self._values_row = forms.labelled("Values", self.values)
-        self._plan_rows = (
+        column(
+            plan,
             forms.labelled("Energies", self.energies),
             forms.section("Instrument", self.instrument),
             forms.section("Simulated shots", self.options),
-            forms.labelled("Vary", self.quantity),
+            self.quantity,
+        )
+        self.task = forms.ModelPicker(
+            "Simulate",
+            {_IMAGE: ("the image", image), _PLAN: ("shots, to plan an experiment", plan)},
+            "The image that the object casts, or shots with random imperfections, whose fields are "
+            "compared with the object.",
         )
 
     def _connect(self) -> None:
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.potential.picked.connect(self._follow_layer)
-        for choice in (self.task, self.quantity):
-            choice.currentIndexChanged.connect(lambda _: self._on_change())
-        for part in (self.object, self.file, self.setup, self.instrument, self.options):
+        parts = (self.object, self.task, self.setup, self.instrument, self.options, self.quantity)
+        for part in parts:
             part.changed.connect(self._on_change)
-        for line in (self.side, self.energies, self.values):
+        for line in (self.side, self.energies):
             line.textChanged.connect(lambda _: self.keep())
 
     @notify_errors
@@ -203,7 +150,7 @@ class Simulate(panels.ToolPanel):
                 f"{name} is selected: select the field or the potential of a result, or an image "
                 "of a potential"
             )
-        self.task.setCurrentIndex(self.task.findData(_IMAGE))
+        self.task.set_kind(_IMAGE)
         self.object.set_kind(_LAYER)
         self.potential.layer = layer
 
@@ -212,13 +159,11 @@ class Simulate(panels.ToolPanel):
             "task": self.task,
             "setup": self.setup,
             "object": self.object,
-            "file": self.file,
             "size": self.side,
             "energies": self.energies,
             "instrument": self.instrument,
             "options": self.options,
             "quantity": self.quantity,
-            "values": self.values,
         }
 
     def state(self) -> dict[str, Any]:
@@ -234,61 +179,55 @@ class Simulate(panels.ToolPanel):
         target = self._object(setup)
         size = self.side.text().strip()
         shape = shape_of_text(size, "the size") if size else None
-        if self.task.state() == _PLAN:
-            quantity, options = self.quantity.state(), self.options.model()
-            return PlanJob(
-                object=target,
-                setups=self._setups(setup),
-                shape=shape,
-                instrument=validate(Instrument, self.instrument.state(), "instrument"),
-                options=options,  # type: ignore[arg-type]
-                quantity=quantity,
-                values=tuple(_numbers("the values", self.values.text())) if quantity else (),
-            )
-        return self._image_job(target, setup, shape or _SHAPE)
+        if self.task.kind == _IMAGE:
+            return self._image_job(target, setup, shape or ForwardJob.shape)
+        key, sweep = self.quantity.kind, self.quantity.model()
+        values = "" if sweep is None else sweep.values  # type: ignore[attr-defined]
+        unit = SWEPT[key].unit if values else ""
+        instrument = validate(Instrument, self.instrument.state(), "instrument")
+        options: Any = self.options.model()
+        return PlanJob(
+            object=target,
+            setups=self._setups(setup),
+            shape=shape,
+            instrument=instrument,
+            options=options,
+            quantity=key,
+            values=tuple(_numbers("the values", values, unit)),
+        )
 
     def _object(self, setup: Setup | None) -> SimulatedObject:
         """Return the phantom, the file or the layer's field, or raise an `InputError`."""
-        recipe: Any = self.object.model()
         if self.object.kind == _LAYER:
             return input_field(self.potential.layer, self.viewer.dims.point, setup)
-        if self.object.kind != _GRID:
-            return recipe
-        if not self.file.path:
-            raise InputError("there is no file with a 3-D field: choose one")
-        return GridFile(self.file.path, recipe)
+        chosen: Any = self.object.model()
+        return chosen
 
     def _image_job(
         self, target: SimulatedObject, setup: Setup | None, shape: tuple[int, int]
     ) -> ForwardJob:
         beam: Any = self.source.layer
         source = None if beam is None else image_of(beam)
-        common: dict[str, Any] = {
-            "unit": about.unit_of(beam or {}),
-            "setup_origin": self.setup.origin,
-        }
+        layer: Any = None
         if isinstance(target, InputField):
-            layer: Any = self.potential.layer
-            return ForwardJob(
-                target,
-                setup=setup or target.setup,
-                deflector=self.deflector.currentData(),
-                source=None if source is None else source_on(beam, source, layer),
-                name=f"{about.metadata_of(layer).get('name') or layer.name} image",
-                frame=about.frame_of(layer),
-                subject=layer,
-                **common,
-            )
-        shape = shape if source is None else source.shape
+            layer, setup = self.potential.layer, setup or target.setup
+            shape = layer.data.shape[-2:]
+            source = None if source is None else source_on(beam, source, layer)
+        elif source is not None:
+            shape = source.shape
+        # In another experiment the object may have other pixels.
+        is_moved = layer is None or getattr(target, "setup", None) not in (None, setup)
         return ForwardJob(
             target,
             shape=shape,
             setup=setup,
+            deflector=self.deflector.currentData(),
             source=source,
             name=f"{target.title} image",
-            frame=about.frame_for(shape, setup),
-            subject=target.title,
-            **common,
+            frame=about.frame_for(shape, setup) if is_moved else about.frame_of(layer),
+            unit=about.unit_of(beam or {}),
+            setup_origin=self.setup.origin,
+            subject=target.title if layer is None else layer,
         )
 
     def _setups(self, setup: Setup | None) -> tuple[Setup, ...]:
@@ -326,7 +265,7 @@ class Simulate(panels.ToolPanel):
             self.warning.show_text(content.warning)
             return
         self.verdict.show_headline(content.headline)
-        self.plot.show_errors(content)
+        self.plot.show_drawing(lambda axes: draw_errors(axes[0], content, self.plot.ink))
         rows, details = (panels.fact_rows(content.facts, details=flag) for flag in (False, True))
         self.report.show_rows(rows, details)
         self.reveal(self.report)
@@ -355,20 +294,13 @@ class Simulate(panels.ToolPanel):
             self._on_change()
 
     def _on_change(self) -> None:
-        kind, is_plan = self.object.kind, self.task.state() == _PLAN
-        for row in self._layer_rows:
-            row.setVisible(kind == _LAYER)
-        for row in self._plan_rows:
-            row.setVisible(is_plan)
-        self._values_row.setVisible(is_plan and bool(self.quantity.state()))
-        self._file_row.setVisible(kind == _GRID)
-        self._source_row.setVisible(not is_plan)
+        kind, is_plan = self.object.kind, self.task.kind == _PLAN
         self.save_result.setVisible(not is_plan)
         self._size_row.setVisible(is_plan or kind != _LAYER)
+        self._deflector_row.setVisible(kind == _LAYER)
         has_size = is_plan and kind not in PHANTOMS
-        self.side.setPlaceholderText("that of the field" if has_size else "200 x 200")
+        self.side.setPlaceholderText("that of the field" if has_size else _SIZE)
         if kind == _LAYER:
-            self._deflector_row.setVisible(not is_plan)
             self._show_interpretation()
         self.keep()
 
@@ -382,6 +314,15 @@ class Simulate(panels.ToolPanel):
             self.interpretation.show_text(error_text(error), style)
             return
         self.interpretation.show_text(field.text, "" if is_field(layer) else forms.PROBLEM_STYLE)
+
+
+def _values_of(key: str) -> tuple[str, type[CheckedModel]]:
+    """Return title and entries of a quantity that can be varied."""
+    swept = SWEPT[key]
+    unit = f", in {swept.unit} or with a unit" if swept.unit else ""
+    tip = f"Values of the quantity, separated by commas{unit}."
+    field: Any = Field(title="Values", description=tip)
+    return swept.title, create_model(key, __base__=CheckedModel, values=(str, field))
 
 
 def _numbers(name: str, text: str, unit: str = "") -> Sequence[float]:

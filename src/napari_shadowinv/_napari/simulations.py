@@ -12,19 +12,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import Field
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.jobs import Job
+from napari_shadowinv._napari.jobs import Job, name_of_result
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.widgets._layers import image_of, shown_plane
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level, percent
 from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.beam import displacement_from_potential, number_in_unit
+from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
@@ -46,17 +49,25 @@ from napari_shadowinv.pipeline.inversion_run import plane_of
 _FIELDS = ("field", "field y", "field x")
 
 
-@dataclass(frozen=True)
-class GridFile:
+class _File(CheckedModel):
+    file: Path = Field(
+        title="File",
+        description="openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; "
+        "particles are traced through it.",
+    )
+
+
+class GridFile(GridView, _File):
     """A 3-D field in a file, and the direction from which it is seen."""
 
-    path: str
-    view: GridView
+    def field(self) -> FieldGrid:
+        """Read the field, in the frame of the beam."""
+        return self.apply(read_field_grid(self.file))
 
     @property
     def title(self) -> str:
         """Name of the file without its ending."""
-        return Path(self.path).stem
+        return self.file.stem
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +115,7 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
             "Invert shot), open a .shadowinv file or an image of a potential in px² (File → Open), "
             "or select a simulated object"
         )
-    result, title = about.result_of(layer), layer.name
+    result, title = about.result_of(layer), name_of_result(layer)
     is_masked = about.role_of(layer) == "potential" and bool(np.isnan(layer.data).any())
     if result is not None and (about.role_of(layer) in _FIELDS or is_masked):
         displacement = np.asarray(about.displacement_of(layer))
@@ -188,7 +199,7 @@ class ForwardJob(Job):
         keywords: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
         if isinstance(self.object, GridFile):
             source, shadow = self._source(self.shape)
-            grid = self.object.view.apply(read_field_grid(Path(self.object.path)))
+            grid = self.object.field()
             shape: Any = self.shape if source is None else np.shape(source)
             traced = trace(grid, check_particles(self.setup), shape, profile=source, **keywords)
             image, displacement = traced.image, np.nan_to_num(traced.displacement)
@@ -209,25 +220,17 @@ class ForwardJob(Job):
 
     def layers(self, content: Prediction) -> LayerData:
         origin = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
-        # In another experiment the object may have other pixels.
-        frame = self.frame
-        if self._field_setup not in (None, self.setup):
-            frame = about.frame_for(content.image.shape, self.setup)
         layer = shot_layer(
             content.image,
             self.name,
             self.setup,
             intensity_limits(content.image),
-            frame=frame,
+            frame=self.frame,
             unit=self.unit,
             source=content.source,  # for an inversion of the image
             setup_origin=origin if self.setup_origin else None,
         )
         return [layer]
-
-    @property
-    def _field_setup(self) -> Setup | None:
-        return self.object.setup if isinstance(self.object, InputField) else None
 
     def _source(self, shape: tuple[int, ...]) -> tuple[FloatArray | None, BoolArray | None]:
         """Return the beam that passes the object, and where the object stops it."""
@@ -241,7 +244,7 @@ class ForwardJob(Job):
 
     def _transfer(self, displacement: FloatArray) -> tuple[FloatArray, str]:
         """Return the displacement in the chosen setup, and the assumption behind it."""
-        field_setup, setup = self._field_setup, self.setup
+        field_setup, setup = getattr(self.object, "setup", None), self.setup
         if field_setup is None or setup is None or field_setup == setup:
             return displacement, ""
         deflector = self.deflector or default_deflector(field_setup, setup)
@@ -286,9 +289,8 @@ class PlanJob(Job):
             return self.object
         Reporter(*callbacks)("field", 0, None)
         if isinstance(self.object, GridFile):
-            path, setup = Path(self.object.path), next(iter(self.setups), None)
-            grid = self.object.view.apply(read_field_grid(path))
-            return object_of_field(grid, setup, title=path.name)
+            setup, name = next(iter(self.setups), None), self.object.file.name
+            return object_of_field(self.object.field(), setup, title=name)
         field = self.object
         return object_of_displacement(field.displacement(), field.setup, title=field.title)
 

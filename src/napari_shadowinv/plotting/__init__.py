@@ -2,9 +2,10 @@
 
 - the figure of any result: `result_figure`; of each kind: `report_figure`, `fit_figure`,
   `pack_figure`
-- products with their bands: `products_figure`; axes of their spectra: `make_logarithmic`
+- products with their bands: `products_figure`; curves of one: `draw_curves`; axes of spectra:
+  `make_logarithmic`
 - the test of one static field: `left_out_figure`
-- planned experiments: `plan_figure`, `sweep_figure`
+- planned experiments: `plan_figure`, `sweep_figure`; their errors: `draw_errors`
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
 - a style of their own, whatever a user's matplotlibrc says: `own_style`
 - a stack as a movie: `write_film`
@@ -17,8 +18,12 @@ from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure
 from napari_shadowinv.plotting._movie import stack_frames, write_film
 from napari_shadowinv.plotting._panels import own_style
-from napari_shadowinv.plotting._plan_figure import plan_figure, sweep_figure
-from napari_shadowinv.plotting._product_figure import make_logarithmic, products_figure
+from napari_shadowinv.plotting._plan_figure import draw_errors, plan_figure, sweep_figure
+from napari_shadowinv.plotting._product_figure import (
+    draw_curves,
+    make_logarithmic,
+    products_figure,
+)
 from napari_shadowinv.plotting.figures import (
     comparison_figure,
     report_figure,
@@ -28,6 +33,8 @@ from napari_shadowinv.plotting.figures import (
 
 __all__ = [
     "comparison_figure",
+    "draw_curves",
+    "draw_errors",
     "fit_figure",
     "left_out_figure",
     "make_logarithmic",

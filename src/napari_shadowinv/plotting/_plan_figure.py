@@ -1,4 +1,7 @@
-"""Figures of planned experiments: `plan_figure`, and of one quantity varied, `sweep_figure`."""
+"""Figures of planned experiments: `plan_figure`, and of one quantity varied, `sweep_figure`.
+
+- their errors on given axes: `draw_errors`
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
@@ -15,6 +19,8 @@ from napari_shadowinv.plotting._panels import GOOD_COLOUR, LEVEL_COLOURS, QUIET_
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+_LOG_RANGE = 8.0  # of values; larger ones have a logarithmic axis
 
 
 def plan_figure(plan: ExperimentPlan) -> Figure:
@@ -40,7 +46,8 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
         panels[0].draw_intensity(image, "First draw", intensity_limits(image))
         fields = {"object": true, "retrieved in the first draw": retrieved}
         _panels.draw_side_by_side(panels[1:4], fields)
-        _draw_errors(panels[4].axes, plan)
+        draw_errors(panels[4].axes, plan)
+        panels[4].axes.set_title(f"Error made: {percent(plan.error.median)}")
         _draw_parts(panels[5].axes, plan)
     return figure
 
@@ -60,46 +67,71 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
     matplotlib.figure.Figure
         A figure with an Agg canvas; write it with `save_figure`.
     """
-    order = np.argsort(sweep.values)
-    values = np.array(sweep.values)[order]
-    plans = [sweep.plans[k] for k in order]
     with _panels.styled_figure((6.4, 4.8), layout="constrained") as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-        spreads = [plan.error for plan in plans]
-        low, high = ([100 * getattr(each, end) for each in spreads] for end in ("low", "high"))
-        above.fill_between(
-            values, low, high, color=GOOD_COLOUR, alpha=0.2, label="68 % of the draws"
-        )
-        medians = [100 * each.median for each in spreads]
-        above.plot(values, medians, "o-", color=GOOD_COLOUR, label="error made")
-        totals = [100 * plan.total.median for plan in plans]
-        above.plot(values, totals, "--", color=QUIET_COLOUR, label="error reported")
-        above.set_ylabel("error of the field (%, r.m.s.)")
-        above.set_ylim(bottom=0)
+        values, plans = _draw_sweep(above, sweep)
         above.legend()
         above.set_title(plans[0].title)
         shares = [100 * plan.determined_share for plan in plans]
         below.plot(values, shares, "s-", color=QUIET_COLOUR)
         below.set_ylim(-5, 105)
         below.set_ylabel("determined\n(% of draws)")
-        below.set_xlabel(f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title)
-        if values[0] > 0 and values[-1] / values[0] > 8:
-            below.set_xscale("log")
-            below.minorticks_off()
-        below.set_xticks(values, [f"{value:.3g}" for value in values])
+        below.set_xlabel(_axis_of(sweep))
     return figure
 
 
-def _draw_errors(axes: Axes, plan: ExperimentPlan) -> None:
+def draw_errors(axes: Axes, content: ExperimentPlan | ExperimentSweep, ink: str = "black") -> None:
+    """Draw the errors made and reported, of each draw of a plan or of each value of a sweep.
+
+    Parameters
+    ----------
+    axes : Axes
+    content : ExperimentPlan or ExperimentSweep
+    ink : str
+        Colour of the marks of the errors reported in each draw.
+    """
+    if isinstance(content, ExperimentSweep):
+        _draw_sweep(axes, content)
+        axes.set_xlabel(_axis_of(content))
+    else:
+        _draw_draws(axes, content, ink)
+    axes.legend(fontsize=7)
+
+
+def _draw_sweep(axes: Axes, sweep: ExperimentSweep) -> tuple[FloatArray, list[ExperimentPlan]]:
+    """Draw the errors over the values; return these in their order, and the plans."""
+    order = np.argsort(sweep.values)
+    values = np.array(sweep.values)[order]
+    plans = [sweep.plans[k] for k in order]
+    spreads = [plan.error for plan in plans]
+    low, high = ([100 * getattr(each, end) for each in spreads] for end in ("low", "high"))
+    axes.fill_between(values, low, high, color=GOOD_COLOUR, alpha=0.2, label="68 % of the draws")
+    medians = [100 * each.median for each in spreads]
+    axes.plot(values, medians, "o-", color=GOOD_COLOUR, label="error made")
+    totals = [100 * plan.total.median for plan in plans]
+    axes.plot(values, totals, "--", color=QUIET_COLOUR, label="error reported")
+    axes.set_ylabel("error of the field (%, r.m.s.)")
+    axes.set_ylim(bottom=0)
+    if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
+        axes.set_xscale("log")
+        axes.minorticks_off()
+    axes.set_xticks(values, [f"{value:.3g}" for value in values])
+    return values, plans
+
+
+def _axis_of(sweep: ExperimentSweep) -> str:
+    return f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title
+
+
+def _draw_draws(axes: Axes, plan: ExperimentPlan, ink: str) -> None:
+    """Errors made and reported in each draw; draws that are not determined in another colour."""
     numbers = [shot.number for shot in plan.shots]
     colours = [LEVEL_COLOURS[shot.verdict.level] for shot in plan.shots]
     axes.bar(numbers, [100 * shot.error for shot in plan.shots], color=colours)
     totals = [100 * shot.total for shot in plan.shots]
-    axes.plot(numbers, totals, "_", color="black", markersize=7, label="reported")
+    axes.plot(numbers, totals, "_", color=ink, markersize=7, label="reported")
     axes.set_xlabel("draw (blue: depends on the beam, red: doubtful)")
     axes.set_ylabel("error of the field (%)")
-    axes.set_title(f"Error made: {percent(plan.error.median)}")
-    axes.legend(fontsize=7)
 
 
 def _draw_parts(axes: Axes, plan: ExperimentPlan) -> None:

@@ -1,4 +1,4 @@
-"""Products of a result on a page: `products_figure`."""
+"""Products of a result on a page: `products_figure`; the curves of one: `draw_curves`."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _draw(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
     if len(result.variables[names[0]].dims) == 2:
         _draw_map(axes, result, names[0])
         return
-    _draw_curves(axes, result, names)
+    draw_curves(axes, result, names)
     if "intensity" in result.variables:
         beside = axes.twinx()
         places, _ = result.shown_places("intensity")
@@ -106,14 +106,26 @@ def make_logarithmic(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _draw_curves(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
-    """Draw variables along a common axis with their bands, in the unit that they are shown in."""
+def draw_curves(
+    axes: Axes, result: ProductResult, names: Sequence[str], colours: Sequence[str] = _COLOURS
+) -> None:
+    """Draw variables along a common axis with their bands, in the unit that they are shown in.
+
+    Parameters
+    ----------
+    axes : Axes
+    result : ProductResult
+    names : sequence of str
+        The variables, one of the result's `curve_groups`.
+    colours : sequence of str
+        Of the curves.
+    """
     from matplotlib.ticker import MaxNLocator
 
     places, words = result.shown_places(names[0])
     scale, unit = result.shown_scale(names)
     for number, name in enumerate(names):
-        colour = _COLOURS[number % len(_COLOURS)]
+        colour = colours[number % len(colours)]
         marker = "." if result.is_series else ""
         values = scale * result[name].value
         axes.plot(places, values, color=colour, linewidth=1.3, marker=marker, label=name)

@@ -14,7 +14,6 @@ from helpers.reports import texts_of
 from napari_shadowinv._napari.form import StepsSection
 from napari_shadowinv._napari.simulations import input_field
 from napari_shadowinv._napari.viewer_sync import error_text
-from napari_shadowinv._napari.widgets._products import ProductForm
 from napari_shadowinv._napari.widgets.invert_shot import InvertShot
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
@@ -71,16 +70,6 @@ def test_raw_counts_are_no_potential(viewer: ViewerModel, dtype: type) -> None:
         input_field(layer, viewer.dims.point, None)
     layer.data = counts / 7
     assert "px²" in input_field(layer, viewer.dims.point, None).text
-
-
-def test_the_component_of_an_axisymmetric_field_is_offered(viewer: ViewerModel, qtbot: Any) -> None:
-    form = ProductForm(viewer)
-    qtbot.addWidget(form)
-    assert form._component_row.isHidden()
-    form.product.setCurrentIndex(form.product.findData("axisymmetric"))
-    assert not form._component_row.isHidden()
-    choices = [form.component.itemText(row) for row in range(form.component.count())]
-    assert choices == ["azimuthal", "axial"]
 
 
 def estimated(tool: Any, method: str, qtbot: Any) -> str:

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from qtpy.QtWidgets import QFileDialog
 
+from helpers.forms import enter
 from helpers.reports import texts_of
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets._products import shape_fields
-from napari_shadowinv.analysis import EnclosedCurrent, analyse, products_in
+from napari_shadowinv.analysis import PRODUCTS, EnclosedCurrent, analyse, products_in
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.io import read_dataset
 from napari_shadowinv.physics.forward import synthetic_image
@@ -33,19 +34,22 @@ def inversion() -> Inversion:
 def form(window: Any, open_widget: Any, inversion: Inversion) -> Any:
     add_to_viewer(window, inversion, paper_setup(), name="ring")
     form = open_widget("Analyse").products
-    form.samples.setValue(20)
+    enter(form.bands.entries["samples"], 20)
     return form
 
 
-def choose(form: Any, kind: str) -> None:
-    form.product.setCurrentIndex(form.product.findData(kind))
+def choose(form: Any, name: str) -> None:
+    form.product.set_kind(name)
+    if form.product.kind != name:
+        form.product.set_kind("more")
+        form.more_products.set_kind(name)
 
 
 def measure(form: Any, qtbot: Any) -> Any:
-    count = len(form.results)
+    count = len(form.measured)
     form.panel.button.click()
-    qtbot.waitUntil(lambda: len(form.results) > count, timeout=PATIENCE)
-    return form.results[-1]
+    qtbot.waitUntil(lambda: len(form.measured) > count, timeout=PATIENCE)
+    return form.measured[-1]
 
 
 def test_round_ellipse_becomes_a_circle_and_others_a_polygon():
@@ -82,9 +86,39 @@ def test_profile_is_drawn_with_its_bands(form: Any, qtbot: Any) -> None:
     measured = measure(form, qtbot)
     assert measured.unit.symbol == "MG µm"
     (axes,) = form.plot.figure.axes
-    assert axes.get_ylabel() == "MG µm"
+    assert axes.get_ylabel() == "field (MG µm)"
     assert [line.get_label() for line in axes.lines] == ["along", "normal"]
     assert len(axes.collections) == 4  # two bands each
+
+
+def test_entries_of_a_product_are_those_of_its_model(form: Any, qtbot: Any) -> None:
+    first = [form.product.choice.itemText(row) for row in range(form.product.choice.count())]
+    assert len(first) == 7
+    assert first[-1] == "more…"
+    offered = set()
+    for name, kind in PRODUCTS.items():
+        choose(form, name)
+        assert form.kind is kind
+        offered |= form._picker.form.entries.keys()
+    assert {"width", "find_tilt", "component", "path_length", "smoothing"} <= offered
+    assert offered.isdisjoint({"path", "center", "rectangle", "label", "noise_power"})
+    choose(form, "profile")
+    enter(form.product.form.entries["width"], "4 px")
+    form._draw()
+    form.shapes.layer.add_lines(np.array([[23.5, 5.0], [23.5, 42.0]]))
+    assert measure(form, qtbot).product.width == 4
+
+
+def test_centre_of_an_object_along_the_beam_is_that_of_a_circle(form: Any, qtbot: Any) -> None:
+    choose(form, "azimuthal")
+    form._draw()
+    form.shapes.layer.add_ellipses(np.array([[23.5, 23.5], [15.0, 15.0]]))
+    measured = measure(form, qtbot).product
+    assert measured.center == pytest.approx((23.5, 23.5))
+    assert measured.radius == pytest.approx(15.0)
+    form.shapes.layer.add_rectangles(np.array([[5.0, 5.0], [15.0, 25.0]]))
+    form.panel.button.click()
+    assert "is no circle" in form.panel.status.text()
 
 
 def test_map_becomes_a_layer_on_its_result(form: Any, window: Any, qtbot: Any) -> None:
@@ -96,7 +130,7 @@ def test_map_becomes_a_layer_on_its_result(form: Any, window: Any, qtbot: Any) -
     np.testing.assert_allclose(layer.scale, field.scale)
     ratio = layer.data / measured["density"].value
     np.testing.assert_allclose(ratio, ratio[0, 0])
-    assert form.plot.isVisibleTo(form) is False
+    assert form.plot.isHidden()
 
 
 def test_products_are_exported_and_saved_with_the_result(
@@ -105,7 +139,7 @@ def test_products_are_exported_and_saved_with_the_result(
     for _ in range(2):
         choose(form, "contrast")
         measure(form, qtbot)
-    assert [each.name for each in form.results] == ["contrast", "contrast_2"]
+    assert [each.name for each in form.measured] == ["contrast", "contrast_2"]
     names = iter([tmp_path / "products.csv", tmp_path / "both.shadowinv"])
     monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (str(next(names)), ""))
     form.export.click()

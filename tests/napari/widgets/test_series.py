@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from qtpy.QtWidgets import QFileDialog
 
+from helpers.forms import enter
 from helpers.reports import texts_of
 from napari_shadowinv import run_stack
 from napari_shadowinv._napari.layers import add_to_viewer
@@ -48,7 +49,7 @@ def form(window: Any, open_widget: Any, store: Path) -> Any:
     tool = open_widget("Analyse")
     tool.tabs.setCurrentWidget(tool.products)
     form = tool.products
-    form.product.setCurrentIndex(form.product.findData("region"))
+    form.product.set_kind("region")
     form._draw()
     form.shapes.layer.add_ellipses(np.array([[15.5, 15.5], [10.0, 10.0]]))
     return form
@@ -62,10 +63,10 @@ def press(form: Any, qtbot: Any) -> str:
 
 
 def test_series_of_a_store_is_that_of_python(form: Any, qtbot: Any, store: Path) -> None:
-    assert form.times.isVisibleTo(form)
-    form.times.setText("1 ns")
+    assert form.shots.isVisibleTo(form)
+    enter(form.shots.entries["times"], "1 ns")
     assert press(form, qtbot) == ""
-    (measured,) = form.results
+    (measured,) = form.measured
     region = Region(center=(15.5, 15.5), radius=10)
     times = 1e-9 * np.arange(SHOTS)
     (expected,) = analyse_shots(read_stack(store), region, times)
@@ -79,7 +80,7 @@ def test_series_of_a_store_is_that_of_python(form: Any, qtbot: Any, store: Path)
 
 
 def test_numbers_and_centroid_are_drawn_over_time(form: Any, qtbot: Any) -> None:
-    form.times.setText("0, 1 ns, 2 ns, 4 ns")
+    enter(form.shots.entries["times"], "0, 1 ns, 2 ns, 4 ns")
     press(form, qtbot)
     numbers, places = form.plot.figure.axes
     assert places.get_xlabel() == "time (ns)"
@@ -87,15 +88,15 @@ def test_numbers_and_centroid_are_drawn_over_time(form: Any, qtbot: Any) -> None
     lines = {line.get_label(): line for axes in (numbers, places) for line in axes.lines}
     assert {"peak", "rms", "centroid_y", "centroid_x"} <= lines.keys()
     np.testing.assert_allclose(lines["rms"].get_xdata(), [0, 1, 2, 4])
-    np.testing.assert_allclose(lines["rms"].get_ydata(), form.results[0]["rms"].value)
+    np.testing.assert_allclose(lines["rms"].get_ydata(), form.measured[0]["rms"].value)
     middle = 1e6 * 15.5 * paper_setup().object_pixel_size
     np.testing.assert_allclose(lines["centroid_y"].get_ydata(), middle, rtol=0.02)
 
 
 def test_shots_are_chosen_and_numbered_without_times(form: Any, qtbot: Any) -> None:
-    form.shots.setText("1:4:2")
+    enter(form.shots.entries["shots"], "1:4:2")
     press(form, qtbot)
-    np.testing.assert_array_equal(form.results[0].coordinates["shot"].values, [1, 3])
+    np.testing.assert_array_equal(form.measured[0].coordinates["shot"].values, [1, 3])
     assert "per shot" in texts_of(form.report)["Growth of rms"]
     ticks = form.plot.figure.axes[-1].get_xticks()
     np.testing.assert_array_equal(ticks, np.round(ticks))
@@ -114,18 +115,18 @@ MISTAKES = [  # product, shots, times, message
 
 def test_mistake_with_a_store_is_a_sentence(form: Any, qtbot: Any, messages: list[str]) -> None:
     for product, shots, times, message in MISTAKES:
-        form.product.setCurrentIndex(form.product.findData(product))
-        form.shots.setText(shots)
-        form.times.setText(times)
+        form.product.set_kind(product)
+        enter(form.shots.entries["shots"], shots)
+        enter(form.shots.entries["times"], times)
         assert message in press(form, qtbot)
         assert message in messages[-1]
-        assert form.results == []
+        assert form.measured == []
 
 
 def test_series_is_saved_as_a_table_and_a_figure(
     form: Any, qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    form.times.setText("2 ns")
+    enter(form.shots.entries["times"], "2 ns")
     press(form, qtbot)
     names = iter([(tmp_path / "growth.csv", ""), (tmp_path / "growth", "PDF (*.pdf)")])
     monkeypatch.setattr(
@@ -158,21 +159,21 @@ def test_cancelled_series_leaves_no_result(
     form.panel.button.click()
     qtbot.waitUntil(lambda: not form.panel.running, timeout=PATIENCE)
     assert form.panel.status.text() == "Cancelled."
-    assert form.results == []
+    assert form.measured == []
     monkeypatch.undo()
     assert press(form, qtbot) == ""
-    assert len(form.results) == 1
+    assert len(form.measured) == 1
 
 
 def test_single_result_has_no_times(form: Any, window: Any, qtbot: Any) -> None:
-    form.times.setText("1 ns")
+    enter(form.shots.entries["times"], "1 ns")
     press(form, qtbot)
     inversion = invert(image_at(0.0), source=np.full((32, 32), 300.0))
     added = add_to_viewer(window, inversion, paper_setup(), name="single")
     form.result.layer = next(layer for layer in added if layer in form.result.offered)
-    assert not form.times.isVisibleTo(form)
-    form.samples.setValue(20)
+    assert not form.shots.isVisibleTo(form)
+    enter(form.bands.entries["samples"], 20)
     press(form, qtbot)
-    (measured,) = form.results  # those of the store are forgotten
+    (measured,) = form.measured  # those of the store are forgotten
     assert not measured.is_series
     assert form.save.isEnabled()

@@ -23,7 +23,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read_field_grid
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantom_models import BlobRecipe, ToroidRecipe
+from napari_shadowinv.physics.phantom_models import BlobRecipe
 from napari_shadowinv.physics.phantoms import (
     coaxial_line,
     four_toroids,
@@ -34,7 +34,6 @@ from napari_shadowinv.physics.phantoms import (
 )
 from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import deflector_titles
-from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
 from napari_shadowinv.pipeline.experiment_object import object_of_field
 
@@ -233,25 +232,12 @@ def test_an_object_brings_the_beam_that_it_needs(
     assert "select the setup 'light'" in messages[0]
 
 
-def test_a_strong_object_warns_of_caustics_and_a_weak_one_does_not() -> None:
-    weak = run_job(ForwardJob(BlobRecipe(amplitude=5, sigma=8), shape=(40, 50)))
-    strong = run_job(ForwardJob(BlobRecipe(amplitude=-200, sigma=8), shape=(40, 50)))
-    assert weak.warning == ""
-    assert "Caustics" in strong.warning
-    assert strong.caustic_share > 0
-
-
 def test_a_potential_and_its_object_make_the_same_image() -> None:
     blob = BlobRecipe(amplitude=20, sigma=8)
     phantom = blob.phantom((40, 50), None)
     by_object = run_job(ForwardJob(blob, shape=(40, 50)))
     by_potential = run_job(ForwardJob(InputField(1e9 * phantom.potential, to_px2=1e-9)))
     assert abs(by_object.image - by_potential.image).max() < 0.02
-
-
-def test_a_magnetic_object_asks_for_particles() -> None:
-    with pytest.raises(InputError, match="select the setup"):
-        run_job(ForwardJob(ToroidRecipe()))
 
 
 def test_a_3d_field_of_a_file_is_traced(tmp_path: Path) -> None:
@@ -267,8 +253,8 @@ def test_a_3d_field_of_a_file_is_traced(tmp_path: Path) -> None:
     dataset.to_netcdf(path, engine="h5netcdf")
     setup = paper_setup()
     with pytest.raises(InputError, match="there is no setup"):
-        run_job(ForwardJob(GridFile(str(path), GridView()), shape=(20, 30)))
-    job = ForwardJob(GridFile(str(path), GridView(right="-x")), shape=(20, 30), setup=setup)
+        run_job(ForwardJob(GridFile(file=path), shape=(20, 30)))
+    job = ForwardJob(GridFile(file=path, right="-x"), shape=(20, 30), setup=setup)
     prediction = run_job(job)
     # Seen with x to the left, y points up.
     expected = setup.displacement_from_path_integrated_b([-0.5 * 4e-4, 0.0])[1]
@@ -280,7 +266,7 @@ def test_a_3d_field_of_a_file_is_traced(tmp_path: Path) -> None:
 def tool(opened: Any) -> Any:
     """The widget with a small toroid and three draws."""
     tool = opened(Simulate)
-    tool.task.setCurrentIndex(tool.task.findData("plan"))
+    tool.task.set_kind("plan")
     tool.object.set_kind("toroid")
     tool.object.form.restore({"peak": 20.0, "radius": 9e-6})
     tool.side.setText("64 x 64")
@@ -309,8 +295,8 @@ def test_a_plan_shows_its_verdict_and_the_first_image(
 
 
 def test_a_sweep_draws_the_error_at_each_value(tool: Any, qtbot: Any) -> None:
-    tool.quantity.setCurrentIndex(tool.quantity.findData("counts"))
-    tool.values.setText("100, 1600")
+    tool.quantity.set_kind("counts")
+    enter(tool.quantity.form.entries["values"], "100, 1600")
     finished(tool, qtbot)
     line = tool.plot.figure.axes[0].lines[0]
     np.testing.assert_array_equal(line.get_xdata(), [100, 1600])
@@ -350,9 +336,7 @@ def cube(tmp_path: Path) -> Path:
 def traced(tool: Any, cube: Path) -> Any:
     """The widget with the field of the file, seen along x."""
     tool.object.set_kind("grid")
-    tool.file.edit.setText(str(cube))
-    tool.file.changed.emit()
-    tool.object.form.restore({"beam": "x", "right": "y", "centre": True})
+    tool.object.form.restore({"file": str(cube), "beam": "x", "right": "y", "centre": True})
     tool.side.setText("")
     return tool
 
@@ -360,7 +344,6 @@ def traced(tool: Any, cube: Path) -> Any:
 def test_a_3d_field_is_planned_as_in_python(
     traced: Any, viewer: ViewerModel, cube: Path, qtbot: Any
 ) -> None:
-    assert traced.file.isVisibleTo(traced)
     finished(traced, qtbot)
     qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
     grid = read_field_grid(cube).turned("x", "y").centred()
@@ -375,18 +358,14 @@ def test_a_3d_field_is_planned_as_in_python(
     assert layer.name == "cube.nc, planned"
     texts = texts_of(traced.report)
     assert texts["Error made"] == next(f.text for f in expected.facts if f.title == "Error made")
-    traced.object.set_kind("toroid")
-    assert not traced.file.isVisibleTo(traced)
 
 
 def test_file_and_view_are_remembered(traced: Any, cube: Path) -> None:
     state = traced.state()
+    traced.object.form.restore({})
     traced.object.set_kind("toroid")
-    traced.file.edit.setText("")
     traced.restore(state)
-    file = traced._object(None)
-    assert file.path == str(cube)
-    assert file.view.model_dump() == {"beam": "x", "right": "y", "centre": True}
+    assert traced._object(None) == GridFile(file=cube, beam="x", right="y", centre=True)
 
 
 def test_wrong_file_is_a_sentence(
@@ -395,22 +374,22 @@ def test_wrong_file_is_a_sentence(
     np.save(tmp_path / "plane.npy", np.ones((4, 4)))
     xr.Dataset({"rho": ("x", np.ones(3))}).to_netcdf(tmp_path / "rho.nc", engine="h5netcdf")
     for text, message in (
-        ("", "There is no file with a 3-D field: choose one"),
+        ("", "'File' is missing"),
         (str(tmp_path / "none.h5"), "none.h5"),
         (str(tmp_path / "plane.npy"), "is no HDF5 file: expected an openPMD file or a NetCDF 4"),
         (str(tmp_path / "rho.nc"), "rho.nc"),
     ):
-        traced.file.edit.setText(text)
+        enter(traced.object.form.entries["file"], text)
         finished(traced, qtbot)
         assert message in traced.panel.status.text()
         assert message in messages[-1]
     assert len(messages) == 4
-    traced.file.edit.setText(str(tmp_path / "cube.nc"))
-    traced.object.form.restore({"beam": "x", "right": "x"})
+    file = str(tmp_path / "cube.nc")
+    traced.object.form.restore({"file": file, "beam": "x", "right": "x"})
     finished(traced, qtbot)
     assert len(messages) == 5
     assert "right" in messages[-1]
-    traced.object.form.restore({"beam": "x", "right": "y"})
+    traced.object.form.restore({"file": file, "beam": "x", "right": "y"})
     traced.setup.picker.set_kind("none")
     finished(traced, qtbot)
     assert "There is no setup: expected one of charged particles" in messages[-1]

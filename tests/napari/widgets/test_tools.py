@@ -114,11 +114,14 @@ def test_a_profile_has_true_units_on_both_axes(profile: Any, qtbot: Any) -> None
 def test_a_plot_ignores_the_settings_of_other_figures(qtbot: Any) -> None:
     plot = Plot(200)
     qtbot.addWidget(plot)
+
+    def draw(columns: list[Any]) -> None:
+        columns[0].plot([0, 1], [0, 1], label="a_b")
+        columns[0].set_xlabel("50 % of a_b")  # no text that TeX takes
+        columns[0].legend()
+
     with rc_context({"text.usetex": True}):
-        (axis,) = plot.fresh_axes()
-        axis.plot([0, 1], [0, 1], label="a_b")
-        axis.set_xlabel("50 % of a_b")  # no text that TeX takes
-        plot.add_legend(axis)
+        plot.show_drawing(draw)
         plot.figure.canvas.draw()
     assert not any(text.get_usetex() for text in plot.figure.findobj(Text))
 
@@ -162,16 +165,18 @@ def test_a_profile_is_averaged_over_its_width(profile: Any, window: Any, qtbot: 
         return bool(profile.profiles) and profile.profiles[0].values[3] == pytest.approx(value)
 
     qtbot.waitUntil(lambda: shows(400), timeout=PATIENCE)
-    profile.width_edit.setValue(9)
+    profile.width_edit.setText("9")
     qtbot.waitUntil(lambda: shows(400 + 80 / 12), timeout=PATIENCE)
     axes = profile.plot.figure.axes
     assert axes[-1].get_xlabel() == "distance (µm), mean over 9 px"
     assert "height (nm), mean over 9 px" in profile.table()
-    profile.width_unit.setCurrentText("µm")  # pixels of 2 µm
-    profile.width_edit.setValue(10)
+    profile.width_edit.setText("10 um")  # pixels of 2 µm
     qtbot.waitUntil(lambda: shows(400 + 24 / 12), timeout=PATIENCE)
     assert axes[-1] not in profile.plot.figure.axes
     assert "mean over 10 µm" in profile.table()
+    profile.width_edit.setText("-1")
+    qtbot.waitUntil(lambda: "Width is '-1'" in profile.problem.text(), timeout=PATIENCE)
+    assert profile.profiles == []
 
 
 def test_a_profile_lies_on_a_layer_that_was_turned(profile: Any, window: Any, qtbot: Any) -> None:

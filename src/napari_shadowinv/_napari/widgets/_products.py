@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, count
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 from napari.utils.notifications import show_info
+from pydantic import Field, create_model
 from qtpy import QtWidgets
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.jobs import Finished, Job, name_of_result
+from napari_shadowinv._napari.layers import LayerData, add_layers
 from napari_shadowinv._napari.placement import mapped, matrix_between
 from napari_shadowinv._napari.preferences import colour_map
-from napari_shadowinv._napari.run import Outcome, Run
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes
-from napari_shadowinv._napari.widgets._panels import ReportView
+from napari_shadowinv._napari.widgets._panels import ReportView, ToolPanel
 from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis import (
     FIELD_UNITS,
@@ -34,174 +38,153 @@ from napari_shadowinv.analysis import (
     product_from_dict,
     products_table,
 )
-from napari_shadowinv.analysis.axisymmetric import AxisymmetricProfile
-from napari_shadowinv.analysis.outlines import Outlined
-from napari_shadowinv.analysis.product import BANDS
 from napari_shadowinv.analysis.series import shot_times
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import write
-from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, RESULT, SITES
+from napari_shadowinv.io import replacing, write
+from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
 from napari_shadowinv.io.store_shots import open_shots
 from napari_shadowinv.physics.beam import number_in_unit
 from napari_shadowinv.physics.units import prefix_for
-from napari_shadowinv.plotting import make_logarithmic, products_figure, save_figure
+from napari_shadowinv.plotting import draw_curves, products_figure, save_figure
 
 _ELLIPSE_CORNERS = 90
 _ROUND = 0.02  # largest difference of the axes of a circle
-_OPACITIES = (0.35, 0.18)  # of the bands
 _BY_SETUP = "unit of the setup"
-_TIMES, _SHOTS = "Times", "Shots"  # labels of the rows of a store
+_MORE = "more"
+# The products that most experiments need; the others follow below *more…*.
+_USUAL = ("profile", "region", "flux", "current", "current-density", "axisymmetric")
 OPEN_SHAPES = ("line", "path")
 _PANEL_HEIGHT_PX = 180
-_MAX_COLUMN = 3  # entries of a legend inside the axes; longer ones are above
 
 
 @dataclass(frozen=True, eq=False)
-class _Request:
-    """A product to be measured, of a result or of the shots of a store, and a layer of it."""
+class ProductJob(Job):
+    """The measurement of a product, of a result or of the shots of a store."""
 
     origin: about.Result[Any] | Path
-    layer: Any
-    work: Callable[[OnProgress, ShouldStop], list[ProductResult]]
+    layer: Any  # of the result or the store
+    product: Product
+    unit: str | None
+    samples: int
+    shots: str | None
+    times: str
+
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
+        common: Any = {"unit": self.unit, "on_progress": on_progress, "should_stop": should_stop}
+        if isinstance(self.origin, Path):
+            stack = open_shots(self.origin, self.shots)
+            seconds = _seconds(self.times, stack["index"].values.tolist())
+            return analyse_shots(stack, self.product, seconds, **common)
+        choices = {"samples": self.samples, "setup": self.origin.setup, **common}
+        return analyse(self.origin.content, self.product, **choices)
+
+    def layers(self, content: list[ProductResult]) -> LayerData:
+        """Describe the maps, on top of the result."""
+        return [
+            map_layer(measured, name, self.layer)
+            for measured in content
+            for name, variable in measured.variables.items()
+            if variable.dims == PLANE
+        ]
 
 
-class ProductPlot(qt.Plot):
-    """The curves of a product with their bands of 68 and 95 %, or its series over shots."""
-
-    def __init__(self) -> None:
-        super().__init__(height=_PANEL_HEIGHT_PX)
-
-    def show_curves(self, result: ProductResult) -> bool:
-        """Draw all curves but the image's intensity; return whether there is any."""
-        groups = result.curve_groups
-        if not groups:
-            return False
-        self.setMinimumHeight(_PANEL_HEIGHT_PX * len(groups))
-        axes = self.fresh_axes(len(groups))
-        for axis, names in zip(axes, groups, strict=True):
-            self._draw_group(axis, result, names)
-        _, words = result.shown_places(groups[0][0])
-        axes[-1].set_xlabel(f"{words[:1].lower()}{words[1:]}", color=self.ink)
-        if "shot" in result.coordinates:
-            axes[-1].xaxis.get_major_locator().set_params(integer=True)
-        if result.is_logarithmic:
-            make_logarithmic(axes[-1])
-        self.draw()
-        return True
-
-    def _draw_group(self, axis: Any, result: ProductResult, names: Sequence[str]) -> None:
-        places, _ = result.shown_places(names[0])
-        scale, unit = result.shown_scale(names)
-        marker = "." if result.is_series else ""
-        for number, name in enumerate(names):
-            colour = qt.COLOURS[number % len(qt.COLOURS)]
-            axis.plot(places, scale * result[name].value, color=colour, marker=marker, label=name)
-            for share, opacity in zip(BANDS, _OPACITIES, strict=True):
-                if (band := result.band(name, share)) is not None:
-                    low, high = (scale * end for end in band)
-                    axis.fill_between(places, low, high, color=colour, alpha=opacity, linewidth=0)
-        axis.set_ylabel("" if unit == "1" else unit, color=self.ink)
-        if len(names) > _MAX_COLUMN:
-            above = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
-            compact = {"ncols": len(names), "handlelength": 1.0, "columnspacing": 0.8}
-            self.add_legend(axis, size=7, frameon=False, **above, **compact)
-        else:
-            self.add_legend(axis)
+def draw_groups(columns: Sequence[Any], result: ProductResult) -> None:
+    """Draw the curves of a product, in a panel for each unit, but the image's intensity."""
+    for axes, names in zip(columns, result.curve_groups, strict=True):
+        draw_curves(axes, result, names, qt.COLOURS)
+        axes.label_outer()
+        above: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+        axes.legend(frameon=False, ncols=len(names), **above)
 
 
-class ProductForm(QtWidgets.QWidget):
+class _Bands(CheckedModel):
+    """How the bands of a single result are found."""
+
+    samples: int = Field(
+        default=100, ge=20, le=2000, description="Number of samples of the field for the bands."
+    )
+
+
+class _Shots(CheckedModel):
+    """The shots of a store that are followed."""
+
+    shots: str = Field(
+        default="all finished ones",
+        description="Shots of the store, such as 3:20 or 0,2,5. Empty: all finished ones.",
+    )
+    times: str = Field(
+        default="shots are numbered",
+        description="Time between two shots of the store, such as 1 ns, or the times of all shots "
+        "used, such as 0, 1 ns, 3 ns; a number without a unit is in s. Empty: shots are "
+        "numbered, and rates are per shot.",
+    )
+
+
+class ProductForm(ToolPanel):
     """Choose a result, a product and a shape, and measure it with its bands.
 
     Of a store, the product is followed through its shots.
     """
 
     def __init__(self, viewer: Any) -> None:
-        super().__init__()
-        self.viewer = viewer
-        self.results: list[ProductResult] = []
+        run = Run("analysis", "Measure", "Measure the product with its bands.")
+        super().__init__(viewer, "products", run)
+        self.measured: list[ProductResult] = []
         self._origin: about.Result[Any] | Path | None = None
         tip = "<qt>Layer of the result of an inversion or a fit, or of a store of shots.</qt>"
         self.result = LayerPicker(
             viewer, tip, suits=lambda layer: bool(about.result_of(layer) or _store_of(layer))
         )
-        self.product = forms.SteadyComboBox(
-            {name: f"{kind.title[:1].upper()}{kind.title[1:]}" for name, kind in PRODUCTS.items()}
-        )
+        kinds = _forms_of(PRODUCTS)
+        usual = {name: kinds.pop(name) for name in _USUAL}
+        self.more_products = forms.ModelPicker("", kinds)
+        self.product = forms.ModelPicker("Product", {**usual, _MORE: ("more…", self.more_products)})
         tip = "<qt>Shapes layer with the line or outline. Of several, the selected is used.</qt>"
         self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",))
         self.unit = forms.SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
-        tip = "<qt>Width of the strip across a profile's line, in px.</qt>"
-        self.width_edit = QtWidgets.QDoubleSpinBox(maximum=1e4, toolTip=tip)
-        component = AxisymmetricProfile.model_fields["component"]
-        titles = {name: name for name in get_args(component.annotation)}
-        self.component = forms.SteadyComboBox(titles, str(component.description))
-        self._component_row = forms.labelled(str(component.title), self.component)
-        tip = "<qt>Number of samples of the field for the bands.</qt>"
-        self.samples = QtWidgets.QSpinBox(minimum=20, maximum=2000, value=100, toolTip=tip)
-        self.times = forms.SavedLine(
-            "shots are numbered",
-            "Time between two shots of the store, such as 1 ns, or the times of all shots "
-            "used, such as 0, 1 ns, 3 ns; a number without a unit is in s. Empty: shots are "
-            "numbered, and rates are per shot.",
-        )
-        self.shots = forms.SavedLine(
-            "all finished ones",
-            "Shots of the store, such as 3:20 or 0,2,5. Empty: all finished ones.",
-        )
-        self._store_rows = (forms.labelled(_SHOTS, self.shots), forms.labelled(_TIMES, self.times))
-        self.panel = Run("analysis", "Measure", "Measure the product with its bands.")
-        self.panel.button.clicked.connect(lambda: self._run_or_cancel())
-        self.panel.ended.connect(self._on_end)
-        self.plot, self.report = ProductPlot(), ReportView()
+        self.bands, self.shots = forms.ModelForm(_Bands), forms.ModelForm(_Shots)
+        self.plot, self.report = qt.Plot(_PANEL_HEIGHT_PX), ReportView()
         self.export = qt.push_button("Export CSV…", "Save all measured products.", self._export)
-        self.save = qt.push_button(
-            "Save with result…", "Save the result with all measured products.", self._save
-        )
+        self.save = qt.push_button("Save with result…", "", self._save)
         self.picture = qt.push_button(
             "Save figure…", "Save a figure of all measured products.", self._save_figure
         )
         self.clear = qt.push_button("Clear", "Forget all measured products.", self._clear)
         shapes = qt.with_button(self.shapes, "✎", "Draw a new shape for the product.", self._draw)
-        numbers = qt.side_by_side((self.width_edit, 1), (self.samples, 1))
-        _, layout = qt.scrolling_column(
-            self,
+        self._shape_row = forms.labelled("Shape", shapes)
+        self.add(
             forms.labelled("Result", self.result),
-            *self._store_rows,
-            forms.labelled("Product", self.product),
-            forms.labelled("Shape", shapes),
+            self.shots,
+            self.product,
+            self._shape_row,
             forms.labelled("Unit", self.unit),
-            self._component_row,
-            forms.labelled("Width, samples", numbers),
+            self.bands,
             self.panel,
             self.plot,
             self.report,
             qt.side_by_side((self.export, 1), (self.picture, 1)),
             qt.side_by_side((self.save, 1), (self.clear, 0)),
         )
-        layout.addStretch(1)
         self.result.picked.connect(self._on_result)
-        self.product.currentIndexChanged.connect(lambda _: self._enable())
+        for picker in (self.product, self.more_products):
+            picker.changed.connect(lambda: self._shape_row.setVisible(_is_drawn(self.kind)))
         self._on_result()
-        self._enable()
         self._clear()
 
     @property
-    def kind(self) -> type[Product]:
-        return PRODUCTS[self.product.currentData()]
+    def _picker(self) -> forms.ModelPicker:
+        return self.more_products if self.product.kind == _MORE else self.product
 
-    def _enable(self) -> None:
-        is_drawn = "path" in self.kind.model_fields
-        self.shapes.parent().setEnabled(is_drawn)
-        self.width_edit.setEnabled("width" in self.kind.model_fields)
-        self._component_row.setVisible("component" in self.kind.model_fields)
+    @property
+    def kind(self) -> type[Product]:
+        return PRODUCTS[self._picker.kind]
 
     def _on_result(self) -> None:
-        """Show the rows of a store or of a single result, and offer the units of its fields."""
+        """Show the entries of a store or of a single result, and offer the units of its fields."""
         layer = self.result.layer
         is_store = layer is not None and _store_of(layer) is not None
-        for row in self._store_rows:
-            row.setVisible(is_store)
-        self.samples.setEnabled(not is_store)
+        self.shots.setVisible(is_store)
+        self.bands.setVisible(not is_store)
         tip = "Save the result with all measured products."
         if is_store:
             tip = "Only for a single result; of a store, export a table or save a figure."
@@ -215,7 +198,7 @@ class ProductForm(QtWidgets.QWidget):
         self.unit.addItems([_BY_SETUP, *symbols])
         self.unit.setCurrentText(before if before in symbols else _BY_SETUP)
 
-    def request(self) -> _Request:
+    def request(self) -> ProductJob:
         """Return what is to be measured, or raise an `InputError`."""
         layer = self.result.layer
         if layer is None:
@@ -223,28 +206,17 @@ class ProductForm(QtWidgets.QWidget):
                 "there is no result to measure: run 'Invert shot', 'Fit several images' or "
                 "'Invert stack', or open a .shadowinv file or a store of shots"
             )
-        values: dict[str, Any] = {"product": self.kind.name()}
-        if "width" in self.kind.model_fields:
-            values["width"] = self.width_edit.value()
-        if "component" in self.kind.model_fields:
-            values["component"] = self.component.currentData()
-        if "path" in self.kind.model_fields:
+        choices: Any = self._picker.model()
+        values = {**choices.model_dump(exclude_unset=True), "product": self.kind.name()}
+        if _is_drawn(self.kind):
             values |= self._outline(layer)
         symbol = self.unit.currentText()
         product, unit = product_from_dict(values), None if symbol == _BY_SETUP else symbol
         origin: Any = _store_of(layer) or about.result_of(layer)
-        shots, times = self.shots.text().strip() or None, self.times.text().strip()
-        samples = self.samples.value()
-
-        def work(on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
-            common: Any = {"unit": unit, "on_progress": on_progress, "should_stop": should_stop}
-            if isinstance(origin, Path):
-                stack = open_shots(origin, shots)
-                seconds = _seconds(times, stack["index"].values.tolist())
-                return analyse_shots(stack, product, seconds, **common)
-            return analyse(origin.content, product, samples=samples, setup=origin.setup, **common)
-
-        return _Request(origin, layer, work)
+        bands: Any = self.bands.model()
+        shots = self.shots.state()
+        followed = shots.get("shots"), shots.get("times", "")
+        return ProductJob(origin, layer, product, unit, bands.samples, *followed)
 
     def _outline(self, layer: Any) -> dict[str, Any]:
         """Return the fields of a product that the selected shape stands for, in px."""
@@ -253,7 +225,7 @@ class ProductForm(QtWidgets.QWidget):
             raise InputError(
                 f"there is no shape for the {self.kind.title}: press ✎ and draw one on the image"
             )
-        is_closed = issubclass(self.kind, Outlined)
+        is_closed = "center" in self.kind.model_fields
         index = selected_shape(
             shapes,
             lambda kind: is_closed != (kind in OPEN_SHAPES) or (is_closed and kind == "path"),
@@ -265,107 +237,101 @@ class ProductForm(QtWidgets.QWidget):
                 "press ✎ and draw one"
             )
         corners = mapped(matrix_between(shapes, layer), shapes.data[index])
-        return shape_fields(shapes.shape_type[index], corners)
+        values = shape_fields(shapes.shape_type[index], corners)
+        if not values.keys() <= self.kind.model_fields.keys():
+            raise InputError(
+                f"the shape for the {self.kind.title} is no circle: press ✎ and draw an ellipse "
+                "with the Shift key held down"
+            )
+        return values
 
     def choose(self, layer: Any) -> None:
         """Select the result that a layer belongs to, or raise an `InputError`."""
-        result = None if layer is None else about.result_of(layer) or _store_of(layer)
-        of_result = [
-            each
-            for each in self.result.offered
-            if result is not None and result in (about.result_of(each), _store_of(each))
-        ]
+        together = [] if layer is None else about.layers_of(self.viewer, layer)
+        of_result = [each for each in together if each in self.result.offered]
         if not of_result:
             raise InputError(
                 "no result is selected: select a layer of an inversion, a fit or a store of shots"
             )
         self.result.layer = layer if layer in of_result else of_result[-1]
 
-    @qt.notify_errors
-    def _run_or_cancel(self) -> None:
-        if self.panel.running:
-            self.panel.cancel()
-            return
-        request = self.request()
-        self.panel.start(request.work, request)
-
-    def _on_end(self, outcome: Outcome) -> None:
-        if outcome.value is None:
-            return
-        request: _Request = outcome.tag
-        if self._origin != request.origin:
-            self.results = []
-        self._origin = request.origin
-        for measured in outcome.value:
-            taken = {each.name for each in self.results}
-            numbers = (f"{measured.name}_{number}" for number in range(2, 10_000))
-            name = next(n for n in (measured.name, *numbers) if n not in taken)
-            self.results.append(replace(measured, name=name))
-            self._show(self.results[-1], request)
-
-    def _show(self, measured: ProductResult, request: _Request) -> None:
+    def show_result(self, finished: Finished, job: ProductJob) -> None:
+        if self._origin != job.origin:
+            self.measured = []
+        self._origin = job.origin
+        for measured in finished.content:
+            taken = {each.name for each in self.measured}
+            numbered = (f"{measured.name}_{number}" for number in count(2))
+            name = next(n for n in chain([measured.name], numbered) if n not in taken)
+            self.measured.append(replace(measured, name=name))
+        measured = self.measured[-1]
         rows = [(fact.title, fact.text) for fact in measured.facts]
-        rows += [("Note", sentence) for sentence in measured.limits]
-        self.report.show_rows(rows)
-        self.plot.setVisible(self.plot.show_curves(measured))
+        self.report.show_rows([*rows, *(("Note", sentence) for sentence in measured.limits)])
+        panels = len(measured.curve_groups)
+        self.plot.setVisible(panels > 0)
+        if panels:
+            self.plot.setMinimumHeight(_PANEL_HEIGHT_PX * panels)
+            self.plot.show_drawing(lambda axes: draw_groups(axes, measured), panels)
         for widget in (self.export, self.picture, self.clear):
             widget.setEnabled(True)
-        self.save.setEnabled(isinstance(request.origin, about.Result))
-        for name, variable in measured.variables.items():
-            if variable.dims == PLANE:
-                add_layers(self.viewer, [map_layer(measured, name, request.layer)])
+        self.save.setEnabled(isinstance(job.origin, about.Result))
+        add_layers(self.viewer, finished.layer_data)
+        self.reveal(self.report)
 
     def _clear(self) -> None:
-        self.results, self._origin = [], None
+        self.measured, self._origin = [], None
         self.report.setVisible(False)
         self.plot.setVisible(False)
         for widget in (self.export, self.picture, self.save, self.clear):
             widget.setEnabled(False)
-
-    def show_problem(self, text: str) -> None:
-        """Show a problem until the next measurement."""
-        self.panel.say(text, problem=True)
 
     @qt.notify_errors
     def _draw(self) -> None:
         layer = self.result.layer
         if layer is None:
             raise InputError("there is no result to draw on: run 'Invert shot' first")
-        mode = "add_ellipse" if issubclass(self.kind, Outlined) else "add_line"
+        mode = "add_ellipse" if "center" in self.kind.model_fields else "add_line"
         self.shapes.layer = new_shapes(self.viewer, layer, self.kind.name(), mode)
 
     @qt.notify_errors
     def _export(self) -> None:
-        export_csv(self, "products.csv", products_table(self.results))
+        export_csv(self, "products", products_table(self.measured))
 
     @qt.notify_errors
     def _save_figure(self) -> None:
-        filters = ";;".join(f"{suffix[1:].upper()} (*{suffix})" for suffix in FIGURE_SUFFIXES)
-        name, selected = QtWidgets.QFileDialog.getSaveFileName(
-            self, "Save figure", f"products{PNG.suffix}", filters
-        )
-        if not name:
-            return
-        path = Path(name)
-        if path.suffix.lower() not in FIGURE_SUFFIXES:
-            suffixes = [suffix for suffix in FIGURE_SUFFIXES if f"*{suffix}" in selected]
-            path = path.with_name(path.name + (suffixes or [PNG.suffix])[0])
-        figure = products_figure(self.results)
-        show_info(f"Wrote {save_figure(path, figure, overwrite=path == Path(name))}")
+        if chosen := ask_file(self, "Save figure", "products", FIGURE_SUFFIXES):
+            figure = products_figure(self.measured)
+            show_info(f"Wrote {save_figure(chosen.path, figure, overwrite=chosen.overwrite)}")
 
     @qt.notify_errors
     def _save(self) -> None:
         result: Any = self._origin
-        name, _ = QtWidgets.QFileDialog.getSaveFileName(
-            self, "Save with result", f"products{RESULT.suffix}", f"Result (*{RESULT.suffix})"
-        )
-        if not name:
-            return
-        content = result.content
-        if result.setup is not None and content.setup is None:
-            content = content.in_units(result.setup)
-        dataset = content.to_dataset()
-        show_info(f"Wrote {write(name, add_products(dataset, self.results), overwrite=True)}")
+        if chosen := ask_file(self, "Save with result", "products", RESULT.suffixes[:1]):
+            content = result.content
+            if result.setup is not None and content.setup is None:
+                content = content.in_units(result.setup)
+            dataset = add_products(content.to_dataset(), self.measured)
+            show_info(f"Wrote {write(chosen.path, dataset, overwrite=chosen.overwrite)}")
+
+
+def _is_drawn(kind: type[Product]) -> bool:
+    """Whether a product needs a line or an outline."""
+    return not {"path", "center"}.isdisjoint(kind.model_fields)
+
+
+def _forms_of(products: Mapping[str, type[Product]]) -> forms.Kinds:
+    """Return titles and models of products for a picker, without the fields of shapes."""
+    kinds: forms.Kinds = {}
+    for name, kind in products.items():
+        of_shape = {"label"} | ({"radius"} if "center" in kind.model_fields else set())
+        fields: Any = {}
+        for key, field in kind.parameters().items():
+            extra: Any = field.json_schema_extra or {}
+            if key not in of_shape and "metavar" not in extra and "hidden" not in extra:
+                fields[key] = field.annotation, field
+        title = f"{kind.title[:1].upper()}{kind.title[1:]}"
+        kinds[name] = title, create_model(kind.title, __base__=CheckedModel, **fields)
+    return kinds
 
 
 def _store_of(layer: Any) -> Path | None:
@@ -377,7 +343,7 @@ def _seconds(times: str, shots: list[int]) -> list[float] | None:
     """Return the time of each shot in s; None if shots are numbered."""
     if not times:
         return None
-    received = f"{_TIMES} is '{times}'"
+    received = f"Times is '{times}'"
     try:
         numbers = [number_in_unit(part, "s") for part in times.split(",")]
     except ValueError:
@@ -387,11 +353,36 @@ def _seconds(times: str, shots: list[int]) -> list[float] | None:
     return shot_times(numbers, shots, received)
 
 
-def export_csv(parent: QtWidgets.QWidget, name: str, text: str) -> None:
+class ChosenFile(NamedTuple):
+    """A file to write, and whether the user agreed to replace it."""
+
+    path: Path
+    overwrite: bool
+
+
+def ask_file(
+    parent: QtWidgets.QWidget, title: str, stem: str, suffixes: Sequence[str]
+) -> ChosenFile | None:
+    """Ask for a file with one of several endings, the first by default; None if cancelled."""
+    filters = {f"{suffix[1:].upper()} (*{suffix})": suffix for suffix in suffixes}
+    name, selected = QtWidgets.QFileDialog.getSaveFileName(
+        parent, title, stem + suffixes[0], ";;".join(filters)
+    )
+    if not name:
+        return None
+    path = Path(name)
+    if path.suffix.lower() in suffixes:
+        return ChosenFile(path, overwrite=True)
+    # The dialog asked about the entered name only.
+    return ChosenFile(path.with_name(path.name + filters.get(selected, suffixes[0])), False)
+
+
+def export_csv(parent: QtWidgets.QWidget, stem: str, text: str) -> None:
     """Ask for a file, offering a name, and write a table."""
-    path, _ = QtWidgets.QFileDialog.getSaveFileName(parent, "Export CSV", name, "CSV (*.csv)")
-    if path:
-        show_info(f"Wrote {forms.save_text(text, path, SITES.suffix)}")
+    if chosen := ask_file(parent, "Export CSV", stem, SITES.suffixes):
+        with replacing(chosen.path, chosen.overwrite) as unfinished:
+            unfinished.write_text(text, encoding="utf-8")
+        show_info(f"Wrote {chosen.path}")
 
 
 def selected_shape(shapes: Any, suits: Callable[[str], bool]) -> int | None:
@@ -418,17 +409,18 @@ def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:
     return {"path": [tuple(map(float, point)) for point in points]}
 
 
+_MAP = about.Kind("product", "", "{title} ({unit})", visible=True)
+
+
 def map_layer(measured: ProductResult, name: str, layer: Any) -> Any:
     """Describe the layer of a map, on top of a layer of its result."""
     values = measured[name].value
     largest = float(np.nanpercentile(np.abs(values), 99.8)) or 1.0
     factor, prefix = prefix_for(largest)
     unit = f"{prefix}{measured.variables[name].unit}"
-    keywords = {
-        "name": about.layer_name(f"{measured.title} ({unit})", layer.name.partition(" – ")[2]),
+    look = {
         "colormap": colour_map("signed"),
         "contrast_limits": (-factor * largest, factor * largest),
-        "metadata": about.metadata_for("product", unit),
-        **about.frame_of(layer).keywords(),
     }
-    return factor * values, keywords, "image"
+    words, name = {"title": measured.title, "unit": unit}, name_of_result(layer)
+    return _MAP.layer(factor * values, name, about.frame_of(layer), None, look, words=words)

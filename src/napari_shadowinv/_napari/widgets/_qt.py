@@ -33,6 +33,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
+_NO_LIMIT_PX = 16_777_215  # of Qt
 _CONSTANT_STAGES = ("samples",)  # do not change the objective
 # Errors that a saved state causes which another version wrote in another form.
 UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
@@ -263,18 +264,20 @@ def _plain_style() -> AbstractContextManager[None]:
 
 
 class Plot(QWidget):
-    """A figure, created at the first drawing."""
+    """A figure, hidden until the first drawing; it grows with the window unless it is `fixed`."""
 
-    def __init__(self, height: int) -> None:
+    def __init__(self, height: int, *, fixed: bool = False) -> None:
         super().__init__()
         self.setMinimumHeight(height)
+        self.setMaximumHeight(height if fixed else _NO_LIMIT_PX)
         self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
+        self.setVisible(False)
         column(self)
         self.figure: Any = None
         self.ink, self.paper = "", ""
         self._canvas: Any = None
 
-    def fresh_axes(self, rows: int = 1) -> list[Any]:
+    def _fresh_axes(self, rows: int = 1) -> list[Any]:
         """Return empty axes in a column with a common x axis."""
         if self._canvas is None:
             self._make_canvas()
@@ -293,12 +296,16 @@ class Plot(QWidget):
             axis.grid(color=self.ink, alpha=0.15)
         return axes
 
-    def add_legend(self, holder: Any, size: int = 8, **keywords: Any) -> None:
-        colours = {"labelcolor": self.ink, "facecolor": self.paper, "edgecolor": self.ink}
+    def show_drawing(self, draw: Callable[[list[Any]], Any], rows: int = 1) -> None:
+        """Draw on empty axes in a column, and give their legends napari's colours."""
+        self.setVisible(True)
+        axes = self._fresh_axes(rows)
         with _plain_style():
-            holder.legend(fontsize=size, **colours, **keywords)
-
-    def draw(self) -> None:
+            draw(axes)
+        for legend in filter(None, (each.get_legend() for each in axes)):
+            legend.get_frame().set(facecolor=self.paper, edgecolor=self.ink)
+            for text in legend.get_texts():
+                text.set(color=self.ink, fontsize=8)
         self._canvas.draw_idle()
 
     def _make_canvas(self) -> None:
@@ -336,10 +343,8 @@ class ObjectiveCurve(Plot):
     """The objective of a fit at each step, with a colour for each stage."""
 
     def __init__(self) -> None:
-        super().__init__(_CURVE_HEIGHT_PX)
-        self.setMaximumHeight(_CURVE_HEIGHT_PX)
+        super().__init__(_CURVE_HEIGHT_PX, fixed=True)
         self._shown = 0
-        self.setVisible(False)
 
     def empty(self) -> None:
         self._shown = 0
@@ -355,8 +360,9 @@ class ObjectiveCurve(Plot):
         drawable = np.where(values > 0, values, np.nan)
         if np.isfinite(drawable).sum() < 2:
             return
-        self.setVisible(True)
-        (axis,) = self.fresh_axes()
+        self.show_drawing(lambda axes: self._draw(axes[0], steps, drawable))
+
+    def _draw(self, axis: Any, steps: list[tuple[str, float]], drawable: Any) -> None:
         colours: dict[str, str] = {}
         begin = 0
         for stage, group in groupby(steps, key=lambda step: step[0]):
@@ -371,5 +377,5 @@ class ObjectiveCurve(Plot):
         axis.set_yscale("log")
         axis.set_ylabel("objective")
         axis.set_xlabel("step")
-        self.add_legend(self.figure, 7, loc="outside upper center", ncols=3, frameon=False)
-        self.draw()
+        above: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 1)}
+        axis.legend(ncols=3, frameon=False, **above)

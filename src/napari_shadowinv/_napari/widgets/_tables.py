@@ -1,9 +1,12 @@
-"""Tables with a row for each image: `ImageTable` of a fit, `ShotTable` of a stack."""
+"""Tables with a check box and entries in each row: `NumberTable`.
+
+- a row for each image of a fit: `ImageTable`; for each shot of a stack: `ShotTable`
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,19 +33,18 @@ from napari_shadowinv.physics.beam import BeamQuantity, number_in_unit, text_in_
 from napari_shadowinv.physics.setup import SETUPS, Setup, beam_quantities
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
 
-_MAX_SHOWN_ROWS = 8
 _PREFIXED_UNIT = "m"  # cells show it, with the prefix of each number
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of numbers in a unit, or of names of files if the unit is None."""
+    """A column of numbers in a unit, or of texts if the unit is None."""
 
     name: str
     title: str
     unit: str | None
     tip: str
-    width_px: int
+    width_px: int = 90
     default: float | None = None
 
     @property
@@ -50,13 +52,37 @@ class Column:
         unit = "" if self.unit == _PREFIXED_UNIT else self.unit
         return f"{self.title} ({unit})" if unit else self.title
 
+    def read(self, text: str) -> Any:
+        """Return a number, None for nothing, or text that is no number."""
+        if not text or self.unit is None:
+            return text or None
+        with suppress(ValueError):  # the text stays for correction
+            return number_in_unit(text, self.unit)
+        return text
+
+    def show(self, value: Any) -> str:
+        """Return the text of a value, rounded."""
+        if value is None or isinstance(value, str):
+            return value or ""
+        return text_in_unit(value, "m") if self.unit == _PREFIXED_UNIT else f"{value:.6g}"
+
+    def problem(self, value: Any) -> str:
+        """Return what is wrong with a value, in a sentence; empty for a number."""
+        if self.unit is None or not isinstance(value, str):
+            return ""
+        try:
+            number_in_unit(value, self.unit)
+        except ValueError as error:
+            return f"received {value!r}, {error}"
+        return ""
+
 
 class NumberTable(QTableWidget):
-    """A row for each image; its first cell holds the name and whether it is used."""
+    """Rows with a name and a check box first; more than `max_rows` of them scroll."""
 
-    def __init__(self, title: str, columns: Sequence[Column]) -> None:
+    def __init__(self, title: str, columns: Sequence[Column], max_rows: int = 8) -> None:
         super().__init__(0, len(columns) + 1)
-        self._title = title
+        self._title, self._max_rows = title, max_rows
         self.verticalHeader().setVisible(False)
         self.setSelectionMode(QTableWidget.SelectionMode.NoSelection)
         self.setTextElideMode(Qt.TextElideMode.ElideMiddle)
@@ -85,98 +111,80 @@ class NumberTable(QTableWidget):
 
     def fit_height(self) -> None:
         """Fit the height to the rows, up to a maximum."""
-        rows = sum(self.rowHeight(row) for row in range(min(self.rowCount(), _MAX_SHOWN_ROWS)))
+        rows = sum(self.rowHeight(row) for row in range(min(self.rowCount(), self._max_rows)))
         header = self.horizontalHeader()
         header.setFixedHeight(header.sizeHint().height())
         self.setFixedHeight(header.height() + rows + 2 * self.frameWidth())
 
+    def showEvent(self, event: Any) -> None:
+        super().showEvent(event)
+        self.fit_height()  # the rows get the heights of napari's style only now
+
     def is_checked(self, row: int) -> bool:
         return bool(self.item(row, 0).checkState() == Qt.CheckState.Checked)
 
-    def number(self, row: int, column: int) -> float | None:
-        """Return the number in a cell, None if it is empty; or raise an `InputError`."""
-        item = self.item(row, column)
-        exact, text = item.data(Qt.ItemDataRole.UserRole), item.text().strip()
-        if exact is not None or not text:
-            return None if exact is None else float(exact)
-        try:
-            return number_in_unit(text, self._columns[column - 1].unit or "")
-        except ValueError as error:
-            name = self.item(row, 0).text()
-            raise InputError(f"'{name}': received {text!r}, {error}") from error
+    def values(self, row: int) -> dict[str, Any]:
+        """Return the values of a row by column, None where empty; or raise an `InputError`."""
+        values = {}
+        for number, spec in enumerate(self._columns, 1):
+            values[spec.name] = self.item(row, number).data(Qt.ItemDataRole.UserRole)
+            if problem := spec.problem(values[spec.name]):
+                raise InputError(f"'{self.item(row, 0).text()}': {problem}")
+        return values
 
-    def write(self, row: int, column: int, value: Any) -> None:
-        """Show a number, a file's name, or text that the user has to correct."""
+    def write_row(self, row: int, values: Mapping[str, Any]) -> None:
+        """Show the values of a row by column, and the defaults of others."""
+        for number, spec in enumerate(self._columns, 1):
+            self._write(row, number, values.get(spec.name, spec.default))
+
+    def enter(self, item: QTableWidgetItem) -> tuple[str, Any]:
+        """Return the column of a cell, and the user's entry: a number, None, or text."""
+        spec = self._columns[item.column() - 1]
+        value = spec.read(item.text().strip())
+        self._write(item.row(), item.column(), value)
+        return spec.name, value
+
+    def _write(self, row: int, column: int, value: Any) -> None:
+        """Show a number or a text, which the user has to correct if it is no number."""
         item, spec = self.item(row, column), self._columns[column - 1]
-        is_number = not isinstance(value, str) and value is not None
+        problem = spec.problem(value)
         with QSignalBlocker(self):
             # The shown text is rounded.
-            item.setData(Qt.ItemDataRole.UserRole, value if is_number else None)
-            if not is_number:
-                item.setText(value or "")
-            elif spec.unit == _PREFIXED_UNIT:
-                item.setText(text_in_unit(value, spec.unit))
-            else:
-                item.setText(f"{value:.6g}")
-            self._mark(item, spec)
-
-    def enter(self, item: QTableWidgetItem) -> Any:
-        """Return the user's entry in a cell: a number, None, or text that is no number."""
-        value: Any = item.text().strip() or None
-        unit = self._columns[item.column() - 1].unit
-        if value is not None and unit is not None:
-            with suppress(ValueError):  # the text stays for correction
-                value = number_in_unit(value, unit)
-        self.write(item.row(), item.column(), value)
-        return value
-
-    def _mark(self, item: QTableWidgetItem, spec: Column) -> None:
-        """Mark an invalid number by its colour and tooltip."""
-        item.setData(Qt.ItemDataRole.ForegroundRole, None)
-        item.setToolTip(f"<qt>{spec.tip}</qt>")
-        if spec.unit is None:
-            return
-        try:
-            number_in_unit(item.text() or "0", spec.unit)
-        except ValueError as error:
-            item.setForeground(PROBLEM_COLOUR)
-            item.setToolTip(f"<qt>{error}</qt>")
+            item.setData(Qt.ItemDataRole.UserRole, value)
+            item.setText(spec.show(value))
+            item.setData(Qt.ItemDataRole.ForegroundRole, PROBLEM_COLOUR if problem else None)
+            item.setToolTip(f"<qt>{problem or spec.tip}</qt>")
 
 
 _METADATA_KEY = "fit"  # entries of the rows in a layer's metadata
-_NAME, _BEAM, _BRIGHTNESS, _PSF = range(4)
-_BEAM_WIDTH_PX = 90
+_BRIGHTNESS = 2  # column
+
+
+def _column(name: str, title: str, unit: str | None, default: float | None = None) -> Column:
+    """Return the column of a field of a row of shots."""
+    tip = str(ShotRow.model_fields[name].description)
+    return Column(name, title, unit, tip, _WIDTHS_PX[name], default)
+
+
+_WIDTHS_PX = {"brightness": 76, "psf": 72, "mask": 90}
 _IMAGE_COLUMNS = (
-    Column(
-        "brightness",
-        "Brightness",
-        "",
-        "Brightness of the image relative to the source; 1 if they are equally bright.",
-        76,
-        1.0,
-    ),
-    Column(
-        "psf",
-        "PSF σ",
-        "px",
-        "Standard deviation of the image's blur, in pixels after the steps; 0 without blur.",
-        72,
-        0.0,
-    ),
+    _column("brightness", "Brightness", "", 1.0),
+    _column("psf", "PSF σ", "px", 0.0),
 )
+_SHOT_COLUMNS = (_column("brightness", "Brightness", ""), _column("mask", "Mask", None))
 
 
 def beam_column(kind: str) -> Column:
     """Return the column for a kind of setup; without a setup, the relative displacement."""
     if kind not in SETUPS:
         tip = "Displacement in this image relative to the first image, such as 0.6."
-        return Column("strength", "Strength", "", tip, _BEAM_WIDTH_PX)
+        return Column("strength", "Strength", "", tip)
     quantity = SETUPS[kind].beam_quantity()
     return _quantity_column(quantity, quantity.description)
 
 
 def _quantity_column(quantity: BeamQuantity, tip: str) -> Column:
-    return Column(quantity.name, quantity.noun.capitalize(), quantity.unit, tip, _BEAM_WIDTH_PX)
+    return Column(quantity.name, quantity.noun.capitalize(), quantity.unit, tip)
 
 
 @dataclass(frozen=True)
@@ -266,9 +274,7 @@ class ImageTable(QWidget):
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
-        # The rows get the heights of napari's style only now, and another widget may have changed
-        # a layer's setup.
-        self.fill()
+        self.fill()  # another widget may have changed a layer's setup
 
     def show_beams(self, kind: str, value: Any, is_brightness_known: bool) -> None:
         """Fill the cells; `value` is the reference's energy or wavelength in the shown setup."""
@@ -281,9 +287,7 @@ class ImageTable(QWidget):
         reference_beam = value if kind in SETUPS else 1.0
         for number, row in enumerate(self.rows):
             beam = reference_beam if row == reference else self._beam_of(row)
-            self.table.write(number, _BEAM, beam)
-            for cell, spec in enumerate(_IMAGE_COLUMNS, _BRIGHTNESS):
-                self.table.write(number, cell, row.entries().get(spec.name, spec.default))
+            self.table.write_row(number, {**row.entries(), self.beam.name: beam})
             with QSignalBlocker(self.table):
                 brightness = self.table.item(number, _BRIGHTNESS)
                 brightness.setFlags(editable if is_brightness_known else Qt.ItemFlag.NoItemFlags)
@@ -292,23 +296,23 @@ class ImageTable(QWidget):
 
     def beam_value(self, row: ImageRow) -> float:
         """Return energy, wavelength or strength of a row, or raise an `InputError`."""
-        value = self._number(row, _BEAM)
+        value = self._values(row)[self.beam.name]
         if value is None:
             quantity = self.beam.title.lower()
             raise InputError(
                 f"'{row.name}' has no {quantity}: enter it in the table, or uncheck the image"
             )
-        return value
+        return float(value)
 
     def brightness(self, row: ImageRow) -> float:
-        value = self._number(row, _BRIGHTNESS)
-        return 1.0 if value is None else value
+        value = self._values(row)["brightness"]
+        return 1.0 if value is None else float(value)
 
     def psf(self, row: ImageRow) -> float:
-        return self._number(row, _PSF) or 0.0
+        return self._values(row)["psf"] or 0.0
 
-    def _number(self, row: ImageRow, column: int) -> float | None:
-        return self.table.number(self.rows.index(row), column)
+    def _values(self, row: ImageRow) -> dict[str, Any]:
+        return self.table.values(self.rows.index(row))
 
     def _beam_of(self, row: ImageRow) -> Any:
         """Return the user's entry, or else the value in the layer's setup."""
@@ -323,14 +327,13 @@ class ImageTable(QWidget):
         return getattr(row.setup, self.beam.name, None)
 
     def _on_edit(self, item: Any) -> None:
-        row, column = self.rows[item.row()], item.column()
-        if column == _NAME:
+        row = self.rows[item.row()]
+        if item.column() == 0:
             row.store(use=self.table.is_checked(item.row()))
             self._on_use()
             return
-        name = self.beam.name if column == _BEAM else _IMAGE_COLUMNS[column - _BRIGHTNESS].name
-        value = self.table.enter(item)
-        is_setup = column == _BEAM and name != "strength" and row == self.reference
+        name, value = self.table.enter(item)
+        is_setup = name == self.beam.name != "strength" and row == self.reference
         if is_setup and isinstance(value, float):
             self.reference_beam_entered.emit(value)
         else:
@@ -358,24 +361,6 @@ def _setup_summary(row: ImageRow) -> str:
     return f"with its own setup ({row.setup.probe}{f', {origin}' if origin else ''})"
 
 
-_SHOT_COLUMNS = (
-    Column(
-        "brightness",
-        "Brightness",
-        "",
-        "Brightness of the image relative to the source, by which it is divided; empty for 1.",
-        76,
-    ),
-    Column(
-        "mask",
-        "Mask",
-        None,
-        "Image of the same size, 0 at unusable pixels, with a path relative to the table; empty "
-        "for the common mask.",
-        90,
-    ),
-)
-_MASK = 1 + len(_SHOT_COLUMNS)
 _FILE_FILTER = "tables (*.csv)"
 
 
@@ -436,10 +421,8 @@ class ShotTable(QWidget):
 
     def _row(self, number: int) -> ShotRow:
         row = self._rows[number]
-        changes: dict[str, Any] = {"exclude": not self.table.is_checked(number)}
-        for cell, spec in enumerate(self._columns[:-1], 1):
-            changes[spec.name] = self.table.number(number, cell)
-        mask = self.table.item(number, _MASK).text().strip()
+        changes = {"exclude": not self.table.is_checked(number), **self.table.values(number)}
+        mask = changes.pop("mask")
         if not mask or row.mask is None or mask != row.mask.name:
             changes["mask"] = self._folder / mask if mask else None
         entries = row.model_dump(exclude={"strength"})  # tables have another form of it
@@ -466,23 +449,16 @@ class ShotTable(QWidget):
             self._fill()
 
     def _fill(self) -> None:
-        columns = self._columns
-        self.table.set_columns(columns)
+        self.table.set_columns(self._columns)
         with QSignalBlocker(self.table):
             self.table.setRowCount(len(self._rows))
             for number, row in enumerate(self._rows):
-                values = {"brightness": row.brightness, **row.beam}
+                mask = None if row.mask is None else row.mask.name
+                values = {"brightness": row.brightness, "mask": mask, **row.beam}
                 self.table.fill_row(number, row.file.name, _tip(row), checked=not row.exclude)
-                for cell, spec in enumerate(columns[:-1], 1):
-                    self.table.write(number, cell, values.get(spec.name))
-                self.table.write(number, _MASK, "" if row.mask is None else row.mask.name)
+                self.table.write_row(number, values)
         self.table.setVisible(bool(self._rows))
         self.save_button.setEnabled(bool(self._rows))
-        self.table.fit_height()
-
-    def showEvent(self, event: Any) -> None:
-        super().showEvent(event)
-        # The rows get the heights of napari's style only now.
         self.table.fit_height()
 
     def _on_edit(self, item: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -25,39 +26,30 @@ from napari_shadowinv.analysis.paths import (
     table_text,
 )
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.beam import number_in_unit
 
 _REDRAW_MS = 40  # while the line moves
 _LAYER_ROLE = Qt.ItemDataRole.UserRole
-_PIXELS = "px"
-_MAX_WIDTH = 1e6
 _MAX_NAME_LENGTH = 34
+_MAX_WIDTH = 1e6
 
 
-class ProfilePlot(qt.Plot):
-    """A plot for each unit, in a column with a common distance axis."""
-
-    def __init__(self) -> None:
-        super().__init__(height=220)
-
-    def show_profiles(self, distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> None:
-        """Draw profiles; without profiles, empty the plot."""
-        if self.figure is None and not profiles:
-            return
-        units = list(dict.fromkeys(profile.unit for profile in profiles))
-        axes = self.fresh_axes(max(len(units), 1))
-        for axis, of_unit in zip(axes, units or [""], strict=True):
-            axis.set_ylabel(of_unit or "value", color=self.ink)
-            for number, profile in enumerate(profiles):
-                if profile.unit == of_unit:
-                    colour, name = qt.COLOURS[number % len(qt.COLOURS)], profile.name
-                    if len(name) > _MAX_NAME_LENGTH:
-                        name = f"…{name[1 - _MAX_NAME_LENGTH :]}"
-                    axis.plot(distance, profile.values, color=colour, label=name)
-            if profiles:
-                self.add_legend(axis)
-        averaging = f", {profiles[0].averaging}" if profiles and profiles[0].averaging else ""
-        axes[-1].set_xlabel(f"distance ({unit}){averaging}", color=self.ink)
-        self.draw()
+def draw_profiles(
+    columns: Sequence[Any], distance: FloatArray, unit: str, profiles: Sequence[Profile]
+) -> None:
+    """Draw profiles in panels for their units, with a common distance axis."""
+    units = list(dict.fromkeys(profile.unit for profile in profiles))
+    for axes, of_unit in zip(columns, units, strict=False):
+        axes.set_ylabel(of_unit or "value")
+        for number, profile in enumerate(profiles):
+            if profile.unit == of_unit:
+                colour, name = qt.COLOURS[number % len(qt.COLOURS)], profile.name
+                if len(name) > _MAX_NAME_LENGTH:
+                    name = f"…{name[1 - _MAX_NAME_LENGTH :]}"
+                axes.plot(distance, profile.values, color=colour, label=name)
+        axes.legend()
+    averaging = f", {profiles[0].averaging}" if profiles and profiles[0].averaging else ""
+    columns[-1].set_xlabel(f"distance ({unit}){averaging}")
 
 
 class Analyse(qt.Docked):
@@ -74,13 +66,12 @@ class Analyse(qt.Docked):
         self.lines = LayerPicker(self.viewer, tip, "none yet", kinds=("shapes",))
         self.layers = QtWidgets.QListWidget(toolTip="Layers to plot.", maximumHeight=110)
         self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        tip = "Width of the strip, perpendicular to the line, over which values are averaged."
-        self.width_edit = QtWidgets.QDoubleSpinBox(maximum=_MAX_WIDTH, toolTip=f"<qt>{tip}</qt>")
-        self.width_edit.setSpecialValueText("0: line only")
-        self.width_edit.setKeyboardTracking(False)
-        self.width_unit = forms.SteadyComboBox(tip=tip)
-        self.width_unit.addItem(_PIXELS)
-        self.plot = ProfilePlot()
+        self.width_edit = forms.SavedLine(
+            "0: line only",
+            "Width of the strip, perpendicular to the line, over which values are averaged: in "
+            "px, or with a unit such as 20 um.",
+        )
+        self.plot = qt.Plot(height=220)
         self.measures = forms.WrappingLabel()
         self.measures.setToolTip(
             "<qt>Peak: value of largest magnitude. Width: full width at half of the peak, relative "
@@ -90,8 +81,8 @@ class Analyse(qt.Docked):
         self.problem = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.export = qt.push_button("Export CSV…", "Save the profile as a table.", self._export)
         lines = qt.with_button(self.lines, "✎", "Draw a new line.", self._draw)
-        width = qt.side_by_side((self.width_edit, 2), (self.width_unit, 1))
-        controls = (forms.labelled("Line", lines), self.layers, forms.labelled("Width", width))
+        width = forms.labelled("Width", self.width_edit)
+        controls = (forms.labelled("Line", lines), self.layers, width)
         results = (self.hint, self.plot, self.measures, self.export, self.problem)
         page, self.products = QtWidgets.QWidget(), products.ProductForm(self.viewer)
         self.tabs = QtWidgets.QTabWidget()
@@ -99,6 +90,7 @@ class Analyse(qt.Docked):
         self.tabs.addTab(self.products, "Products of a result")
         qt.column(self, self.tabs)
         qt.column(page, *controls, *results, margin=6).setStretchFactor(self.plot, 1)
+        self.plot.setVisible(True)  # it keeps its place
         self._connect()
         self._fill()
 
@@ -108,8 +100,7 @@ class Analyse(qt.Docked):
         qt.while_alive(self, self.viewer.dims, "current_step", self._schedule_plot)
         qt.layers_while_alive(self, self.viewer.layers, "set_data", self._on_layer)
         self.lines.picked.connect(self._schedule_plot)
-        widths = self.width_edit.valueChanged, self.width_unit.currentIndexChanged
-        for signal in (self.layers.itemChanged, *widths):
+        for signal in (self.layers.itemChanged, self.width_edit.textChanged):
             signal.connect(lambda _: self._schedule_plot())
 
     def _items(self) -> list[tuple[Any, Any]]:
@@ -148,29 +139,38 @@ class Analyse(qt.Docked):
         line = None
         if shapes is not None:
             line = products.selected_shape(shapes, lambda kind: kind in products.OPEN_SHAPES)
-        self.profiles = []
+        self.profiles, problem = [], ""
         if shapes is not None and line is not None and layers:
             vertices = np.array([shapes.data_to_world(end)[-2:] for end in shapes.data[line]])
-            step = min(float(np.min(np.abs(layer.scale[-2:]))) for layer in layers)
-            _, self._distance = sample_path(vertices, step)
-            self._unit = f"{layers[0].units[-1]:~P}"
-            self._offer_width_in(self._unit)
-            width, averaging = self._width(step)
-            points = sample_strip(vertices, self._distance, width, step)
-            position = self.viewer.dims.point
-            self.profiles = [
-                Profile(
-                    layer.name,
-                    unit_of(layer),
-                    interpolate(shown_plane(layer, position), points, pixel_mapper(layer, shapes)),
-                    averaging,
-                )
-                for layer in layers
-            ]
-            self.problem.setVisible(False)
-        self.hint.setVisible(not self.profiles)
-        self.plot.show_profiles(self._distance, self._unit, self.profiles)
+            try:
+                self._sample(vertices, layers, shapes)
+            except InputError as error:
+                problem = str(error)
+        self.problem.show_text(problem)
+        self.hint.setVisible(not self.profiles and not problem)
+        if self.profiles or self.plot.figure is not None:
+            panels = len({profile.unit for profile in self.profiles}) or 1
+            curves = self._distance, self._unit, self.profiles
+            self.plot.show_drawing(lambda axes: draw_profiles(axes, *curves), panels)
         self._show_measures()
+
+    def _sample(self, vertices: FloatArray, layers: Sequence[Any], shapes: Any) -> None:
+        """Sample the layers along a line with corners in the world of its shapes."""
+        step = min(float(np.min(np.abs(layer.scale[-2:]))) for layer in layers)
+        _, self._distance = sample_path(vertices, step)
+        self._unit = f"{layers[0].units[-1]:~P}"
+        width, averaging = strip_width(self.width_edit.text(), step, self._unit)
+        points = sample_strip(vertices, self._distance, width, step)
+        position = self.viewer.dims.point
+        self.profiles = [
+            Profile(
+                layer.name,
+                unit_of(layer),
+                interpolate(shown_plane(layer, position), points, pixel_mapper(layer, shapes)),
+                averaging,
+            )
+            for layer in layers
+        ]
 
     def _show_measures(self) -> None:
         lines = []
@@ -184,25 +184,6 @@ class Analyse(qt.Docked):
     def show_problem(self, text: str) -> None:
         """Show a problem until the next profile."""
         self.problem.show_text(text)
-
-    def _offer_width_in(self, unit: str) -> None:
-        """Offer the width in pixels and in the world's unit."""
-        units = [_PIXELS] + ([] if unit in ("pixel", "pixels", _PIXELS) else [unit])
-        if units == [self.width_unit.itemText(n) for n in range(self.width_unit.count())]:
-            return
-        index = max(self.width_unit.currentIndex(), 0)
-        with QSignalBlocker(self.width_unit):
-            self.width_unit.clear()
-            self.width_unit.addItems(units)
-            self.width_unit.setCurrentIndex(min(index, len(units) - 1))
-
-    def _width(self, pixel: float) -> tuple[float, str]:
-        """Return the width of the strip in the world's unit, and the averaging in words."""
-        number, unit = self.width_edit.value(), self.width_unit.currentText()
-        if not number:
-            return 0.0, ""
-        width = number * pixel if unit == _PIXELS else number
-        return width, f"mean over {number:g} {unit}"
 
     def table(self) -> str:
         """Return the profiles as comma-separated values, or raise an `InputError`."""
@@ -250,4 +231,14 @@ class Analyse(qt.Docked):
 
     @qt.notify_errors
     def _export(self) -> None:
-        products.export_csv(self, "profile.csv", self.table())
+        products.export_csv(self, "profile", self.table())
+
+
+def strip_width(text: str, pixel: float, unit: str) -> tuple[float, str]:
+    """Return a strip's width, of px or a length, in the world's unit, and the mean in words."""
+    for in_unit, factor in (("px", pixel), (unit, 1.0)):
+        with suppress(ValueError):
+            width = number_in_unit(text or "0", in_unit)
+            if 0 <= width < _MAX_WIDTH:
+                return factor * width, f"mean over {width:g} {in_unit}" if width else ""
+    raise InputError(f"Width is '{text}', expected a number in px, or with a unit, such as 20 um")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
-from itertools import count
+from functools import lru_cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,8 @@ from qtpy.QtCore import QObject, Qt
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import packs
-from napari_shadowinv._napari.jobs import Finished
+from napari_shadowinv._napari.jobs import Finished, name_of_result
+from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.packs import PackJob
 from napari_shadowinv._napari.result_files import dataset_of_layers
 from napari_shadowinv._napari.run import Run
@@ -24,7 +24,9 @@ from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, mask_of, new_shapes
+from napari_shadowinv._napari.widgets._products import ask_file
 from napari_shadowinv._napari.widgets._results import ResultLayers
+from napari_shadowinv._napari.widgets._tables import Column, NumberTable
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.pack import FILM_TYPES
@@ -35,7 +37,17 @@ from napari_shadowinv.io.formats import RESULT
 from napari_shadowinv.io.images import read_scan
 from napari_shadowinv.pipeline import film_files, read_pack, write_layers
 
-_COLUMNS = ("Scan", "Film", "Filters in front of the film")
+_COLUMNS = (
+    Column("film", "Film", None, f"Type of the film: {', '.join(FILM_TYPES)}."),
+    Column(
+        "filters",
+        "Filters in front",
+        None,
+        "Thickness, unit and material of each filter in front of the film, such as 13 um Al; 25 um "
+        "Fe.",
+        320,
+    ),
+)
 _MIN_SIZE_PX = (620, 560)
 
 
@@ -49,38 +61,35 @@ class NewPackDialog(QtWidgets.QDialog):
         self._folder = folder
         self.written: Path | None = None  # the pack file after saving
         self.form = forms.ModelForm(film_files.NewPack)
-        self.table = QtWidgets.QTableWidget(0, len(_COLUMNS))
-        self.table.setHorizontalHeaderLabels(_COLUMNS)
-        self.table.horizontalHeader().setStretchLastSection(True)
-        self.table.setToolTip(
-            "<qt>Films in the order in which the beam passes them. Filters as thickness, unit and "
-            "material, such as 13 um Al; 25 um Fe.</qt>"
-        )
+        self.table = NumberTable("Scan, in the order of the beam", _COLUMNS, max_rows=14)
         self._problem = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         choices = QtWidgets.QDialogButtonBox.StandardButton
         self.buttons = QtWidgets.QDialogButtonBox(choices.Save | choices.Cancel)
         self.buttons.accepted.connect(self.accept)
         self.buttons.rejected.connect(self.reject)
-        column = QtWidgets.QVBoxLayout(self)
-        for widget in (self.form, self.table, self._problem, self.buttons):
-            column.addWidget(widget)
-        self._show_layers(film_files.draft_pack(folder)["layers"])
+        column = qt.column(self, self.form, self.table, self._problem, margin=9)
+        column.addStretch(1)
+        column.addWidget(self.buttons)
+        layers = film_files.draft_pack(folder)["layers"]
+        self.table.setRowCount(len(layers))
+        for row, layer in enumerate(layers):
+            tip = "Uncheck a scan that is no film of the pack."
+            self.table.fill_row(row, layer["file"], tip, checked=True)
+            self.table.write_row(row, {"film": layer["film"]})
+        self.table.itemChanged.connect(lambda item: item.column() and self.table.enter(item))
         self.form.entries["film"].line.changed.connect(self._on_film)
 
     def entries(self) -> dict[str, Any]:
         facts: Any = self.form.model()
         layers = [
-            {
-                "film": self.table.cellWidget(row, 1).currentText(),
-                "filters": [
-                    part.strip()
-                    for part in self.table.item(row, 2).text().split(";")
-                    if part.strip()
-                ],
-                "file": self.table.item(row, 0).text(),
-            }
-            for row in range(self.table.rowCount())
+            {**self.table.values(row), "file": self.table.item(row, 0).text()}
+            for row in filter(self.table.is_checked, range(self.table.rowCount()))
         ]
+        for layer in layers:
+            parts = (part.strip() for part in (layer["filters"] or "").split(";"))
+            layer["filters"] = [part for part in parts if part]
+        if not layers:
+            raise InputError("no scan is checked: check the films of the pack")
         return film_files.draft_pack(self._folder, facts, layers)
 
     def accept(self) -> None:
@@ -95,26 +104,13 @@ class NewPackDialog(QtWidgets.QDialog):
             return
         super().accept()
 
-    def _show_layers(self, layers: list[dict[str, Any]]) -> None:
-        self.table.setRowCount(len(layers))
-        for row, layer in enumerate(layers):
-            scan = QtWidgets.QTableWidgetItem(layer["file"])
-            scan.setFlags(scan.flags() & ~Qt.ItemFlag.ItemIsEditable)
-            film = QtWidgets.QComboBox()
-            film.addItems(list(FILM_TYPES))
-            film.setCurrentText(layer["film"])
-            self.table.setItem(row, 0, scan)
-            self.table.setCellWidget(row, 1, film)
-            self.table.setItem(row, 2, QtWidgets.QTableWidgetItem(""))
-
     def _on_film(self) -> None:
         """Show the selected type for all films whose file names contain no type."""
         facts = film_files.NewPack(film=self.form.entries["film"].line.value)
         for row, layer in enumerate(film_files.draft_pack(self._folder, facts)["layers"]):
-            self.table.cellWidget(row, 1).setCurrentText(layer["film"])
+            self.table.write_row(row, {**self.table.values(row), "film": layer["film"]})
 
 
-_COLOUR = "#00c8ff"
 _SETTLE_MS = 60
 _MIN_MOVE_PX = 0.01  # napari rounds coordinates
 
@@ -137,7 +133,7 @@ class CornerEditor(QObject):
 
     @property
     def shown(self) -> bool:
-        return self.polygon is not None and self.polygon in self._viewer.layers
+        return all(layer in self._viewer.layers for layer in (self.scan, self.polygon))
 
     def show(self, films: Any, doses: FilmDoses) -> None:
         """Show the displayed film of a pack's layer; changes to another pack are discarded."""
@@ -193,33 +189,27 @@ class CornerEditor(QObject):
             )
         pixels = self._scan_of(plane)
         self._plane = plane
-        title = f"film {plane + 1}"
+        name = f"scan of film {plane + 1}"
         # The scan has the pixel size of the films, and its film lies over them.
         frame = about.frame_of(self._films)
         size = np.array(self._films.data.shape[-2:])
         centre = np.asarray(frame.translate) + (size - 1) / 2 * frame.scale
-        placement = frame.keywords()
-        placement["translate"] = tuple(centre - corners.mean(axis=0) * frame.scale)
-        if self.shown and self.scan in self._viewer.layers:
-            self.scan.data, self.scan.name = pixels, f"scan of {title}"
-            self.polygon.data, self.polygon.name = [corners], f"corners of {title}"
-            for layer in (self.scan, self.polygon):
-                layer.translate = placement["translate"]
-            self.polygon.mode = "direct"
-            return
-        from napari.layers import Image, Shapes
-
-        self.scan = Image(pixels, rgb=True, name=f"scan of {title}", **placement)
-        width = max(1.0, max(size) / 200)
-        look: Any = {"face_color": "transparent", "edge_color": _COLOUR, "edge_width": width}
-        self.polygon = Shapes([corners], shape_type="polygon", **look, **placement)
-        self.polygon.name = f"corners of {title}"
-        for layer, role in ((self.scan, "scan"), (self.polygon, "corners")):
-            layer.metadata = about.metadata_for(role, "")
-            self._viewer.layers.append(layer)
-        self._viewer.layers.selection.active = self.polygon
+        is_new = not self.shown
+        if is_new:
+            metadata = about.metadata_for("scan", "")
+            look = {"rgb": True, "name": name, "metadata": metadata, **frame.keywords()}
+            (self.scan,) = add_layers(self._viewer, [(pixels, look, "image")])
+            self.polygon = new_shapes(self._viewer, self.scan, "corners", "direct")
+            self.polygon.metadata = about.metadata_for("corners", "")
+        self.scan.data, self.scan.name = pixels, name
+        self.polygon.name = about.layer_name("corners", name)
+        self.polygon.data = []
+        self.polygon.add_polygons([corners])
+        for layer in (self.scan, self.polygon):
+            layer.translate = centre - corners.mean(axis=0) * frame.scale
         self.polygon.mode = "direct"
-        self._viewer.reset_view()
+        if is_new:
+            self._viewer.reset_view()
 
     def _scan_of(self, plane: int) -> AnyArray:
         """Return the pixels of a film's scan with eight bits."""
@@ -246,38 +236,22 @@ _PLOT_HEIGHT_PX = 260
 _BRUSH_PX = 10
 
 
-class SpectrumPlot(qt.Plot):
-    """Mean fluence against energy."""
-
-    def __init__(self) -> None:
-        super().__init__(_PLOT_HEIGHT_PX)
-        self.setFixedHeight(_PLOT_HEIGHT_PX)
-        policy = QtWidgets.QSizePolicy.Policy
-        self.setSizePolicy(policy.Expanding, policy.Fixed)
-        self.shown: packs.Spectrum | None = None
-
-    def show_spectrum(self, spectrum: packs.Spectrum | None, where: str = "") -> None:
-        """Draw a spectrum; None empties the plot."""
-        self.shown = spectrum
-        self.setVisible(spectrum is not None)
-        if spectrum is None:
-            return
-        (axis,) = self.fresh_axes()
-        style = {"fmt": "o-", "color": qt.COLOURS[0], "markersize": 4, "capsize": 2}
-        axis.errorbar(spectrum.energies, spectrum.fluence, spectrum.error, **style)
-        layers = zip(spectrum.bands, spectrum.energies, spectrum.is_measured, strict=True)
-        for band, energy, is_measured in layers:
-            if not is_measured:
-                # The last film also contains protons from beyond its band.
-                low, high = min(*band, energy), max(*band, energy)
-                axis.axvspan(low, high, facecolor="none", edgecolor=self.ink, hatch="////", lw=0)
-        axis.set_yscale("log", nonpositive="clip")
-        positive = spectrum.fluence[spectrum.fluence > 0]
-        if positive.size:
-            axis.set_ylim(positive.min() / 3, 3 * positive.max())
-        axis.set_xlabel(f"energy (MeV), mean {where}", color=self.ink, fontsize=8)
-        axis.set_ylabel(f"fluence ({packs.PER_AREA})", color=self.ink, fontsize=8)
-        self.draw()
+def draw_spectrum(axes: Any, spectrum: packs.Spectrum, where: str, ink: str) -> None:
+    """Draw the mean fluence against energy."""
+    style = {"fmt": "o-", "color": qt.COLOURS[0], "markersize": 4, "capsize": 2}
+    axes.errorbar(spectrum.energies, spectrum.fluence, spectrum.error, **style)
+    layers = zip(spectrum.bands, spectrum.energies, spectrum.is_measured, strict=True)
+    for band, energy, is_measured in layers:
+        if not is_measured:
+            # The last film also contains protons from beyond its band.
+            low, high = min(*band, energy), max(*band, energy)
+            axes.axvspan(low, high, facecolor="none", edgecolor=ink, hatch="////", lw=0)
+    axes.set_yscale("log", nonpositive="clip")
+    positive = spectrum.fluence[spectrum.fluence > 0]
+    if positive.size:
+        axes.set_ylim(positive.min() / 3, 3 * positive.max())
+    axes.set_xlabel(f"energy (MeV), mean {where}")
+    axes.set_ylabel(f"fluence ({packs.PER_AREA})")
 
 
 class FilmPack(panels.ToolPanel):
@@ -289,7 +263,6 @@ class FilmPack(panels.ToolPanel):
         scratch = TemporaryDirectory(prefix="film-pack-")
         qt.when_destroyed(self, scratch.cleanup)
         self._scratch = Path(scratch.name)
-        self._folders = count(1)
         self.fit_images = ResultLayers(self.viewer, self)
         self._build()
         self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
@@ -319,7 +292,8 @@ class FilmPack(panels.ToolPanel):
             about.may_be_mask,
             kinds=("shapes", "labels"),
         )
-        self.plot = SpectrumPlot()
+        self.spectrum: packs.Spectrum | None = None  # shown
+        self.plot = qt.Plot(_PLOT_HEIGHT_PX, fixed=True)
         self.plot.setToolTip(
             "<qt>Mean fluence of each film. Error bars are the median standard deviation of a "
             "pixel, because calibration errors are common to all pixels and do not average out. "
@@ -376,7 +350,7 @@ class FilmPack(panels.ToolPanel):
         file = Path(path).expanduser().absolute()
         pack = read_pack(file)
         name = file.stem if file.stem != "pack" else file.parent.name
-        return PackJob(pack, str(file), name, self._new_folder())
+        return PackJob(pack, str(file), name, Path(mkdtemp(dir=self._scratch)))
 
     @qt.notify_errors
     def _new_pack(self) -> None:
@@ -401,8 +375,8 @@ class FilmPack(panels.ToolPanel):
         return PackJob(
             metadata.get("pack") or doses.pack,
             metadata.get("path", ""),
-            metadata.get("pack_name") or layer.name.removesuffix(_title(packs.FLUENCE)).strip(),
-            self._new_folder(),
+            name_of_result(layer),
+            Path(mkdtemp(dir=self._scratch)),
             self.corners.corners(doses) or metadata.get("corners"),
             by_hand,
             doses.scales,
@@ -419,17 +393,14 @@ class FilmPack(panels.ToolPanel):
 
     def show_result(self, finished: Finished, job: PackJob) -> None:
         self.corners.close()
-        is_first = not self.viewer.layers
         self.results = self._last.layers_for_next(job.path or job.name)
-        self.results.complete.connect(partial(self._on_layers, self.results, is_first))
-        self.results.show(finished.layer_data)
+        self.results.complete.connect(self._follow_result)
+        self.results.show(finished.layer_data, fit=not self.viewer.layers)
 
-    def _on_layers(self, results: ResultLayers, is_first: bool) -> None:
-        for layer in results.layers:
+    def _follow_result(self) -> None:
+        for layer in self.results.layers:
             if about.role_of(layer) == packs.FLUENCE:
                 self.packs.layer = layer
-        if is_first:
-            self.viewer.reset_view()
         self._on_pack()
 
     def _selected(self) -> tuple[Any, FilmDoses]:
@@ -444,8 +415,7 @@ class FilmPack(panels.ToolPanel):
 
     def _partner(self, layer: Any, role: str) -> Any | None:
         """Return the layer of the same result with a role, or None."""
-        result = about.result_of(layer)
-        partners = (partner for partner in self.viewer.layers if about.result_of(partner) is result)
+        partners = about.layers_of(self.viewer, layer)
         return next((partner for partner in partners if about.role_of(partner) == role), None)
 
     def _on_pack(self) -> None:
@@ -464,7 +434,6 @@ class FilmPack(panels.ToolPanel):
         """Draw the spectrum of the current region."""
         layer = self.packs.layer
         if layer is None:
-            self.plot.show_spectrum(None)
             return
         _, doses = self._selected()
         try:
@@ -473,7 +442,8 @@ class FilmPack(panels.ToolPanel):
             self.show_problem(str(error))
             return
         where = "of the whole film" if region is None else "in the region"
-        self.plot.show_spectrum(packs.spectrum_in(doses, region), where)
+        spectrum = self.spectrum = packs.spectrum_in(doses, region)
+        self.plot.show_drawing(lambda axes: draw_spectrum(axes[0], spectrum, where, self.plot.ink))
 
     @qt.notify_errors
     def _draw_region(self) -> None:
@@ -494,8 +464,8 @@ class FilmPack(panels.ToolPanel):
         labels = self._partner(layer, packs.UNUSABLE)
         if labels is None:
             raise InputError(
-                f"the layer '…{_title(packs.UNUSABLE)}' of '{layer.name}' was deleted: press Run, "
-                "or open the file again"
+                f"the unusable pixels of '{layer.name}' were deleted: press Run, or open the file "
+                "again"
             )
         labels.visible = True
         labels.selected_label = packs.BY_HAND
@@ -527,25 +497,10 @@ class FilmPack(panels.ToolPanel):
     @qt.notify_errors
     def _save(self) -> None:
         layer, doses = self._selected()
-        name, _ = QtWidgets.QFileDialog.getSaveFileName(
-            self, "Save the result", f"pack{RESULT.suffix}", f"results (*{RESULT.suffix})"
-        )
-        if not name:
-            return
-        has_suffix = name.lower().endswith(RESULT.suffix)
-        path = Path(name if has_suffix else name + RESULT.suffix)
-        result: Any = about.result_of(layer)
-        doses = packs.copy_edits(doses, self._scratch, path)
-        saved = about.Result(doses, result.setup, result.attributes)
-        layers = [each for each in self.viewer.layers if about.result_of(each) is result]
-        layer_data = [each.as_layer_data_tuple() for each in layers]
-        show_info(
-            f"Wrote {write(path, dataset_of_layers(layer_data, saved), overwrite=has_suffix)}"
-        )
-
-    def _new_folder(self) -> Path:
-        return self._scratch / str(next(self._folders))
-
-
-def _title(role: str) -> str:
-    return next(kind.title for kind in packs.KINDS if kind.role == role)
+        if chosen := ask_file(self, "Save the result", "pack", RESULT.suffixes[:1]):
+            result: Any = about.result_of(layer)
+            doses = packs.copy_edits(doses, self._scratch, chosen.path)
+            saved = about.Result(doses, result.setup, result.attributes)
+            layers = about.layers_of(self.viewer, layer)
+            dataset = dataset_of_layers([each.as_layer_data_tuple() for each in layers], saved)
+            show_info(f"Wrote {write(chosen.path, dataset, overwrite=chosen.overwrite)}")
