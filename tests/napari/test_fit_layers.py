@@ -104,7 +104,7 @@ def test_a_file_of_the_command_shows_all_of_a_fit(
 ) -> None:
     layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
     layers = more(viewer, layers)
-    in_each = ["potential", "field y", "field x", "field", "uncertainty", "arrows"]
+    in_each = ["potential", "field y", "field x", "direction", "field", "uncertainty", "arrows"]
     in_each += ["significance", "structures"]
     of_fields = ["field arrows", *(f"{role}{part}" for role in in_each for part in ("", " E"))]
     of_answers = [f"{role} {name} 1" for role in ("field", "arrows") for name in "BE"]

@@ -84,7 +84,7 @@ def test_all_layers_come_back_as_they_were(
     saved = viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     assert saved == [str(tmp_path / "a.shadowinv")]
     after = other_viewer.open(tmp_path / "a.shadowinv", plugin=None)
-    assert len(before) == len(after) == 11
+    assert len(before) == len(after) == 12
     for layer, two in zip(before, after, strict=True):
         assert_same_layer(layer, two)
 

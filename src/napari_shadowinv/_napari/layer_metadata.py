@@ -189,6 +189,7 @@ KINDS = (
     Kind("potential", "potential", "potential ({unit})", colormap="potential"),
     Kind("field y", "displacement", "{symbol} ({unit})", colormap="signed"),
     Kind("field x", "displacement", "{symbol} ({unit})", colormap="signed"),
+    Kind("direction", "displacement", "direction of {symbol}", shown_of="shot"),
     Kind("field", "displacement", "{symbol} ({unit})", colormap="field", visible=True),
     Kind(
         "uncertainty",

@@ -44,7 +44,7 @@ _STRUCTURE_COLOUR = "#ff3d7f"
 _ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 
 _FIELD_VARIABLES = ("displacement", "potential")
-_MAX_ARROWS_PER_SIDE = 28
+_MAX_ARROWS_PER_SIDE = 20
 _MIN_ARROW_LENGTH = 0.05  # relative to the longest
 _MAX_SHOWN_SITES = 200_000
 _LIMITS_PERCENTILE = 99.7
@@ -296,6 +296,9 @@ Content = tuple[Any, dict[str, str], dict[str, Any]]  # data, words of the title
 def _image(view: View, kind: Kind) -> Content:
     words: dict[str, str] = {}
     data = view.dataset[kind.variable].data
+    if kind.role == "direction":
+        colours = direction_colours(np.where(view.used, view.field.vectors, 0.0))
+        return colours, {"symbol": view.field.symbol}, {"rgb": True}
     if kind.role == "uncertainty":
         # A field is proportional to its displacement.
         strength_per_pixel = _ratio(view.magnitude, np.hypot(*view.plane("displacement")))
@@ -328,6 +331,20 @@ def _image(view: View, kind: Kind) -> Content:
         limits = view.intensity_limits
     look = {"colormap": colour_map(kind.colormap), "contrast_limits": _nonempty(limits)}
     return data, words, look
+
+
+def direction_colours(vectors: FloatArray) -> FloatArray:
+    """Return vectors (y, x) as colours (H, W, 3): the direction as hue, the length as brightness.
+
+    Red points to the right; the hue grows anticlockwise, so that cyan points to the left.
+    """
+    from skimage.color import hsv2rgb
+
+    length = np.hypot(*vectors)
+    hue = np.arctan2(-vectors[0], vectors[1]) / (2 * np.pi) % 1
+    brightness = length / (length.max() or 1.0)
+    colours: FloatArray = hsv2rgb(np.stack([hue, np.ones_like(hue), brightness], axis=-1))
+    return colours
 
 
 def _field(view: View, role: str) -> tuple[Any, Limits, dict[str, str]]:

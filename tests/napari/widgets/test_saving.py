@@ -118,7 +118,7 @@ def test_more_layers_adds_those_that_are_missing(tool: Any, window: Any, qtbot: 
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     added = {role_of(layer) for layer in window.layers} - set(few)
     assert added == {
-        "reprojection", "potential", "field y", "field x", "field arrows", "sites"
+        "reprojection", "potential", "field y", "field x", "direction", "field arrows", "sites"
     }  # fmt: skip
     assert {role_of(layer) for layer in window.layers if layer.visible} == {
         "shot",
