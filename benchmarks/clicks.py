@@ -99,7 +99,7 @@ def walk(viewer: Any, setup: Path) -> list[str]:
     assert plugins is not None
     ours = mouse.choose(plugins, "Shadowinv")
     assert ours is not None
-    mouse.choose(ours, "Invert shot (Shadowinv)")
+    mouse.choose(ours, "Invert (Shadowinv)")
     tool: Any = next(iter(viewer.window.dock_widgets.values()))
     wait_for(tool.isVisible)
     settle(0.5)

@@ -2,7 +2,7 @@
 
     python benchmarks/window.py [--pixels 600] [--repeat 3]
 
-The window is 1280 × 800 pixels, holds the shot and the widget *Invert shot*, and its Run button
+The window is 1280 × 800 pixels, holds the shot and the widget *Invert*, and its Run button
 is pressed. Without a graphics card (``xvfb-run -a -s "-screen 0 2560x1440x24"``, remote desktops)
 the processor draws the window, and takes that time from the inversion. Processor time, which
 other programs do not disturb, is told beside the time by the clock; each figure is the least of
@@ -59,7 +59,7 @@ class Window:
         self.viewer = napari.Viewer()
         self.viewer.window._qt_window.resize(1280, 800)
         self.viewer.add_image(shot, name="shot")
-        _, self.tool = self.viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert shot")
+        _, self.tool = self.viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert")
         self.tool.options.restore({"n_sites": n_sites})
         self.drawn = 0
         self.viewer.window._qt_viewer.canvas.native.aboutToCompose.connect(self._on_draw)

@@ -128,8 +128,7 @@ def press_run(widget: Any) -> None:
     while widget.panel.running or (hasattr(widget, "results") and widget.results.busy):
         settle(0.2)
     settle()
-    bar = widget.area.verticalScrollBar()
-    bar.setValue(bar.maximum())
+    widget.area.verticalScrollBar().setValue(widget.panel.y())  # Run, and the report below it
 
 
 def show_only(viewer: napari.Viewer, *titles: str) -> None:
@@ -143,7 +142,7 @@ def toroid_window() -> None:
     viewer = new_window("toroid with caustics")
     *_, shot = viewer.open_sample(PLUGIN, "toroid_with_caustics")
     shot.name = "toroid"
-    widget = open_widget(viewer, "Invert shot")
+    widget = open_widget(viewer, "Invert")
     press_run(widget)
     widget.area.verticalScrollBar().setValue(0)
     widget.area.ensureWidgetVisible(widget.panel.status)
@@ -159,13 +158,13 @@ def stack_window(folder: Path) -> None:
     )
     viewer.add_image(reference, name="reference", visible=False)
     viewer.add_image(np.stack(shots), name="burner", axis_labels=("shot", "y", "x"))
-    widget = open_widget(viewer, "Invert stack")
+    widget = open_widget(viewer, "Invert")
     widget.source.set_kind("layer")
     widget.source.layers.layer = viewer.layers["reference"]
     widget.steps.add("hot-pixels")
     widget.steps.folded.expand()
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
-        widget.store.edit.setText("burner.shadowinv.zarr")
+        widget.store.folder.edit.setText("burner.shadowinv.zarr")
         press_run(widget)
         viewer.dims.set_current_step(0, SHOWN)
         photograph(viewer, "napari-stack.png")
@@ -175,11 +174,9 @@ def first_windows() -> None:
     """Tutorial: the sample and its widget, the field, and a line profile through both."""
     viewer = new_window("first shadowgram")
     viewer.open_sample(PLUGIN, "toroid")
-    invert_shot = open_widget(viewer, "Invert shot")
+    tool = open_widget(viewer, "Invert")
     photograph(viewer, "tutorial-first-shot.png", close=False)
-    press_run(invert_shot)
-    bar = invert_shot.area.verticalScrollBar()
-    bar.setValue(bar.maximum() - 15)  # begin with a whole row
+    press_run(tool)
     photograph(viewer, "tutorial-first-field.png", close=False)
     show_only(viewer, "residual (% of mean)")
     viewer.layers.selection.active = viewer.layers["✓ residual (% of mean) – toroid"]
@@ -202,13 +199,13 @@ def proton_windows() -> None:
         exec(compile(making, "proton-radiograph.md", "exec"), {})
         viewer = new_window("proton radiograph")
         viewer.open(["shot.tif", "reference.tif"])
-        invert_shot = open_widget(viewer, "Invert shot")
-        invert_shot.setup.picker.set_kind("proton")
-        fields = invert_shot.setup.picker.form
+        tool = open_widget(viewer, "Invert")
+        tool.setup.picker.set_kind("proton")
+        fields = tool.setup.picker.form
         fields.restore(PROTON_FIELDS)
-        invert_shot.setup.picker.changed.emit()
+        tool.setup.picker.changed.emit()
         photograph(viewer, "tutorial-proton-setup.png", close=False)
-        press_run(invert_shot)
+        press_run(tool)
         viewer.layers["✓ caustics – shot"].visible = True
         photograph(viewer, "tutorial-proton-field.png")
 
@@ -217,15 +214,15 @@ def source_windows() -> None:
     """Tutorial: an estimated beam, and the field that it gives."""
     viewer = new_window("no reference image", height=880)
     viewer.open_sample(PLUGIN, "four_toroids")
-    invert_shot = open_widget(viewer, "Invert shot")
-    invert_shot.source.set_kind("polynomial")
-    invert_shot.show_source.click()
-    while invert_shot.panel.running:
+    tool = open_widget(viewer, "Invert")
+    tool.source.set_kind("polynomial")
+    tool.show_source.click()
+    while tool.panel.running:
         settle(0.2)
     settle()
     photograph(viewer, "tutorial-source-estimate.png", close=False)
-    press_run(invert_shot)
-    for title, text in invert_shot.report.rows:
+    press_run(tool)
+    for title, text in tool.report.rows:
         print(f"{title}: {text}")
     photograph(viewer, "tutorial-source-field.png")
 
@@ -234,12 +231,12 @@ def night_window() -> None:
     """Tutorial: a run of shots, inverted into a store."""
     viewer = new_window("a night's stack", height=880)
     viewer.open_sample(PLUGIN, "wakefield_run")
-    invert_stack = open_widget(viewer, "Invert stack")
+    tool = open_widget(viewer, "Invert")
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
-        invert_stack.steps.add("high-pass")
-        invert_stack.store.edit.setText("night.shadowinv.zarr")
-        press_run(invert_stack)
-        print(invert_stack.panel.status.text(), [layer.name for layer in viewer.layers])
+        tool.steps.add("high-pass")
+        tool.store.folder.edit.setText("night.shadowinv.zarr")
+        press_run(tool)
+        print(tool.panel.status.text(), [layer.name for layer in viewer.layers])
         viewer.dims.set_current_step(0, 10)
         settle(3.0)
         viewer.layers["displacement arrows – night"].length = NIGHT_ARROWS

@@ -90,14 +90,14 @@ def test_the_recipe_of_the_first_shadowgram_repeats_its_report(
 ):
     from qtpy.QtCore import QSettings
 
-    from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+    from napari_shadowinv._napari.widgets.invert import Invert
 
     # The widget must not remember the settings of whoever runs the test.
     QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(tmp_path))
     monkeypatch.chdir(tmp_path)
     viewer = make_napari_viewer()
     viewer.open_sample("napari-shadowinv", "toroid")
-    tool = InvertShot(viewer)
+    tool = Invert(viewer)
     assert tool.source.choice.currentText() == "supplied with the shot"
     tool.recipes.save(Path("recipe.toml"))
     viewer.layers["toroid"].save("toroid.tif")

@@ -92,7 +92,7 @@ def test_an_image_of_another_size_is_told_how_to_get_a_scale(
     image = viewer.add_image(np.ones((30, 52)), name="other")
     assert tuple(image.scale) == (1, 1)
     assert "'other' is in pixels, the results are in µm" in messages[-1]
-    assert "Invert shot" in messages[-1]
+    assert "Invert" in messages[-1]
 
 
 def test_what_has_a_place_keeps_it(

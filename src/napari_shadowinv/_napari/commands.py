@@ -93,7 +93,7 @@ def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> results.La
 def refine(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Fit the forward model to the image of the selected inversion, in a window by Invert shot."""
+    """Fit the forward model to the image of the selected inversion, in *Invert*."""
     if layer is None:
         raise InputError("no layer is selected: select a layer of an inversion's result")
     from napari_shadowinv._napari.jobs import name_of_result, refinement
@@ -101,7 +101,7 @@ def refine(
     job = refinement(layer, layer, name_of_result(layer), psf=0.0)
     if viewer is None or not viewer_sync.in_event_loop():
         return list(job.work(lambda _: None, lambda: False).layer_data)
-    _open_widget(viewer, "Invert shot").refine_layer(layer)
+    _open_widget(viewer, "Invert").refine_layer(layer)
     return []
 
 
@@ -218,26 +218,16 @@ def predict_image(
 
 @viewer_sync.notify_errors(otherwise=lambda: None)
 def watch_folder(viewer: napari.Viewer | None = None) -> None:
-    """Choose a folder whose shots are inverted as they arrive, in *Invert stack*."""
-    _open_widget(viewer, "Invert stack").choose_folder()
+    """Choose a folder whose shots are inverted as they arrive, in *Invert*."""
+    _open_widget(viewer, "Invert").choose_folder()
 
 
 @viewer_sync.notify_errors(otherwise=lambda: None)
 def edit_setup(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> None:
-    """Enter the setup of the selected image."""
-    window = _window_of(viewer)
-    from napari_shadowinv._napari.widgets.image_setup import ImageSetup
-
-    title = "Setup of an image"
-    widget = window.dock_widgets.get(title)
-    if widget is None:
-        widget = ImageSetup(without_proxy(viewer))
-        window.add_dock_widget(widget, name=title, area="right")
-    else:
-        without_proxy(widget).come_to_front()
-    widget.choose(without_proxy(layer))
+    """Enter the setup of the selected image, in *Invert*."""
+    _open_widget(viewer, "Invert").edit_setup(without_proxy(layer))
 
 
 def _source_for(selection: _Selection, layer: Any, viewer: Any) -> tuple[FloatArray, str]:
@@ -361,7 +351,9 @@ def _filtered_layer(
 
 def _open_widget(viewer: Any, name: str) -> Any:
     """Open one of the plugin's widgets, or bring it to the front, and return it."""
-    window = _window_of(viewer)
+    window = getattr(viewer, "window", None)
+    if window is None:
+        raise InputError("there is no window: choose this in a menu of napari")
     # napari's menus know the plugin by another name, under which it would be opened twice.
     for title, widget in window.dock_widgets.items():
         if title.startswith(f"{name} ("):
@@ -370,10 +362,3 @@ def _open_widget(viewer: Any, name: str) -> Any:
             return widget
     _, widget = window.add_plugin_dock_widget("napari-shadowinv", name)
     return widget
-
-
-def _window_of(viewer: Any) -> Any:
-    window = getattr(viewer, "window", None)
-    if window is None:
-        raise InputError("there is no window: choose this in a menu of napari")
-    return window

@@ -37,7 +37,7 @@ from napari_shadowinv.preprocessing import STEPS, Step
 # For each key a title, and the class of its form's model, a widget, or None.
 Kinds = dict[str, tuple[str, type[BaseModel] | QWidget | None]]
 
-PROBLEM_COLOUR = QColor("#d9822b")
+PROBLEM_COLOUR = QColor("#c8711a")  # as other colours of text, readable on dark and light
 PROBLEM_STYLE = f"color: {PROBLEM_COLOUR.name()};"
 _LABEL_WIDTH_PX, _ENTRY_WIDTH_PX = 80, 80
 INDENT = 12
@@ -139,14 +139,25 @@ class SavedLine(QtWidgets.QLineEdit):
         self.setText(str(text))
 
 
+def _ask_for_file(edit: PathEdit) -> str:
+    return str(QtWidgets.QFileDialog.getOpenFileName(edit, edit.title, "", edit.files)[0])
+
+
 class PathEdit(QtWidgets.QWidget):
+    """An entry of a path; `ask` opens its dialog, and returns an empty string if cancelled."""
+
     changed = Signal()
 
     def __init__(
-        self, title: str, example: str = "path of a file", tip: str = "", files: str = ""
+        self,
+        title: str,
+        example: str = "path of a file",
+        tip: str = "",
+        files: str = "",
+        ask: Callable[[PathEdit], str] = _ask_for_file,
     ) -> None:
         super().__init__()
-        self._title, self._files = title, files
+        self.title, self.files, self._ask = title, files, ask
         self.edit = SavedLine(example, tip)
         self.edit.setMinimumWidth(60)
         qt.side_by_side((qt.with_button(self.edit, "…", title, self.choose), 0), holder=self)
@@ -162,13 +173,8 @@ class PathEdit(QtWidgets.QWidget):
     def restore(self, path: Any) -> None:
         self.edit.setText(str(path))
 
-    def ask(self) -> str:
-        """Open a dialog and return the chosen path, or an empty string."""
-        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, self._title, "", self._files)
-        return str(path)
-
     def choose(self) -> None:
-        path = self.ask()
+        path = self._ask(self)
         if path:
             self.edit.setText(path)
             self.changed.emit()
@@ -263,15 +269,16 @@ class Entry:
         return widget
 
     def _make_line(self, texts: dict[str, str]) -> Any:
-        in_unit = f"in {self._unit}" if self._unit else "a number"
-        hint = in_unit if self._field.is_required() else f"not set ({in_unit})"
+        is_file, is_number = Path in self._kinds, bool(self._kinds & {int, float})
+        content = " or ".join(["a number"] * is_number + ["a file"] * is_file)
+        content = f"in {self._unit}" if self._unit else content
+        hint = content if self._field.is_required() else f"not set ({content})"
         if tuple in self._kinds:
             hint = "all, or a range such as 10:200"
         elif self._default is not None:
-            hint = _text_of(self._default, self._unit)
-        is_file = Path in self._kinds
-        if is_file:
-            hint = "path of a file" if self._kinds == {Path} else "a number, or a file"
+            hint = _text_of(self._default, self._unit) if is_number else str(self._default)
+        elif not content:
+            hint = "default"
         line = magic.LineEdit(**texts)
         line.native.setPlaceholderText(hint)
         line.native.setMinimumWidth(_ENTRY_WIDTH_PX)
@@ -332,8 +339,10 @@ def _choices_in(annotation: Any) -> tuple[Any, ...]:
 
 
 def _text_of(value: Any, unit: str) -> str:
-    if isinstance(value, tuple | list):  # pixels, first and end
-        start, stop = value
+    if isinstance(value, tuple | list):
+        if value and isinstance(value[0], str):
+            return ", ".join(value)
+        start, stop = value  # pixels, first and end
         return f"{start}:{'' if stop is None else stop}"
     is_number = isinstance(value, int | float)
     return text_in_unit(value, unit) if is_number else str(value)
@@ -350,7 +359,8 @@ class ModelForm(QWidget):
         self._model_class = model_class
         self._fixed: dict[str, Any] = {}
         self.entries: dict[str, Entry] = {}
-        rows = QtWidgets.QFormLayout()
+        self._rare: list[str] = []  # have a row only while they are stated
+        self._rows = rows = QtWidgets.QFormLayout()
         rows.setContentsMargins(0, 0, 0, 0)
         rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
@@ -365,6 +375,10 @@ class ModelForm(QWidget):
             widget = self.entries[name].widget
             label = QtWidgets.QLabel(widget.label, toolTip=widget.tooltip)
             rows.addRow(label, widget.native)
+            extra = field.json_schema_extra
+            if isinstance(extra, dict) and extra.get("rare"):
+                self._rare.append(name)
+                rows.setRowVisible(widget.native, False)
         self._problem = WrappingLabel(style=PROBLEM_STYLE)
         qt.column(self).addLayout(rows)
         self.layout().addWidget(self._problem)
@@ -399,6 +413,9 @@ class ModelForm(QWidget):
         self._on_change()
 
     def _on_change(self) -> None:
+        for name in self._rare:
+            entry = self.entries[name]
+            self._rows.setRowVisible(entry.widget.native, entry.value is not None)
         problem = ""
         try:
             self.model()

@@ -1,7 +1,8 @@
 """Work on layers in a thread, with its estimated time and progress.
 
 - the pattern of all jobs: `Job`, `Finished`, `ImageJob`
-- an inversion: `InversionJob`; a fit: `FitJob`; the fit that refines an inversion: `refinement`
+- an inversion: `InversionJob`, with its cost: `estimate_cost`; its estimated source: `SourceJob`
+- a fit: `FitJob`; the fit that refines an inversion: `refinement`
 - time and progress of a fit: `TimeEstimate`, `FitProgress`
 """
 
@@ -18,16 +19,23 @@ from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.layer_metadata import KEY, Frame, Result, frame_of, result_of, role_of
 from napari_shadowinv._napari.layers import LayerData, result_layers
 from napari_shadowinv._napari.shots import shot_in_memory
-from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
+from napari_shadowinv._system.machine import physical_memory
+from napari_shadowinv._system.progress import OnProgress, Progress, Reporter, ShouldStop
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.options import FitChoices, FitOptions
+from napari_shadowinv.options import (
+    MAX_DEFAULT_SITES,
+    FitChoices,
+    FitOptions,
+    InversionOptions,
+)
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Cache, run_fit, run_refinement
 from napari_shadowinv.pipeline.fit_run import refinement_choices
 from napari_shadowinv.pipeline.inversion_run import run
-from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.preprocessing import Estimate, Recipe, estimate_source
 from napari_shadowinv.shot import Shot
 
 # Twice what two fast cores take for two to four images of 64² to 400² px without crossing rays.
@@ -50,6 +58,11 @@ _STAGE_NAMES = {"smoothness": "smoothness"} | dict.fromkeys(
     ("other starts", "full size", "point spread", "rivals", "samples", "evidence"), "full size"
 )
 _BAR_LENGTH = 1000
+# Of an inversion; measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites,
+# including the layers of the result.
+_SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
+_BYTES, _BYTES_PER_PIXEL, _BYTES_PER_SITE = 200e6, 280.0, 1700.0
+_MIN_PIXELS_FOR_ESTIMATE = 1_000_000
 _PREVIEW_ROLES = ("field", "caustic")
 
 
@@ -148,6 +161,48 @@ class FitProgress:
         return Progress(progress.stage, done, _BAR_LENGTH, message, self._objective)
 
 
+@dataclass(frozen=True)
+class CostEstimate:
+    """Estimated time (s) and peak memory (bytes) of an inversion."""
+
+    pixels: int
+    sites: int
+    seconds: float
+    memory: float
+
+    @property
+    def exceeds_memory(self) -> bool:
+        available = physical_memory()
+        return available is not None and self.memory > available
+
+    @property
+    def text(self) -> str:
+        """The estimate as a sentence; empty for small images."""
+        if self.pixels < _MIN_PIXELS_FOR_ESTIMATE and not self.exceeds_memory:
+            return ""
+        text = (
+            f"{self.pixels / 1e6:.3g} Mpx with {self.sites:,} sites: about "
+            f"{duration_in_words(self.seconds)} and up to {self.memory / 1e9:.1f} GB"
+        )
+        if not self.exceeds_memory:
+            return f"{text}."
+        return (
+            f"{text}, more than this machine's {(physical_memory() or 0) / 1e9:.1f} GB: crop or "
+            "bin the image, or choose fewer sites."
+        )
+
+
+def estimate_cost(
+    shape: tuple[int, ...], options: InversionOptions, pace: float = 1.0
+) -> CostEstimate:
+    """Estimate an inversion that takes `pace` times the reference time on this machine."""
+    pixels = shape[0] * shape[1]
+    sites = options.n_sites or min(pixels, MAX_DEFAULT_SITES)
+    seconds = pace * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites)
+    memory = _BYTES + _BYTES_PER_PIXEL * pixels + _BYTES_PER_SITE * sites
+    return CostEstimate(pixels, sites, seconds, memory)
+
+
 @dataclass(frozen=True, eq=False)
 class Finished:
     """The result of a job, and the layers that show it."""
@@ -163,7 +218,12 @@ class Finished:
 
 
 class Job:
-    """Something to compute in a thread, and the layers that come of it."""
+    """Something to compute in a thread, and the layers that come of it.
+
+    Cancelled work that does not stop is left alone after `patience` (s).
+    """
+
+    patience: ClassVar[float] = 0.5
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
         raise NotImplementedError
@@ -230,6 +290,41 @@ class InversionJob(ImageJob):
         if self.preview:
             layer_data = [layer for layer in layer_data if role_of(layer[1]) in _PREVIEW_ROLES]
         return layer_data
+
+
+@dataclass(frozen=True, eq=False)
+class SourceJob(Job):
+    estimate: Estimate
+    shot: Shot  # its image may be lazy
+    image: Any
+    made_from: dict[str, str]
+
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FloatArray:
+        report = Reporter(on_progress, should_stop)
+        report("source", 0, None, self.estimate.title)
+        shot = shot_in_memory(self.shot, "the image")
+        source = estimate_source(self.estimate, shot, should_stop)
+        report("source", 1, 1)
+        return source
+
+    def layers(self, content: FloatArray) -> LayerData:
+        layer: Any = self.image
+        metadata = about.metadata_for(
+            about.SOURCE,
+            "",
+            about.setup_of(layer),
+            setup_origin=about.setup_origin_of(layer),
+            made_from=self.made_from,
+            source_mask=self.shot.source_mask,
+        )
+        keywords = {
+            "name": f"{layer.name} source: {self.estimate.title}",
+            "metadata": metadata,
+            "colormap": layer.colormap.name,
+            "contrast_limits": tuple(layer.contrast_limits),
+            **about.frame_of(layer).keywords(),
+        }
+        return [(content, keywords, "image")]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -54,6 +54,7 @@ _MAILBOX_POLL_MS, _PROGRESS_POLL_MS = 10, 500
 # after this time instead of 5 ms.
 _SWITCH_INTERVAL_S = 1e-3
 _MIN_SHOWN_TIME_S = 2.0
+_PATIENCE_S = 0.5
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,8 @@ def _stop(boxes: list[_Mailbox]) -> None:
 class Run(QtWidgets.QWidget):
     """A button to run and cancel, with a progress bar and a line of text.
 
-    It does one work at a time; cancelled work that does not stop is left alone after `patience`
-    (s). The `task` names the work in napari's activity dock.
+    It does one work at a time; cancelled work that does not stop is left alone after the `patience`
+    of its tag (s). The `task` names the work in napari's activity dock.
     """
 
     # A change outside the canvas redraws the whole window. Without a graphics card, an animated bar
@@ -108,9 +109,9 @@ class Run(QtWidgets.QWidget):
     progressed = Signal(object)
     ended = Signal(object)
 
-    def __init__(self, task: str, text: str, tip: str, patience: float = 0.5) -> None:
+    def __init__(self, task: str, text: str, tip: str) -> None:
         super().__init__()
-        self._task, self._text, self._patience = task, text, patience
+        self._task, self._text = task, text
         self._box: _Mailbox | None = None
         self._pending: tuple[Work, Any, bool] | None = None
         self._to_stop: list[_Mailbox] = []
@@ -170,7 +171,8 @@ class Run(QtWidgets.QWidget):
         self._pending = None
         if self._box is not None:
             self._box.stop.set()
-            self._box.detach_at = min(self._box.detach_at, time.monotonic() + self._patience)
+            patience = getattr(self._box.tag, "patience", _PATIENCE_S)
+            self._box.detach_at = min(self._box.detach_at, time.monotonic() + patience)
             self.button.setText("Cancelling…")
             self.button.setEnabled(False)
             self.say("")

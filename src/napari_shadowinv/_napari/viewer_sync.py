@@ -186,8 +186,8 @@ def _place_on_result(layer: Any, fields: list[Any]) -> None:
         unit = f"{fields[-1].units[-1]:~P}"
         show_warning(
             f"'{layer.name}' is in pixels, the results are in {unit}, and their sizes differ, so "
-            "they do not overlap. To set the scale, select the layer and its setup in 'Invert "
-            "shot' and press Run, or move the layer (layer controls → transform)"
+            "they do not overlap. To set the scale, select the layer and its setup in 'Invert' "
+            "and press 'Show at scale', or move the layer (layer controls → transform)"
         )
         return
     frame = frame_of(same_size[-1])

@@ -14,7 +14,7 @@ from helpers.reports import texts_of
 from napari_shadowinv._napari.form import StepsSection
 from napari_shadowinv._napari.simulations import input_field
 from napari_shadowinv._napari.viewer_sync import error_text
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
@@ -40,7 +40,7 @@ def test_a_doubt_of_a_setup_stands_in_the_form_only(
 ) -> None:
     image = synthetic_image(ellipse_pair((40, 52)).displacement)
     viewer.add_image(image, name="shot")
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.options.restore({"n_sites": 200})
     swapped = {"source_object_distance": 1.0, "object_image_distance": 0.01, "energy": 14.7}
     tool.setup.show_setup(ProtonSetup(pixel_size=1e-6, **swapped).model_dump())
@@ -84,7 +84,7 @@ def test_an_estimate_that_contains_the_object_says_so(
 ) -> None:
     image = synthetic_image(1.5 * ellipse_pair((96, 120)).displacement)
     viewer.add_image(image * np.random.default_rng(5).normal(1, 0.01, image.shape), name="shot")
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     assert estimated(tool, "polynomial", qtbot) == ""
     assert "of the pattern in the image" in estimated(tool, "total-variation", qtbot)
     mask = np.zeros(image.shape, int)
@@ -96,12 +96,12 @@ def test_an_estimate_that_contains_the_object_says_so(
 def test_a_file_that_fails_is_not_shown_in_place_of_the_last_shot(
     window: Any, open_widget: Any, qtbot: Any, tmp_path: Path
 ) -> None:
-    tool = open_widget("Invert stack")
+    tool = open_widget("Invert")
     tool.options.restore({"n_sites": 100})
     tool.shots.set_kind("folder")
-    tool.shots.folder.folder.edit.setText(str(tmp_path))
-    tool.shots.folder.pattern.setText("*.npy")
-    tool.store.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+    tool.shots.folder.edit.setText(str(tmp_path))
+    tool.store.watch.restore({"pattern": "*.npy"})
+    tool.store.folder.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
     image = synthetic_image(ellipse_pair((40, 52)).displacement)
     (tmp_path / "a0.npy").write_bytes(b"")
     for number in (1, 2):
@@ -109,7 +109,7 @@ def test_a_file_that_fails_is_not_shown_in_place_of_the_last_shot(
     tool.panel.button.click()
     qtbot.waitUntil(lambda: "2 done" in tool.panel.status.text(), timeout=PATIENCE)
     (tmp_path / "a3.npy").write_bytes(b"")
-    qtbot.waitUntil(lambda: len(tool.failures.rows) == 2, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: len(tool.stack_view.failures.rows) == 2, timeout=PATIENCE)
     qtbot.wait(1000)
     assert window.dims.current_step[0] == 2
     np.save(tmp_path / "a4.npy", image)

@@ -24,7 +24,7 @@ from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.packs import BY_HAND, film_layers
 from napari_shadowinv._napari.widgets.film_pack import FilmPack, NewPackDialog
 from napari_shadowinv._napari.widgets.fit_images import FitImages
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.film import read_corners
 from napari_shadowinv.film_doses import FilmDoses
@@ -292,7 +292,7 @@ def test_films_become_images_that_can_be_fitted(
     for shot, layer in zip(job.shots, images, strict=True):
         np.testing.assert_array_equal(shot.mask, usable_of(layer))
         assert shot.setup == setup_of(layer)
-    invert = InvertShot(viewer)
+    invert = Invert(viewer)
     qtbot.addWidget(invert)
     invert.image.layer = images[1]
     request = invert.request()

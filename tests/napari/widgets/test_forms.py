@@ -18,7 +18,7 @@ from qtpy.QtWidgets import QFileDialog, QWidget
 from helpers.forms import enter
 from napari_shadowinv import InputError, Instrument, InversionOptions, OpticalSetup, ProtonSetup
 from napari_shadowinv._napari.form import ModelForm, ModelPicker, kinds_of, save_text
-from napari_shadowinv._napari.widgets._inputs import InstrumentForm, OptionsForm, SetupPicker
+from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.io import read_toml
@@ -185,13 +185,6 @@ def test_the_command_line_reads_a_saved_setup(
     assert picker.setup() == setup
     if isinstance(setup, OpticalSetup):
         assert math.isinf(picker.setup().source_object_distance)
-
-
-def test_saved_options_are_those_of_the_form(qtbot: Any) -> None:
-    form = OptionsForm(InversionOptions)
-    qtbot.addWidget(form)
-    form.restore(CHANGED)
-    assert InversionOptions(**form._to_save()) == InversionOptions(**CHANGED)
 
 
 def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> None:

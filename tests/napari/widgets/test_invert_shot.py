@@ -16,7 +16,6 @@ import h5py
 import numpy as np
 import pytest
 from napari.utils import progress
-from qtpy.QtWidgets import QComboBox
 
 from helpers.forms import enter
 from helpers.jobs import run_job
@@ -31,13 +30,13 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     unit_of,
 )
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent
-from napari_shadowinv.options import BEAM_SOURCES, DETECTORS
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
 from napari_shadowinv.pipeline import read_recipe
+from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import STEPS, Crop, LowPassFilter, PolynomialEstimate, Recipe
 from napari_shadowinv.provenance import Provenance
 
@@ -49,7 +48,7 @@ PATIENCE = 60_000  # ms; a machine may have other things to do
 @pytest.fixture
 def tool(window: Any, open_widget: Callable[[str], Any], shot: Array) -> Any:
     window.add_image(shot, name="shot")
-    widget = open_widget("Invert shot")
+    widget = open_widget("Invert")
     widget.options.restore(FEW)
     return widget
 
@@ -127,7 +126,7 @@ def test_closing_the_window_ends_the_run(
 ) -> None:
     viewer = make_napari_viewer(show=True)
     viewer.add_image(shot, name="shot")
-    _, widget = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert shot")
+    _, widget = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert")
     widget.panel.button.click()
     qtbot.waitUntil(lambda: widget.panel.button.text() == "Cancel", timeout=PATIENCE)
     viewer.close()
@@ -292,7 +291,7 @@ def test_cancel_ends_the_work_itself(
     tool.options.restore({"tolerance": 1e-12, "lloyd_iterations": 1000, "lloyd_tolerance": 0})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: "Placing the sites" in tool.panel.status.text(), timeout=PATIENCE)
-    tool.panel._patience = math.inf
+    monkeypatch.setattr(Job, "patience", math.inf)
     tool.panel.button.click()
     cancelled.set()
     qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
@@ -356,7 +355,7 @@ def test_a_run_replaces_the_last_result_of_its_shot(
 USER_ERRORS = {
     "no image": None,
     "colour": np.ones((20, 20, 3)),
-    "Split Stack": np.ones((3, 20, 20)),
+    "o store is selected": np.ones((3, 20, 20)),
     "at least 4 × 4": np.ones((1, 1)),
     "no positive pixel": np.zeros((20, 20)),
     "NaN": np.full((20, 20), np.nan),
@@ -391,7 +390,7 @@ def expecting(messages: list[str], qtbot: Any) -> Any:
 def test_a_mistake_is_told_once_and_the_viewer_lives(
     window: Any, open_widget: Any, expecting: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tool = open_widget("Invert shot")
+    tool = open_widget("Invert")
     tool.options.restore(FEW)
 
     expect = expecting(tool)
@@ -438,7 +437,7 @@ def test_a_mistake_in_a_layer_of_another_kind_is_told_once(
     expect("1 pixel")
     lazy = dask.array.ones((3, 20, 20), chunks=(1, 20, 20))
     tool.image.layer = window.add_image(lazy, name="stack", contrast_limits=(0, 1))
-    expect("Split Stack")
+    expect("o store is selected")
     tool.image.layer = window.layers["shot"]
     tool._draw_crop()
     tool.crop.layer.add_rectangles(np.array([[500, 500], [500, 600], [600, 600], [600, 500]]))
@@ -505,6 +504,9 @@ def test_the_preview_follows_in_its_own_layers(
     qtbot.waitUntil(lambda: len(tool.previewed.layers) == 2 and settled(tool), timeout=PATIENCE)
     before = tool.previewed.layers
     field = layer_of(window, "field", "preview")
+    assert "Preview: " in tool.verdict.text()
+    residual = result_of(field).content.report.image_residual
+    assert percent(residual) in tool.panel.status.text()
 
     def follows(change: Any) -> None:
         """Wait until the layer follows a change."""
@@ -553,13 +555,15 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     for name in STEPS:
         tool.steps.add(name)
     tool.steps.folded.expand()
+    tool.store.run.restore({"workers": 3, "overwrite": True})
     assert_it_fits(tool)
     tool._keeper.write()
-    again = InvertShot(window)
+    again = Invert(window)
     qtbot.addWidget(again)
     assert again.options.model() == InversionOptions(seed=5)
     assert again.setup.setup() == paper_setup()
     assert again.source.model() == tool.source.model()
+    assert again.store.run.model() == RunOptions(workers=3)
     assert again.steps.steps() == tuple(step() for step in STEPS.values())
     steps = "Steps: subtract dark level, rotate, crop, remove hot pixels, bin"
     assert again.steps.folded.text().startswith(steps)
@@ -592,17 +596,6 @@ def test_doubts_stand_under_run_with_a_notification(
     assert not tool.report.details.isExpanded()
 
 
-def test_preview_shows_its_verdict_and_residual(
-    window: Any, tool: Any, qtbot: Any, messages: list[str]
-) -> None:
-    tool.live.setChecked(True)
-    qtbot.waitUntil(lambda: len(tool.previewed.layers) == 2 and settled(tool), timeout=PATIENCE)
-    assert "Preview: " in tool.verdict.text()
-    content = result_of(layer_of(window, "field", "preview")).content
-    assert percent(content.report.image_residual) in tool.panel.status.text()
-    assert messages == []
-
-
 def test_menu_brings_a_hidden_tab_to_the_front(
     window: Any, tool: Any, open_widget: Any, qtbot: Any
 ) -> None:
@@ -619,21 +612,6 @@ def test_menu_brings_a_hidden_tab_to_the_front(
     assert not dock.isVisible()
 
 
-def test_image_with_structure_is_taken_before_a_reference(window: Any, open_widget: Any) -> None:
-    y, x = np.mgrid[-1:1:96j, -1:1:96j]
-    beam = 400 * np.exp(-0.3 * (x**2 + y**2))
-    setup = paper_setup()
-    image = synthetic_image(toroid((96, 96), setup, 60.0, 20e-6).displacement, beam)
-    rng = np.random.default_rng(1)
-    window.add_image(rng.poisson(beam).astype(float), name="reference")
-    tool = open_widget("Invert shot")
-    assert tool.image.layer.name == "reference"
-    shot = window.add_image(rng.poisson(image).astype(float), name="shot")
-    assert tool.image.layer is shot
-    window.add_image(rng.poisson(beam).astype(float), name="later reference")
-    assert tool.image.layer is shot
-
-
 def test_camera_fits_after_units_change(
     window: Any, tool: Any, run: Any, proton_setup: ProtonSetup
 ) -> None:
@@ -646,19 +624,6 @@ def test_camera_fits_after_units_change(
     zoom = camera.zoom
     window.reset_view()
     assert camera.zoom == pytest.approx(zoom)
-
-
-def test_detector_and_beam_source_are_chosen_in_the_window(tool: Any) -> None:
-    form = tool.instrument
-    for kind, choices in (("detector", DETECTORS), ("beam_source", BEAM_SOURCES)):
-        box = form.entries[kind].line.native
-        assert isinstance(box, QComboBox)
-        assert [box.itemText(k) for k in range(box.count())] == ["", *choices]
-        assert box.currentText() == ""
-    assert tool.recipe().instrument == Instrument()
-    enter(form.entries["detector"], "film")
-    enter(form.entries["beam_source"], "laser")
-    assert tool.recipe().instrument == Instrument.of("film", source="laser")
 
 
 def test_a_recipe_keeps_detector_and_beam_source(tool: Any, tmp_path: Path) -> None:
@@ -698,7 +663,7 @@ def test_the_beam_under_a_painted_mask_is_predicted_with_its_error(
 ) -> None:
     blob = gaussian_blob((64, 64), -6.0, 4.0)
     window.add_image(np.random.default_rng(0).poisson(500 * synthetic_image(blob.displacement)))
-    tool = open_widget("Invert shot")
+    tool = open_widget("Invert")
     tool.options.restore(FEW)
     tool.source.set_kind("kriged")
     assert tool.source.choice.currentText() == "estimate: predicted under the mask"

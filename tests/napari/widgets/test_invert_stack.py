@@ -16,7 +16,6 @@ from helpers.forms import enter
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert
 from napari_shadowinv._napari.layer_metadata import role_of
-from napari_shadowinv._napari.widgets.invert_stack import InvertStack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, read_stack
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -44,13 +43,13 @@ def out(tmp_path: Path) -> Path:
 @pytest.fixture
 def tool(window: Any, open_widget: Callable[[str], Any], stack: Array, out: Path) -> Any:
     window.add_image(stack, name="shots")
-    return prepared(open_widget("Invert stack"), out)
+    return prepared(open_widget("Invert"), out)
 
 
 def prepared(widget: Any, out: Path) -> Any:
     widget.options.restore(FEW)
-    widget.store.edit.setText(str(out))
-    widget.engine.workers.setValue(1)
+    widget.store.folder.edit.setText(str(out))
+    widget.store.run.restore({"workers": 1})
     return widget
 
 
@@ -66,7 +65,7 @@ def run(qtbot: Any) -> Callable[[Any], None]:
 
 
 def at_rest(tool: Any) -> bool:
-    return not (tool.panel.running or tool.results.busy or tool._refresh_timer.isActive())
+    return not (tool.panel.running or tool.stack_view.busy)
 
 
 @pytest.fixture
@@ -113,13 +112,13 @@ def test_a_stack_layer_becomes_a_store_and_layers(
     proton_setup: ProtonSetup,
 ) -> None:
     tool.setup.show_setup(proton_setup.model_dump())
-    tool.engine.workers.setValue(2)
+    tool.store.run.restore({"workers": 2})
     run(tool)
     assert messages == []
     assert (StackStore(out).statuses() == DONE).all()
     assert tool.panel.status.text() == "4 of 4 done, in run.shadowinv.zarr"
     assert tool.panel.status.toolTip() == str(out)
-    assert not tool.failures.isVisible()
+    assert not tool.stack_view.failures.isVisible()
     field, image = layer_of(window, "field"), window.layers["shots"]
     expected = invert(stack[2], options=InversionOptions(**FEW))
     strength = np.hypot(*proton_setup.path_integrated_b(expected.displacement))
@@ -148,7 +147,7 @@ def test_a_lazy_layer_is_read_shot_by_shot(
         return block
 
     lazy = da.from_array(stack, chunks=(1, -1, -1)).map_blocks(read, meta=np.empty((0, 0, 0)))
-    tool.shots.layers.layer = window.add_image(lazy, name="lazy", contrast_limits=(0, 200))
+    tool.image.layer = window.add_image(lazy, name="lazy", contrast_limits=(0, 200))
     run(tool)
     assert set(at_once) == {1}
     stored = StackStore(out)
@@ -172,11 +171,11 @@ def test_a_corrupt_file_is_listed_and_the_others_are_done(
     run(tool)
     assert messages == []
     assert StackStore(out).statuses().tolist() == [DONE, FAILED, DONE, DONE]
-    (name, reason), *further = texts_of(tool.failures).items()
+    (name, reason), *further = texts_of(tool.stack_view.failures).items()
     assert name == "shot_1.npy"
     assert reason == StackStore(out).report(1)["reason"]
     assert further == []
-    assert tool.failures.isVisible()
+    assert tool.stack_view.failures.isVisible()
     assert tool.panel.status.text() == ("3 of 4 done, 1 failed, in run.shadowinv.zarr")
     assert np.isnan(np.asarray(layer_of(window, "field").data[1])).all()
 
@@ -184,13 +183,13 @@ def test_a_corrupt_file_is_listed_and_the_others_are_done(
     (tmp_path / "shot_1.npy").write_bytes(content)
     before = written(out)
     run(tool)
-    assert list(texts_of(tool.failures)) == ["shot_1.npy"]
-    tool.redo_failed.setChecked(True)
+    assert list(texts_of(tool.stack_view.failures)) == ["shot_1.npy"]
+    enter(tool.store.run.entries["redo_failed"], True)
     run(tool)
-    assert not tool.failures.isVisible()
+    assert not tool.stack_view.failures.isVisible()
     assert (StackStore(out).statuses() == DONE).all()
     assert before.items() <= written(out).items()
-    assert not tool.redo_failed.isChecked()
+    assert not tool.store.run.model().redo_failed
 
 
 def test_cancelled_in_the_middle_it_goes_on_from_there(
@@ -252,7 +251,7 @@ def test_closing_the_window_ends_the_run(
 ) -> None:
     viewer = make_napari_viewer(show=True)
     viewer.add_image(stack, name="shots")
-    _, widget = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert stack")
+    _, widget = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert")
     prepared(widget, out).panel.button.click()
     qtbot.waitUntil(lambda: widget.panel.bar.value() == 2, timeout=PATIENCE)
     viewer.close()
@@ -292,28 +291,25 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.source.set_kind("uniform")
     assert written(out) == before
 
-    tool.store.edit.setText(str(tmp_path / "results"))
+    tool.store.folder.edit.setText(str(tmp_path / "results"))
     expect(".shadowinv.zarr")
-    tool.store.edit.setText("")
+    tool.store.folder.edit.setText("")
     expect("o store is selected")
-    tool.store.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
-    tool.engine.set_kind("scheduler")
-    expect("address is ''")
+    tool.store.folder.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
+    tool.store.cluster.setText("somewhere")
+    expect("address is 'somewhere'")
     monkeypatch.setattr(_schedulers, "_CONNECT_TIMEOUT_S", 0.3)
-    tool.engine.address.setText("tcp://127.0.0.1:9")
+    tool.store.cluster.setText("tcp://127.0.0.1:9")
     expect("o scheduler responds at tcp://127.0.0.1:9")
-    tool.engine.set_kind("threads")
+    tool.store.cluster.setText("")
     tool.shots.set_kind("files")
     expect("o files are selected")
     tool.shots.files.edit.setText(str(tmp_path / "*.tif"))
     expect("o file matches")
-    tool.shots.set_kind("layer")
-    tool.shots.layers.layer = window.add_image(np.ones(SHAPE), name="one")
-    expect("use 'Invert shot'")
-    tool.shots.layers.layer = window.add_image(np.ones((*SHAPE, 3)), rgb=True)
+    tool.image.layer = window.add_image(np.ones((*SHAPE, 3)), rgb=True)
     expect("colour image")
     window.layers.clear()
-    expect("no stack of shots")
+    expect("no image to use")
     assert sorted(path.name for path in tmp_path.glob("*.zarr")) == [out.name]
 
 
@@ -321,10 +317,10 @@ def test_overwriting_takes_a_box_that_counts_once(tool: Any, run: Any, out: Path
     run(tool)
     before = written(out)
     tool.options.restore({**FEW, "seed": 7})
-    tool.overwrite.setChecked(True)
+    enter(tool.store.run.entries["overwrite"], True)
     run(tool)
     assert not before.items() & written(out).items()
-    assert not tool.overwrite.isChecked()
+    assert not tool.store.run.model().overwrite
 
 
 def test_shots_are_filtered_and_their_sources_guessed(
@@ -345,18 +341,3 @@ def test_shots_are_filtered_and_their_sources_guessed(
     np.testing.assert_allclose(
         potential[mask], expected.potential[mask], atol=1e-4 * np.ptp(expected.potential)
     )
-
-
-def test_it_fits_and_remembers_what_is_harmless(
-    window: Any, tool: Any, qtbot: Any, assert_it_fits: Any
-) -> None:
-    tool.engine.workers.setValue(3)
-    tool.overwrite.setChecked(True)
-    tool._show_failures([("a_very_long_name_of_a_file_of_a_shot_0001.tif", "it is damaged " * 5)])
-    assert_it_fits(tool)
-    tool._keeper.write()
-    again = InvertStack(window)
-    qtbot.addWidget(again)
-    assert again.options.model() == InversionOptions(**FEW)
-    assert again.engine.engine() == ("threads", 3)
-    assert not again.overwrite.isChecked()

@@ -11,9 +11,9 @@ from napari.layers import Image, Labels, Shapes
 
 from helpers.jobs import run_job
 from napari_shadowinv import InputError, InversionOptions
+from napari_shadowinv._napari.jobs import SourceJob, estimate_cost
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
-from napari_shadowinv._napari.widgets.invert_shot import SourceJob, estimate_cost
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion import compilation
@@ -94,13 +94,14 @@ def test_a_megapixel_ends_at_the_look_that_asks(job: Any, tmp_path: Path) -> Non
 
 def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Path) -> None:
     stack, out = np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr"
-    counted: list[tuple[int | None, int]] = []
+    counted: list[tuple[int, int]] = []
 
     class CountingJob(StackJob):
-        def _update(self, index: int | None) -> None:
-            counted.append((index, self.status.ended))
+        def _update(self, status: Any) -> None:
+            if status.outcome is not None:
+                counted.append((status.outcome.index, self.status.ended))
 
-    job = CountingJob(stack, out, Recipe(options=FEW), run_options=RunOptions(workers=1))
+    job = CountingJob(stack, out, Recipe(options=FEW), options=RunOptions(workers=1))
     run_job(job)
     assert counted == [(0, 0), (1, 1)]
     assert job.status.ended == 2

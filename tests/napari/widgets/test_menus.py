@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from qtpy.QtWidgets import QComboBox
+from qtpy.QtWidgets import QComboBox, QFileDialog
 
 from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, setup_origin_of
@@ -16,8 +16,7 @@ from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets.analyse import Analyse
-from napari_shadowinv._napari.widgets.image_setup import ImageSetup
-from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv._system.machine import available_threads, set_default_threads
 from napari_shadowinv.inversion import Inversion
 
@@ -96,13 +95,11 @@ def test_an_image_is_predicted_from_the_selected_potential(
 def test_a_folder_is_chosen_and_watched(
     opened: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "napari_shadowinv._napari.widgets._stack_jobs._FolderEdit.ask", lambda _: str(tmp_path)
-    )
-    stack = opened(InvertStack)
-    stack.choose_folder()
-    assert stack.shots.kind == "folder"
-    assert stack.shots.folder.path == tmp_path
+    monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(tmp_path))
+    tool = opened(Invert)
+    tool.choose_folder()
+    assert tool.shots.kind == "folder"
+    assert tool.shots.shots() == tmp_path
 
 
 def test_a_setup_is_stored_with_its_image(
@@ -116,15 +113,14 @@ def test_a_setup_is_stored_with_its_image(
     mask = window.add_labels(np.zeros((20, 30), int))
     window.layers.selection.active = stack
     choose("edit_setup")
-    widget = docked(window, ImageSetup)
+    widget = docked(window, Invert)
     widget.setup.picker.set_kind("proton")
-    widget.apply_button.click()
+    widget.setup.scale_button.click()
     assert "'Kinetic energy (MeV)' is missing" in messages[-1]
-    assert widget.status.text() == messages[-1]
+    assert widget.panel.status.text() == messages[-1]
     widget.setup.picker.form.restore(proton_setup.model_dump())
     assert widget.area.horizontalScrollBar().maximum() == 0
-    assert setup_of(stack) is None  # not before Apply
-    widget.apply_button.click()
+    widget.setup.scale_button.click()
     assert setup_of(stack) == proton_setup
     assert setup_origin_of(stack) == "typed for 'shots'"
     np.testing.assert_allclose(stack.scale, (1, 1.5, 1.5))
@@ -132,12 +128,12 @@ def test_a_setup_is_stored_with_its_image(
     # The same widget shows another image, whose setup is none, and refuses a result.
     image = window.add_image(np.ones((20, 30)), name="other")
     choose("edit_setup")
-    assert docked(window, ImageSetup) is widget
+    assert docked(window, Invert) is widget
     assert widget.image.layer is image
     assert widget.setup.setup() is None
     (window.layers.selection.active,) = add_some(window, solved, "field")
     choose("edit_setup")
-    assert "is no image, or part of a result" in messages[-1]
+    assert "is no image of a shot" in messages[-1]
 
 
 def test_an_open_widget_is_not_opened_twice(window: Any, choose: Any, qtbot: Any) -> None:

@@ -13,8 +13,7 @@ from napari_shadowinv._napari.layer_metadata import is_estimate, metadata_for, r
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import layers_of_dataset
 from napari_shadowinv._napari.widgets.fit_images import FitImages
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
-from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
 from napari_shadowinv.preprocessing import polynomial_source
@@ -44,11 +43,11 @@ def boxes(tool: Any) -> tuple[str, str]:
 def test_a_pair_fills_both_boxes(
     viewer: ViewerModel, opened: Any, shot: str, beam: str, beam_first: bool, window_first: bool
 ) -> None:
-    tool = opened(InvertShot) if window_first else None
+    tool = opened(Invert) if window_first else None
     images = {shot: OBJECT, beam: BEAM}
     for name in (beam, shot) if beam_first else (shot, beam):
         viewer.add_image(images[name], name=name)
-    assert boxes(tool or opened(InvertShot)) == (shot, beam)
+    assert boxes(tool or opened(Invert)) == (shot, beam)
 
 
 def test_a_name_counts_more_than_structure(viewer: ViewerModel, opened: Any) -> None:
@@ -56,7 +55,7 @@ def test_a_name_counts_more_than_structure(viewer: ViewerModel, opened: Any) -> 
     mesh = 1 + 0.5 * (np.indices(SHAPE).sum(axis=0) // 16 % 2)
     for name, image in {"shot": BEAM, "ref": mesh, "dark": 0.01 * OBJECT}.items():
         viewer.add_image(image, name=name)
-    assert boxes(opened(InvertShot)) == ("shot", "ref")
+    assert boxes(opened(Invert)) == ("shot", "ref")
 
 
 @pytest.mark.parametrize(
@@ -75,17 +74,17 @@ def test_nothing_is_guessed_where_two_are_possible(
 ) -> None:
     for name, image in {**others, "shot": OBJECT}.items():
         viewer.add_image(image, name=name)
-    assert boxes(opened(InvertShot)) == ("shot", "uniform")
+    assert boxes(opened(Invert)) == ("shot", "uniform")
 
 
 def test_a_choice_is_never_overruled(viewer: ViewerModel, opened: Any) -> None:
     viewer.add_image(OBJECT, name="shot")
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.source.set_kind("polynomial")
     viewer.add_image(BEAM, name="ref")
     assert boxes(tool) == ("shot", "polynomial")
 
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.image.layer = viewer.layers["ref"]
     viewer.add_image(OBJECT, name="shot 2")
     assert tool.image.layer.name == "ref"
@@ -94,7 +93,7 @@ def test_a_choice_is_never_overruled(viewer: ViewerModel, opened: Any) -> None:
 def test_without_its_beam_an_image_has_the_source_from_before(
     viewer: ViewerModel, opened: Any
 ) -> None:
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     viewer.add_image(OBJECT, name="shot")
     beam = viewer.add_image(BEAM, name="ref")
     assert boxes(tool) == ("shot", "ref")
@@ -105,7 +104,7 @@ def test_without_its_beam_an_image_has_the_source_from_before(
 
 def test_an_estimate_is_not_taken_before_it_is_chosen(viewer: ViewerModel, opened: Any) -> None:
     viewer.add_image(OBJECT, name="shot")
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     made_from = {"estimate": "polynomial"}
     estimate = viewer.add_image(
         BEAM, name="shot source", metadata=metadata_for("source", "", made_from=made_from)
@@ -118,12 +117,12 @@ def test_an_estimate_is_not_taken_before_it_is_chosen(viewer: ViewerModel, opene
 def test_a_stack_is_taken_with_its_beam(viewer: ViewerModel, opened: Any) -> None:
     viewer.add_image(np.stack([OBJECT, OBJECT]), name="run")
     viewer.add_image(BEAM, name="reference")
-    tool = opened(InvertStack)
-    assert tool.shots.layer.name == "run"
+    tool = opened(Invert)
+    assert tool.image.layer.name == "run"
     assert tool.source.layer.name == "reference"
 
 
-@pytest.mark.parametrize(("images", "kind"), [(1, InvertShot), (2, FitImages)])
+@pytest.mark.parametrize(("images", "kind"), [(1, Invert), (2, FitImages)])
 def test_a_fit_from_a_file_has_its_beam(
     viewer: ViewerModel, opened: Any, tmp_path: Any, images: int, kind: Any
 ) -> None:
@@ -153,7 +152,7 @@ def image_of(viewer: ViewerModel) -> Any:
 
 def test_an_estimate_becomes_a_layer(viewer: ViewerModel, opened: Any, qtbot: Any) -> None:
     shot = viewer.add_image(OBJECT, name="shot", scale=(2, 2), translate=(5, 7))
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     assert tool.show_source.parentWidget().isHidden()
     tool.source.set_kind("polynomial")
     assert not tool.show_source.parentWidget().isHidden()

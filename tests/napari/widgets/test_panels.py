@@ -104,7 +104,7 @@ def test_docks_of_this_plugin_share_their_place_as_tabs(
     window: Any, open_widget: Any, qtbot: Any
 ) -> None:
     main = window.window._qt_window
-    tools = [open_widget(name) for name in ("Invert shot", "Analyse", "Simulate")]
+    tools = [open_widget(name) for name in ("Invert", "Analyse", "Simulate")]
     docks = [next(d for d in main.findChildren(QDockWidget) if d.isAncestorOf(t)) for t in tools]
     qtbot.waitUntil(lambda: len(main.tabifiedDockWidgets(docks[0])) == 2, timeout=PATIENCE)
     assert set(main.tabifiedDockWidgets(docks[0])) == set(docks[1:])

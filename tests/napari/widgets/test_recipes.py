@@ -25,8 +25,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets import _files
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
-from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.store import read_stack
 from napari_shadowinv.pipeline import read_recipe, write_recipe
@@ -56,7 +55,7 @@ PATIENCE = 60_000  # ms
 def opened(opened: Callable[[Any], Any]) -> Callable[..., Any]:
     """Make a widget of a class, with few sites."""
 
-    def make(kind: Any = InvertShot) -> Any:
+    def make(kind: Any = Invert) -> Any:
         widget = opened(kind)
         widget.options.restore({"n_sites": 300})
         return widget
@@ -314,7 +313,7 @@ def test_the_selected_result_is_repeated_from_its_files(
 ) -> None:  # fmt: skip
     said: list[str] = []
     monkeypatch.setattr(_files, "show_info", said.append)
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.options.restore({"n_sites": 200})
     tool.recipes.repeat()
     assert not tool.panel.running  # the image is no result
@@ -334,23 +333,6 @@ def test_the_selected_result_is_repeated_from_its_files(
     tool.recipes.repeat()
     qtbot.waitUntil(lambda: len(said) == 2, timeout=60_000)
     assert f"the image {shot_file.name} differs" in said[1]
-
-
-def test_the_window_of_stacks_repeats_the_result_of_a_shot(
-    viewer: ViewerModel, opened: Any, image: Any, run: Any, qtbot: Any,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
-    said: list[str] = []
-    monkeypatch.setattr(_files, "show_info", said.append)
-    run(opened(InvertShot))
-    stack = opened(InvertStack)
-    (field,) = [layer for layer in viewer.layers if role_of(layer) == "field"]
-    viewer.layers.selection.active = field
-    stack.recipes.repeat()
-    with qtbot.captureExceptions() as exceptions:
-        qtbot.waitUntil(lambda: bool(said), timeout=PATIENCE)
-    assert exceptions == []
-    assert said == ["Difference: none: the same result, bit for bit. Changed: nothing"]
 
 
 def test_the_window_does_what_the_command_saves(
@@ -435,10 +417,10 @@ def test_a_stack_is_inverted_by_a_saved_recipe(
     write(tmp_path / "mask.png", usable.astype(float))
     write_recipe(tmp_path / "how.toml", recipe)
     stack = viewer.add_image(np.stack([shot, shot[::-1]]), name="shots", scale=(1, 2, 2))
-    tool = opened(InvertStack)
+    tool = opened()
     tool.recipes.load(tmp_path / "how.toml")
     assert tool.steps.steps() == recipe.steps
-    tool.store.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+    tool.store.folder.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
     tool.panel.button.click()
     qtbot.waitUntil(
         lambda: any(role_of(layer) == "field" for layer in viewer.layers), timeout=PATIENCE

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
+from types import SimpleNamespace
 from typing import Any
 
 from napari_shadowinv._napari.run import Outcome, Run
@@ -12,8 +13,8 @@ from napari_shadowinv._napari.run import Outcome, Run
 class Heard(Run):
     """A button that remembers how its work ended."""
 
-    def __init__(self, qtbot: Any, patience: float = 0.5) -> None:
-        super().__init__("Some work", "Run", "", patience)
+    def __init__(self, qtbot: Any) -> None:
+        super().__init__("Some work", "Run", "")
         qtbot.addWidget(self)
         self.outcomes: list[Outcome] = []
         self.ended.connect(self.outcomes.append)
@@ -50,12 +51,12 @@ def test_work_that_does_not_stop_is_left_alone(qtbot: Any) -> None:
 
 
 def test_work_that_must_be_finished_is_waited_for(qtbot: Any) -> None:
-    panel = Heard(qtbot, patience=math.inf)
-    work = Stubborn()
-    panel.start(work)
+    panel = Heard(qtbot)
+    work, job = Stubborn(), SimpleNamespace(patience=math.inf)
+    panel.start(work, job)
     panel.cancel()
     qtbot.wait(800)
     assert panel.cancelling
     work.may_look.set()
     qtbot.waitUntil(lambda: not panel.running, timeout=5000)
-    assert panel.outcomes == [Outcome("late")]
+    assert panel.outcomes == [Outcome("late", tag=job)]

@@ -36,7 +36,7 @@ def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 @pytest.fixture
 def tool(window: Any, open_widget: Callable[[str], Any], shot: Any) -> Any:
     window.add_image(shot, name="shot", metadata=metadata_for("shot", "", paper_setup()))
-    widget = open_widget("Invert shot")
+    widget = open_widget("Invert")
     widget.options.restore({"n_sites": 300})
     return widget
 
@@ -152,9 +152,9 @@ def test_shot_of_a_store_is_saved_alone(
 ) -> None:  # fmt: skip
     stack = np.stack([shot, shot[:, ::-1]])
     window.add_image(stack, name="run", metadata=metadata_for("shot", "", proton_setup))
-    tool = open_widget("Invert stack")
+    tool = open_widget("Invert")
     tool.options.restore({"n_sites": 300})
-    tool.store.edit.setText(str(tmp_path / "run.shadowinv.zarr"))
+    tool.store.folder.edit.setText(str(tmp_path / "run.shadowinv.zarr"))
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.panel.running and not tool.results.busy, timeout=PATIENCE)

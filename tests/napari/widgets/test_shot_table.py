@@ -1,4 +1,4 @@
-"""The table of shots in *Invert stack*: rows of a file, changed in the window."""
+"""The table of shots in *Invert*: rows of a file, changed in the window."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ def pack(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tool(window: Any, open_widget: Callable[[str], Any], pack: Path) -> Any:
-    tool = open_widget("Invert stack")
+    tool = open_widget("Invert")
     tool.options.restore({"tolerance": 1e-3})
-    tool.engine.workers.setValue(1)
-    tool.store.edit.setText(str(pack.with_name("run.shadowinv.zarr")))
+    tool.store.run.restore({"workers": 1})
+    tool.store.folder.edit.setText(str(pack.with_name("run.shadowinv.zarr")))
     tool.shots.set_kind("table")
     tool.shots.table.file.edit.setText(str(pack))
     tool.shots.table.file.changed.emit()
@@ -74,10 +74,10 @@ def use(tool: Any, row: int, *, used: bool) -> None:
 def run(tool: Any, qtbot: Any) -> StackStore:
     tool.panel.button.click()
     qtbot.waitUntil(
-        lambda: not (tool.panel.running or tool.results.busy or tool._refresh_timer.isActive()),
+        lambda: not (tool.panel.running or tool.stack_view.busy),
         timeout=60_000,
     )
-    return StackStore(tool.store.store)
+    return StackStore(tool.store.path)
 
 
 def test_a_table_is_shown_changed_and_inverted(
@@ -98,7 +98,7 @@ def test_a_table_is_shown_changed_and_inverted(
     assert messages == []
     assert store.names == ("film0.npy", "film1.npy")
     assert (store.statuses() == DONE).all()
-    stack = read(tool.store.store)
+    stack = read(tool.store.path)
     assert [setup_from_dataset(stack.isel(shot=k)) for k in range(2)] == [at(6.0), SETUP]
     (origin,) = store.report(0)["provenance"]["images"]
     assert "mask" not in origin
@@ -129,7 +129,7 @@ def test_the_mask_of_one_row_is_wrong(tool: Any, qtbot: Any, pack: Path) -> None
     write(tool, 1, MASK, "small.npy")
     store = run(tool, qtbot)
     assert store.statuses().tolist() == [DONE, FAILED, DONE]
-    assert "mask has shape (4, 4), image (48, 48)" in tool.failures.rows[0][1]
+    assert "mask has shape (4, 4), image (48, 48)" in tool.stack_view.failures.rows[0][1]
 
 
 def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:
@@ -155,7 +155,7 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:
     expect("o table is selected")
     tool.shots.table.file.edit.setText("/no/pack.csv")
     expect("/no/pack.csv")
-    assert not tool.store.store.exists()
+    assert not tool.store.path.exists()
 
 
 def test_the_rows_are_saved_as_they_are_shown(

@@ -18,7 +18,7 @@ from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, sourc
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.simulations import ForwardJob, GridFile, InputField
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read_field_grid
 from napari_shadowinv.physics.beam import displacement_from_potential
@@ -200,7 +200,7 @@ def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
     dark = np.where(obstructed, 0.0, 1.0)
     np.testing.assert_allclose(layer.data, synthetic_image(phantom.displacement, dark))
     np.testing.assert_array_equal(source_of(layer), dark)
-    shot = opened(InvertShot)
+    shot = opened(Invert)
     np.testing.assert_array_equal(shot.source.measured(shot.image.layer).image, dark)
     assert messages == []
 

@@ -29,8 +29,7 @@ from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.fit_images import FitImages
-from napari_shadowinv._napari.widgets.invert_shot import InvertShot
-from napari_shadowinv._napari.widgets.invert_stack import InvertStack
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
@@ -70,17 +69,15 @@ def typed(tool: Any, energy: float) -> None:
         enter(tool.setup.picker.form.entries[name], value)
 
 
-@pytest.mark.parametrize("kind", [InvertShot, InvertStack])
 def test_a_setup_stays_with_the_image_that_it_came_with(
-    opened: Any, of_a_file: Any, plain: Any, proton_setup: ProtonSetup, kind: Any
+    opened: Any, of_a_file: Any, plain: Any, proton_setup: ProtonSetup
 ) -> None:
-    tool = opened(kind)
-    images = tool.image if kind is InvertShot else tool.shots.layers
+    tool = opened(Invert)
     for _ in range(2):
-        images.layer = of_a_file
+        tool.image.layer = of_a_file
         assert tool.setup.setup() == proton_setup
         assert tool.setup.note.text() == "Came with experiment.h5."
-        images.layer = plain
+        tool.image.layer = plain
         assert tool.setup.setup() is None
         assert tool.setup.note.text() == ""
     # Nor is it at hand in the form.
@@ -88,18 +85,17 @@ def test_a_setup_stays_with_the_image_that_it_came_with(
     assert tool.setup.picker.form.is_empty
 
 
-@pytest.mark.parametrize("kind", [InvertShot, InvertStack])
 def test_the_setup_of_a_file_is_not_there_in_the_next_session(
-    viewer: ViewerModel, opened: Any, of_a_file: Any, shot: Array, kind: Any
+    viewer: ViewerModel, opened: Any, of_a_file: Any, shot: Array
 ) -> None:
-    tool = opened(kind)
+    tool = opened(Invert)
     assert tool.setup.setup() is not None
     enter(tool.setup.picker.form.entries["energy"], "3 MeV")
     assert setup_origin_of(of_a_file) == "came with experiment.h5, changed by hand"
     tool._keeper.write()
     viewer.layers.clear()
     viewer.add_image(shot, name="another")
-    later = opened(kind)
+    later = opened(Invert)
     assert later.setup.setup() is None
     later.setup.picker.set_kind("proton")
     assert later.setup.picker.form.is_empty
@@ -108,7 +104,7 @@ def test_the_setup_of_a_file_is_not_there_in_the_next_session(
 def test_what_the_user_typed_is_at_hand_and_says_for_what(
     viewer: ViewerModel, opened: Any, plain: Any, shot: Array
 ) -> None:
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     typed(tool, 5.0)
     entered = tool.setup.setup()
     assert entered.pixel_size == pytest.approx(2e-6)
@@ -132,7 +128,7 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(
     tool._keeper.write()
     viewer.layers.clear()
     new = viewer.add_image(shot, name="new")
-    later = opened(InvertShot)
+    later = opened(Invert)
     assert later.setup.setup() is None
     later.setup.picker.set_kind("proton")
     assert later.setup.setup() == entered
@@ -141,19 +137,18 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(
     assert setup_origin_of(new) == "typed for 'new'"
 
 
-@pytest.mark.parametrize("kind", [InvertShot, InvertStack])
 def test_the_last_setup_is_selected_where_that_is_preferred(
-    viewer: ViewerModel, opened: Any, plain: Any, shot: Array, preferences: Any, kind: Any
+    viewer: ViewerModel, opened: Any, plain: Any, shot: Array, preferences: Any
 ) -> None:
     preferences.widgets.last_setup = True
-    tool = opened(kind)
+    tool = opened(Invert)
     assert tool.setup.setup() is None  # there is no last one
     typed(tool, 5.0)
     entered = tool.setup.setup()
     tool._keeper.write()
     viewer.layers.clear()
     new = viewer.add_image(shot, name="new")
-    later = opened(kind)
+    later = opened(Invert)
     assert later.setup.setup() == entered
     assert later.setup.note.text() == "Typed for 'plain', in an earlier session."
     # The image has no setup of its own before it is edited.
@@ -161,13 +156,13 @@ def test_the_last_setup_is_selected_where_that_is_preferred(
     # None is a choice, too.
     later.setup.picker.set_kind("none")
     later._keeper.write()
-    assert opened(kind).setup.setup() is None
+    assert opened(Invert).setup.setup() is None
     later.setup.picker.set_kind("proton")
     later._keeper.write()
     preferences.widgets.last_setup = False
     viewer.layers.clear()
     viewer.add_image(shot, name="newest")
-    assert opened(kind).setup.setup() is None
+    assert opened(Invert).setup.setup() is None
 
 
 def test_a_setup_from_a_toml_file_says_so(
@@ -179,7 +174,7 @@ def test_a_setup_from_a_toml_file_says_so(
     path = tmp_path / "tcc.toml"
     path.write_text(text)
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (str(path), ""))
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.setup.files.load_button.click()
     assert tool.setup.setup() == proton_setup
     assert tool.setup.note.text() == "Loaded from tcc.toml."
@@ -192,7 +187,7 @@ def test_a_setup_from_a_toml_file_says_so(
 def test_a_loaded_setup_goes_with_the_image_until_run(
     viewer: ViewerModel, opened: Any, plain: Any, proton_setup: ProtonSetup
 ) -> None:
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.image.layer = plain
     tool.setup.load(proton_setup.model_dump(exclude_none=True), "tcc.toml")
     enter(tool.setup.picker.form.entries["energy"], 5.0)
@@ -209,7 +204,7 @@ def test_a_loaded_setup_goes_with_the_image_until_run(
 
 
 def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) -> None:
-    tool = opened(InvertStack)
+    tool = opened(Invert)
     tool.shots.set_kind("files")
     typed(tool, 5.0)
 
@@ -229,27 +224,24 @@ def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) ->
 def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(
     viewer: ViewerModel, opened: Any
 ) -> None:
-    tools = [opened(kind) for kind in (InvertShot, InvertStack)]
+    tool = opened(Invert)
     viewer.open_sample(PLUGIN, "toroid")
     shot, source = (
         next(layer for layer in viewer.layers if role_of(layer) == role)
         for role in ("shot", "source")
     )
-    for tool in tools:
-        images = tool.shots.layers if isinstance(tool, InvertStack) else tool.image
-        assert images.offered == [shot]
-        assert images.layer is shot
-    first = tools[0]
-    assert first.source.kind == "own"
-    assert first.setup.note.text() == "Came with the sample 'toroid'."
-    first.source.set_kind("layer")
-    assert first.source.layers.layer is source
+    assert tool.image.offered == [shot]
+    assert tool.image.layer is shot
+    assert tool.source.kind == "own"
+    assert tool.setup.note.text() == "Came with the sample 'toroid'."
+    tool.source.set_kind("layer")
+    assert tool.source.layers.layer is source
 
 
 def test_no_image_is_its_own_source(
     viewer: ViewerModel, opened: Any, plain: Any, shot: Array
 ) -> None:
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.source.set_kind("layer")
     assert tool.source.layers.offered == []
     with pytest.raises(InputError, match="no source layer is selected"):
@@ -269,7 +261,7 @@ def test_results_are_not_offered_as_shots(
     viewer: ViewerModel, opened: Any, plain: Any, solved: Inversion
 ) -> None:
     add_to_viewer(viewer, solved, name="solved")
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     assert tool.image.offered == [plain]
     assert [role_of(layer) for layer in tool.masks.layers.offered] == []
     assert all(role_of(layer) in (None, "source") for layer in tool.source.layers.offered)
@@ -309,7 +301,7 @@ def test_a_source_can_be_filtered_and_stays_one(viewer: ViewerModel, opened: Any
 def test_the_source_that_was_chosen_comes_back_after_a_sample(
     viewer: ViewerModel, opened: Any, plain: Any
 ) -> None:
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.source.set_kind("low-pass")
     *_, sample = viewer.open_sample(PLUGIN, "toroid")
     tool.image.layer = sample
@@ -348,18 +340,23 @@ def test_a_source_mask_hides_the_object_from_the_estimate_alone(
 
 def the_masks(tool: Any) -> Any:
     """Return the object with the masks of a run."""
-    return tool.request().shot if isinstance(tool, InvertShot) else tool.request()
+    job = tool.request()
+    return job if tool.shots.is_stack else job.shot
 
 
-@pytest.mark.parametrize("kind", [InvertShot, InvertStack])
+@pytest.mark.parametrize("is_stack", [False, True])
 def test_both_masks_can_be_chosen(
-    viewer: ViewerModel, opened: Any, hump: tuple[Array, Array, Array], kind: Any, tmp_path: Path
+    viewer: ViewerModel,
+    opened: Any,
+    hump: tuple[Array, Array, Array],
+    is_stack: bool,
+    tmp_path: Path,
 ) -> None:
     shot, _, is_object = hump
-    viewer.add_image(shot if kind is InvertShot else np.stack([shot, shot]), name="shot")
-    tool = opened(kind)
-    if kind is InvertStack:
-        tool.store.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+    viewer.add_image(np.stack([shot, shot]) if is_stack else shot, name="shot")
+    tool = opened(Invert)
+    if is_stack:
+        tool.store.folder.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
     assert tool.source_masks.isHidden()
     tool.source.set_kind("polynomial")
     assert not tool.source_masks.isHidden()
@@ -388,7 +385,7 @@ def test_a_mask_over_the_object_is_refused(
     shot, _, is_object = hump
     image = viewer.add_image(shot, name="shot")
     labels = viewer.add_labels(is_object.astype(int), name="object")
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.source.set_kind("polynomial")
     tool.masks.layer = tool.source_masks.layer = labels
     tool.panel.button.click()
@@ -399,11 +396,11 @@ def test_a_mask_over_the_object_is_refused(
     # As well if the estimate was made before, in a layer of its own.
     tool.show_source.click()
     qtbot.waitUntil(lambda: "shot source: fitted polynomial" in viewer.layers, timeout=PATIENCE)
-    for kind, data in ((InvertShot, None), (InvertStack, np.stack([shot, shot]))):
-        later = opened(kind)
+    for data in (None, np.stack([shot, shot])):
+        later = opened(Invert)
         if data is not None:
-            later.shots.layers.layer = viewer.add_image(data, name="stack")
-            later.store.edit.setText("a.shadowinv.zarr")
+            later.image.layer = viewer.add_image(data, name="stack")
+            later.store.folder.edit.setText("a.shadowinv.zarr")
         else:
             later.image.layer = image
         later.source.set_kind("layer")
@@ -448,7 +445,7 @@ def run(qtbot: Any) -> Any:
 def test_a_result_says_where_everything_came_from(
     viewer: ViewerModel, opened: Any, of_a_file: Any, run: Any
 ) -> None:
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.options.restore({"n_sites": 300})
     tool.source.set_kind("polynomial")
     tool.source_masks.paint()
@@ -474,7 +471,7 @@ def test_a_result_says_where_everything_came_from(
 def test_the_report_of_one_run_does_not_stand_beside_another(
     opened: Any, plain: Any, of_a_file: Any, run: Any, qtbot: Any, messages: list[str]
 ) -> None:
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.options.restore({"n_sites": 300})
 
     def rerun() -> None:
@@ -482,6 +479,10 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
         assert texts_of(tool.report)["Flux residual"].endswith("converged")
 
     rerun()
+    # A result of other choices is marked, until they are those of the run again.
+    for number in (300, 400, 300):
+        tool.options.restore({"n_sites": number})
+        assert bool(tool.view.changes.text()) == (number != 300)
     tool.panel.button.click()
     assert texts_of(tool.report) == {}
     tool.panel.button.click()
@@ -511,7 +512,7 @@ def test_what_the_core_refuses_stays_in_the_widget(
         raise InputError("both masks hide the object")
 
     monkeypatch.setattr(jobs, "run", refuse)
-    tool = opened(InvertShot)
+    tool = opened(Invert)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     assert messages == ["Both masks hide the object"]
@@ -544,11 +545,11 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     assert setup_of(prediction) == entered
     assert setup_origin_of(prediction).startswith("came with the forward model")
     assert source_of(prediction) is None
-    # Opened in Invert shot, it is a file's setup like any other.
-    assert opened(InvertShot).setup.setup() == entered
+    # Opened in Invert, it is a file's setup like any other.
+    assert opened(Invert).setup.setup() == entered
 
 
-@pytest.mark.parametrize("kind", [FitImages, InvertShot, InvertStack, Simulate])
+@pytest.mark.parametrize("kind", [FitImages, Invert, Simulate])
 @pytest.mark.parametrize("value", [7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}])
 def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
     viewer: ViewerModel, opened: Any, kind: Any, value: Any, monkeypatch: pytest.MonkeyPatch
@@ -561,8 +562,8 @@ def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
 def test_a_part_of_another_form_leaves_the_other_parts_restored(
     viewer: ViewerModel, opened: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = opened(InvertShot)
+    first = opened(Invert)
     first.options.restore({"n_sites": 777})
     saved = {**first.state(), "source": {"values": 5}, "steps": 3}
     monkeypatch.setattr(StateKeeper, "load", lambda self: saved)
-    assert opened(InvertShot).options.model().n_sites == 777
+    assert opened(Invert).options.model().n_sites == 777

@@ -21,8 +21,7 @@ from napari_shadowinv.analysis.paths import measure_peak
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
 NAMES = (
-    "Invert shot",
-    "Invert stack",
+    "Invert",
     "Fit several images",
     "Film pack",
     "Simulate",
@@ -74,13 +73,13 @@ def test_nothing_is_orange_before_something_is_typed(
     qtbot.wait(50)
     for name, tool in tools.items():
         assert orange_texts(tool) == [], name
-    setup = tools["Invert shot"].setup.picker
+    setup = tools["Invert"].setup.picker
     for index in range(setup.choice.count()):
         setup.choice.setCurrentIndex(index)
-        assert orange_texts(tools["Invert shot"]) == [], setup.choice.currentText()
+        assert orange_texts(tools["Invert"]) == [], setup.choice.currentText()
     setup.set_kind("proton")
     enter(setup.form.entries["energy"], 14.7)
-    assert any("Source" in text for text in orange_texts(tools["Invert shot"]))
+    assert any("Source" in text for text in orange_texts(tools["Invert"]))
 
 
 @pytest.fixture

@@ -191,8 +191,8 @@ def test_first_shadowgram_is_clicked_to_its_end(
     text = page("first-shadowgram.md")
     choose(f"File > Open Sample > {PLUGIN} > Toroidal field below caustics")
     assert [layer.name for layer in window.layers if layer.visible] == ["toroid"]
-    choose(f"Plugins > {PLUGIN} > Invert shot")
-    tool = tool_of(window, "Invert shot")
+    choose(f"Plugins > {PLUGIN} > Invert")
+    tool = tool_of(window, "Invert")
     assert tool.image.layer is window.layers["toroid"]
     press(tool, "Run")
     wait_for_layers(tool, qtbot)
@@ -253,8 +253,8 @@ def test_proton_radiograph_is_clicked_to_its_end(
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(compile(block, "proton-radiograph.md", "exec"), {})
     window.open(["shot.tif", "reference.tif"], plugin="napari")
-    choose(f"Plugins > {PLUGIN} > Invert shot")
-    tool = tool_of(window, "Invert shot")
+    choose(f"Plugins > {PLUGIN} > Invert")
+    tool = tool_of(window, "Invert")
     assert (tool.image.layer.name, tool.source.layer.name) == ("shot", "reference")
     select(tool, "particles (protons, …)")
     for title, value in re.findall(r"^\| ([\w ]+) \| `(.*?)` \|", text, re.M):
@@ -303,8 +303,8 @@ def test_no_reference_is_clicked_to_its_end(
     choose(f"File > Open Sample > {PLUGIN} > Four toroidal fields, uneven beam")
     beam = window.layers["four toroids source"]
     assert not beam.visible
-    choose(f"Plugins > {PLUGIN} > Invert shot")
-    tool = tool_of(window, "Invert shot")
+    choose(f"Plugins > {PLUGIN} > Invert")
+    tool = tool_of(window, "Invert")
     assert tool.image.layer is window.layers["four toroids"]
     select(tool, "estimate: fitted polynomial")
     press(tool, "Show source")
@@ -451,11 +451,11 @@ def test_stack_is_clicked_to_its_end(
     text = page("stack.md")
     monkeypatch.chdir(tmp_path)
     choose(f"File > Open Sample > {PLUGIN} > Plasma wave, 20 optical shots")
-    choose(f"Plugins > {PLUGIN} > Invert stack")
-    tool = tool_of(window, "Invert stack")
+    choose(f"Plugins > {PLUGIN} > Invert")
+    tool = tool_of(window, "Invert")
     select(tool, "high-pass")
-    tool.store.edit.setText(str(tmp_path / "night.shadowinv.zarr"))
-    tool.store.edit.editingFinished.emit()
+    tool.store.folder.edit.setText(str(tmp_path / "night.shadowinv.zarr"))
+    tool.store.folder.edit.editingFinished.emit()
     press(tool, "Run")
     wait_for_layers(tool, qtbot)
     field = layer_of(window, "field")
@@ -489,8 +489,8 @@ def test_film_without_reference_is_clicked_to_its_verdict(
     block = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
     exec(compile(block, "film-without-reference.md", "exec"), {})
     window.open("8MeV.tif", plugin="napari")
-    choose(f"Plugins > {PLUGIN} > Invert shot")
-    tool = tool_of(window, "Invert shot")
+    choose(f"Plugins > {PLUGIN} > Invert")
+    tool = tool_of(window, "Invert")
     select(tool, "particles (protons, …)")
     for title, value in re.findall(r"^\| ([\w ]+) \| `(.*?)` \|", text, re.M):
         enter(tool, title, value)

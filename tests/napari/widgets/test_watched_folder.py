@@ -1,4 +1,4 @@
-"""*Invert stack* with a watched folder: its layers grow as shots arrive."""
+"""*Invert* with a watched folder: its layers grow as shots arrive."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ def out(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def tool(open_widget: Any, folder: Path, out: Path) -> Any:
-    tool = open_widget("Invert stack")
+    tool = open_widget("Invert")
     tool.options.restore({"n_sites": 100})
     tool.shots.set_kind("folder")
-    tool.shots.folder.folder.edit.setText(str(folder))
-    tool.shots.folder.pattern.setText("*.npy")
-    tool.store.edit.setText(str(out))
+    tool.shots.folder.edit.setText(str(folder))
+    tool.store.watch.restore({"pattern": "*.npy"})
+    tool.store.folder.edit.setText(str(out))
     return tool
 
 
@@ -62,12 +62,10 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
             return "field" in roles and len(layer_of(window, "field").data) == count
 
         qtbot.waitUntil(is_there, timeout=PATIENCE)
-        qtbot.waitUntil(
-            lambda: not (tool.results.busy or tool._refresh_timer.isActive()), timeout=PATIENCE
-        )
+        qtbot.waitUntil(lambda: not tool.stack_view.busy, timeout=PATIENCE)
         return layer_of(window, "field")
 
-    assert not tool.engine.isVisible()
+    assert tool.store.run.isHidden()
     tool.panel.button.click()
     qtbot.waitUntil(lambda: "Waiting for shots" in tool.panel.status.text(), timeout=PATIENCE)
     put(folder, 0)
@@ -89,7 +87,7 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     assert window.dims.current_step[0] == 0
     assert field.contrast_limits[1] > limits
     assert np.isfinite(np.asarray(layer_of(window, "field").data[3])).all()
-    assert list(texts_of(tool.failures)) == ["shot_2.npy"]
+    assert list(texts_of(tool.stack_view.failures)) == ["shot_2.npy"]
     assert metadata_of(field)["shots"] == [f"shot_{index}.npy" for index in range(4)]
     status = tool.panel.status
     qtbot.waitUntil(lambda: "3 done, 1 failed" in status.text(), timeout=PATIENCE)
@@ -121,7 +119,7 @@ def test_it_fits_and_a_refused_watch_has_its_reason_under_the_button(
     }
     for folder, reason in reasons.items():
         messages.clear()
-        tool.shots.folder.folder.edit.setText(folder)
+        tool.shots.folder.edit.setText(folder)
         tool.panel.button.click()
         qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
         qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)

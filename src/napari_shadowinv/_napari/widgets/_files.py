@@ -1,6 +1,6 @@
 """Files of a tool: recipes of its controls, and results to save or to repeat.
 
-- recipes, as for the commands: `RecipeButton`; for the tool that fits: `FitRecipeButton`
+- recipes, as for the commands: `RecipeButton`
 - buttons below Run: `SaveButton` saves a result, `MoreLayersButton` shows its hidden layers
 """
 
@@ -16,14 +16,13 @@ from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.form import TOML
-from napari_shadowinv._napari.jobs import name_of_result
+from napari_shadowinv._napari.jobs import Job, name_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import dataset_to_save, layers_of_result, missing_layers
 from napari_shadowinv._napari.run import Outcome
-from napari_shadowinv._napari.shots import layers_of_shot
 from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
-from napari_shadowinv._napari.widgets._layers import new_crop, new_mask
+from napari_shadowinv._napari.widgets._layers import new_mask
 from napari_shadowinv._napari.widgets._panels import ToolPanel
 from napari_shadowinv._napari.widgets._qt import may_replace, notify_errors
 from napari_shadowinv._napari.widgets._results import ResultLayers
@@ -43,19 +42,15 @@ from napari_shadowinv.io.formats import (
     Format,
     formats_for,
 )
-from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import read_recipe, write_recipe
-from napari_shadowinv.pipeline.files import read_part
-from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
 from napari_shadowinv.pipeline.rerun import Rerun, collect_rerun
-from napari_shadowinv.preprocessing import Crop, MeasuredSource, Recipe, UniformEstimate
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.preprocessing import MeasuredSource
 
 
 @dataclass(eq=False)
-class _Repetition:
+class _Repetition(Job):
     """A result to repeat, with the files that are open, and the place of its layers."""
 
     result: about.Result[Any]
@@ -88,7 +83,7 @@ class _Repetition:
             f"{name_of_result(layer)} repeated",
         )
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> None:
+    def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
         inputs = collect_rerun(
             self.result.content, self.images, source=self.source, folder=self.folder
         )
@@ -104,16 +99,14 @@ class _Repetition:
 
 
 class RecipeButton(QPushButton):
-    """A menu to load and save the recipe of a tool with `InversionInputs`, as TOML."""
-
-    command = "invert"
+    """A menu to load and save the recipe of an `ImagePanel` as TOML, and to repeat a result."""
 
     def __init__(self, tool: Any) -> None:
         super().__init__("Recipe")
         self._tool = tool
         self.setToolTip(
             "<qt>Load or save steps, source, masks, setup and options as one TOML file, which also "
-            f"works with <code>shadowinv {self.command} --recipe</code>.</qt>"
+            f"works with <code>shadowinv {tool.command} --recipe</code>.</qt>"
         )
         self.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Fixed)
         menu = QMenu(self)
@@ -140,7 +133,7 @@ class RecipeButton(QPushButton):
         if tool.panel.running:
             raise InputError("a run is under way: wait until it finishes, or press Cancel")
         job = _Repetition.of(tool.viewer.layers.selection.active, tool.viewer)
-        tool.panel.start(job.run, job)
+        tool.start(job)
 
     @notify_errors
     def _on_end(self, outcome: Outcome) -> None:
@@ -154,120 +147,37 @@ class RecipeButton(QPushButton):
         tool, image = self._tool, self._tool.chosen_image()
         recipe = read_recipe(path)
         shape = None if image is None else tuple(image.data.shape[-2:])
-        crop, steps = None, recipe.steps
-        if tool.crop is not None and shape is not None and steps and isinstance(steps[0], Crop):
-            crop, steps = steps[0].slices((shape[0], shape[1])), steps[1:]
-        masks = {
-            tool.masks: _read_mask(recipe.mask, shape),
-            tool.source_masks: _read_mask(recipe.source_mask, shape),
-        }
-        source = _usable_source(recipe, image, path)
-        tool.steps.show_steps(steps)
-        tool.source.show(source)
-        tool.instrument.restore(recipe.instrument.model_dump())
-        tool.options.restore(recipe.options.model_dump())
-        if recipe.setup is not None:
-            tool.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
-        for picker, usable in masks.items():
-            _show_mask(picker, usable, tool.viewer, image)
-        if tool.crop is not None:
-            tool.crop.layer = None if crop is None else new_crop(tool.viewer, image, crop)
+        usable = {key: _read_mask(getattr(recipe, key), shape) for key in tool.mask_pickers}
+        tool.show_recipe(recipe, path)
+        for key, picker in tool.mask_pickers.items():
+            _show_mask(picker, usable[key], tool.viewer, image)
 
     @notify_errors
     def save(self, path: Path) -> None:
         """Write a recipe, with drawn masks and a source layer as files next to it."""
-        image = self._tool.chosen_image()
+        tool, image = self._tool, self._tool.chosen_image()
         # The dialog asks about replacing the entered name only.
         overwrite = bool(path.suffix) and path.exists()
         path = path if path.suffix else path.with_suffix(".toml")
-        recipe = self._recipe()
-        masks, beam = self._masks(image), self._beam(recipe, image)
+        recipe = tool.recipe_to_save()
+        pickers = {key: each for key, each in tool.mask_pickers.items() if not each.isHidden()}
+        masks = {key: picker.usable(image) for key, picker in pickers.items()}
+        beam = tool.source.to_write(recipe, image)
         pictures = {
-            path.with_name(f"{path.stem}_{name}{PNG.suffix}"): (name, pixels)
-            for name, pixels in masks.items()
+            path.with_name(f"{path.stem}_{key}{PNG.suffix}"): (key, pixels)
+            for key, pixels in masks.items()
             if pixels is not None
         }
         source_file = path.with_name(f"{path.stem}_source{NPY.suffix}")
         for file in (path, *pictures, *(() if beam is None else (source_file,))):
             check_output(file, overwrite)
         changes: dict[str, Any] = {}
-        for file, (name, pixels) in pictures.items():
-            changes[name] = write(file, pixels.astype(float), overwrite=overwrite)
+        for file, (key, pixels) in pictures.items():
+            changes[key] = write(file, pixels.astype(float), overwrite=overwrite)
         if beam is not None:
             write(source_file, plane_of(beam.image, "the source"), overwrite=overwrite)
             changes["source"] = MeasuredSource(file=source_file)
         write_recipe(path, recipe.model_copy(update=changes), overwrite=overwrite)
-
-    def _recipe(self) -> Recipe:
-        return self._tool.recipe()
-
-    def _masks(self, image: Any) -> dict[str, BoolArray | None]:
-        """Return the masks of layers, by their keys in a recipe."""
-        tool = self._tool
-        return {"mask": tool.masks.usable(image), "source_mask": tool.hidden_from_source(image)}
-
-    def _beam(self, recipe: Recipe, image: Any) -> Shot | None:
-        """Return a measured source that is in no file where a command finds it, else None."""
-        source = self._tool.source
-        if not isinstance(recipe.source, MeasuredSource) or recipe.source.file is not None:
-            return None
-        is_in_shot = source.is_supplied and bool(about.metadata_of(image).get("path"))
-        return None if is_in_shot else source.measured(image)
-
-
-class FitRecipeButton(RecipeButton):
-    """A menu to load and save the recipe of `FitImages`, without its table."""
-
-    command = "fit"
-
-    @notify_errors
-    def load(self, path: Path) -> None:
-        tool, image = self._tool, self._tool.chosen_image()
-        recipe = read_recipe(path)
-        check_fit(recipe)
-        choices = recipe.fit or FitChoices()
-        _refuse_estimates(recipe, path)
-        tool.check_choices(choices, recipe.setup, path)
-        usable = _read_mask(recipe.mask, None if image is None else tuple(image.data.shape[-2:]))
-        beam = None
-        if isinstance(recipe.source, MeasuredSource) and recipe.source.file is not None:
-            beam = read_part(recipe.source.file, variable=recipe.source.variable)
-        tool.steps.show_steps(recipe.steps)
-        if recipe.setup is not None:
-            tool.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
-        tool.instrument.restore(recipe.instrument.model_dump())
-        tool.show_choices(choices)
-        if beam is not None:
-            (tool.source.layers.layer,) = add_layers(tool.viewer, layers_of_shot(beam)[-1:])
-        tool.source.show(recipe.source, choices.beam)
-        _show_mask(tool.masks, usable, tool.viewer, image)
-
-    def _recipe(self) -> Recipe:
-        recipe = super()._recipe()
-        assert recipe.fit is not None
-        choices = recipe.fit.model_copy(update={"psf": self._tool.common_psf()})
-        return recipe.model_copy(update={"fit": choices})
-
-    def _masks(self, image: Any) -> dict[str, BoolArray | None]:
-        return {"mask": self._tool.masks.usable(image)}
-
-    def _beam(self, recipe: Recipe, image: Any) -> Shot | None:
-        source = self._tool.source
-        if source.layer is not None and source.layer.ndim == 3:
-            raise InputError(
-                f"'{source.layer.name}' has a source for each image, but a recipe has one source "
-                "for all: choose one plane (right click on the layer → Split Stack)"
-            )
-        return source.measured_for_each([(image, None)])[0]
-
-
-def _refuse_estimates(recipe: Recipe, path: Path) -> None:
-    if recipe.estimate is not None and not isinstance(recipe.estimate, UniformEstimate):
-        raise InputError(
-            f"{path} estimates the source ({recipe.estimate.summary}), which a fit here does not "
-            "do: add it as a layer with 'Show source' in Invert shot, select it, and remove the "
-            "estimate from the recipe"
-        )
 
 
 def _show_mask(picker: Any, usable: BoolArray | None, viewer: Any, image: Any) -> None:
@@ -284,24 +194,6 @@ def _read_mask(file: Path | None, shape: tuple[int, ...] | None) -> BoolArray | 
     if shape is not None and usable.shape != shape:
         raise InputError(f"{file}: mask has shape {usable.shape}, image {shape}: they must match")
     return usable
-
-
-def _usable_source(recipe: Recipe, image: Any, path: Path) -> Any:
-    """Return the source of a recipe for the controls; None for uniform."""
-    source = recipe.source
-    is_supplied = image is not None and about.source_of(image) is not None
-    if source is None:
-        return MeasuredSource() if is_supplied else None
-    if not isinstance(source, MeasuredSource) or source.file is not None:
-        return source
-    if source.variable is not None and image is not None and about.metadata_of(image).get("path"):
-        return MeasuredSource(file=about.metadata_of(image)["path"], variable=source.variable)
-    if not is_supplied:
-        raise InputError(
-            f"{path} uses the source in the shot's file, but this image has none: choose an image "
-            "with a source"
-        )
-    return source
 
 
 _TITLES = {

@@ -1,4 +1,4 @@
-"""Fits in a window: `RefineSection` starts a fit, `FitView` shows its progress and verdict."""
+"""Results in a window: `ResultView` shows verdict and report; `RefineSection` starts a fit."""
 
 from __future__ import annotations
 
@@ -6,20 +6,27 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from napari.utils.notifications import show_warning
 from qtpy.QtCore import QSignalBlocker, Qt
 from qtpy.QtWidgets import QDoubleSpinBox, QWidget
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.fit_layers import alternative_layers, start_name
-from napari_shadowinv._napari.jobs import Finished, FitJob
+from napari_shadowinv._napari.jobs import Finished, FitJob, ImageJob, Refinement
 from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
-from napari_shadowinv._napari.run import Run
+from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._napari.widgets import _panels as panels
-from napari_shadowinv._napari.widgets._qt import ObjectiveCurve, column, push_button, timer
+from napari_shadowinv._napari.widgets._qt import (
+    ObjectiveCurve,
+    column,
+    push_button,
+    timer,
+    while_alive,
+)
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
-from napari_shadowinv.facts import Fact, percent
+from napari_shadowinv.facts import Fact, Headline, percent
 from napari_shadowinv.fitting import Fit
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.preprocessing import Recipe
 
 _REDRAW_MS = 500
 _MIN_REDRAW_RATIO = 10  # interval over the time of a drawing
@@ -27,9 +34,9 @@ _MAX_BLUR_PX = 100.0
 
 
 class RefineSection(QWidget):
-    """Folded controls to refine an inversion; `refine` gets the blur's σ in px."""
+    """Folded controls to refine an inversion: the blur's σ in px, and a button."""
 
-    def __init__(self, refine: Callable[[float], None]) -> None:
+    def __init__(self, refine: Callable[[], None]) -> None:
         super().__init__()
         tip = (
             "<qt>Standard deviation of the image's blur from source size and detector, in pixels "
@@ -42,23 +49,35 @@ class RefineSection(QWidget):
             "Fit the forward model to the image, starting from its last inversion. The fit "
             "includes blur, gives error bars, and works beyond the first caustic. The verdict "
             "says whether the image determines the field.",
-            lambda: refine(self.psf.value()),
+            refine,
         )
         blur = forms.labelled("Blur σ", self.psf)
         self.folded = forms.section("Refine the result", blur, self.button)
         column(self, self.folded)
 
 
-class FitView(QWidget):
-    """The objective of a running fit; then its verdict, report and alternative solutions."""
+class ResultView(QWidget):
+    """Verdict and report of a result; of a fit also its course and its other solutions.
 
-    def __init__(self, viewer: Any, panel: Run) -> None:
+    It follows the results of selected layers if their `content` is of one of these kinds; `said`
+    returns warnings that stand elsewhere.
+    """
+
+    def __init__(
+        self,
+        tool: panels.ToolPanel,
+        last: LastResults,
+        content: type | tuple[type, ...],
+        buttons: QWidget,
+        said: Callable[[], str] = str,
+    ) -> None:
         super().__init__()
-        self._viewer, self._panel = viewer, panel
+        self._tool, self._last, self._content, self._said = tool, last, content, said
         self._job: FitJob | None = None
         self._result: Result[Any] | None = None
-        self._alternative = ResultLayers(viewer, self)
-        self.results = ResultLayers(viewer, self)
+        self._recipe: Recipe | None = None  # that was run for the result, if it is the form's
+        self.changes = forms.WrappingLabel()
+        self._alternative = ResultLayers(tool.viewer, self)
         self.curve = ObjectiveCurve()
         self.verdict = panels.VerdictLine()
         self.solutions = forms.SteadyComboBox(
@@ -67,54 +86,82 @@ class FitView(QWidget):
         )
         self._solutions_row = forms.labelled("Solution", self.solutions)
         self.report = panels.ReportView()
-        column(self, self.verdict, self._solutions_row, self.curve, self.report)
+        column(
+            self, self.changes, self.verdict, self._solutions_row, self.curve, buttons, self.report
+        )
         self._redraw_timer = timer(self, _REDRAW_MS, self._draw)
         self.solutions.currentIndexChanged.connect(self._show_alternative)
-        panel.started.connect(self._on_start)
-        panel.ended.connect(self._on_end)
+        # Also for runs that are cancelled, or refused before they start.
+        tool.panel.button.clicked.connect(self.empty)
+        tool.panel.started.connect(self._on_start)
+        tool.panel.ended.connect(self._on_end)
+        while_alive(self, tool.viewer.layers.selection, "active", self.follow)
         self.empty()
 
     def empty(self) -> None:
-        """Clear the report of the last fit; its layers stay."""
-        self._result = None
+        """Clear the report of the last result; its layers stay."""
+        self._result = self._recipe = None
+        self.changes.show_text("")
         self.curve.empty()
-        self.verdict.setVisible(False)
+        self.verdict.show_text("")
         self._solutions_row.setVisible(False)
         self.report.empty()
 
-    def show_result(self, job: FitJob, finished: Finished, last: LastResults) -> None:
-        """Show the layers, verdict and report of a fit; notify if the field is doubtful."""
-        fit = finished.content
-        moved = place_inputs(self._viewer, job)
-        self._show_report(fit, fit.facts_with_names(job.names), job.inputs)
-        if not fit.headline.level.is_success:
-            show_warning(str(fit.headline))
+    def show_fit(self, job: FitJob, finished: Finished) -> ResultLayers:
+        """Show the layers, verdict and report of a fit; return its layers."""
+        fit, tool = finished.content, self._tool
+        moved = place_inputs(tool.viewer, job)
+        self.show_report(finished.result, job, fit.facts_with_names(job.names))
         self._alternative.show([])
-        self._job, self._result = job, finished.result
+        self._job = job
         self._list_solutions(fit)
-        self.results = last.layers_for_next((job.image, job.name))
-        self.results.show(main_layers(finished.layer_data, also=self.results.layer_keys), fit=moved)
+        results = self._last.layers_for_next((job.image, job.name))
+        results.show(main_layers(finished.layer_data, also=results.layer_keys), fit=moved)
+        return results
 
-    def follow(self, _: Any = None) -> bool:
-        """Show the verdict on the fit whose layer is selected; return False without a fit."""
-        layer = self._viewer.layers.selection.active
+    def show_report(
+        self, result: Result[Any], job: ImageJob, facts: Sequence[Fact] | None = None
+    ) -> None:
+        """Show the verdict and report of a job's result; notify if it is doubtful."""
+        headline = self._show(result, facts, job.inputs)
+        self._recipe = None if isinstance(job, Refinement) else job.recipe
+        if not headline.level.is_success:
+            show_caution(str(headline))
+        self._tool.reveal(self.verdict)
+
+    def compare(self, recipe: Recipe) -> None:
+        """Say so if the form's recipe is no longer that of the result."""
+        is_other = self._recipe is not None and recipe != self._recipe
+        self.changes.show_text("Changed since this result: press Run." if is_other else "")
+
+    def show_preview(self, result: Result[Any]) -> None:
+        self._result = result
+        self.verdict.show_headline(result.content.headline, "Preview: ")
+
+    def follow(self, _: Any = None) -> None:
+        """Show the report of the result whose layer is selected, such as a layer from a file."""
+        layer = self._tool.viewer.layers.selection.active
         result = None if layer is None else result_of(layer)
-        if result is None or self._panel.running or not isinstance(result.content, Fit):
-            return False
-        if result is not self._result:
+        is_shown = result is None or result is self._result or self._tool.panel.running
+        if not is_shown and isinstance(result.content, self._content):
             self.empty()
-            self._result = result
-            self._show_report(result.content, result.content.facts)
-        return True
+            self._show(result)
+            self._tool.reveal(self.verdict)
 
-    def _show_report(self, fit: Fit, facts: Sequence[Fact], inputs: panels.Rows = ()) -> None:
-        self.verdict.show_headline(fit.headline)
+    def _show(
+        self, result: Result[Any], facts: Sequence[Fact] | None = None, inputs: panels.Rows = ()
+    ) -> Headline:
+        self._result, content = result, result.content
+        if isinstance(content, Inversion):
+            content = content.in_units(result.setup)
+        facts, said = facts or content.facts, self._said()
+        self.verdict.show_headline(content.headline)
         warnings = [
-            ("Warning", caution.text) for caution in fit.cautions if caution.code != "verdict"
+            row for row in panels.warning_rows(facts) if row not in inputs and row[1] not in said
         ]
-        rows = [row for row in warnings if row not in inputs]
         shown, details = (panels.fact_rows(facts, details=flag) for flag in (False, True))
-        self.report.show_rows([*rows, *inputs, *shown], details)
+        self.report.show_rows([*warnings, *inputs, *shown], details)
+        return content.headline
 
     def _list_solutions(self, fit: Fit) -> None:
         with QSignalBlocker(self.solutions):
@@ -139,12 +186,14 @@ class FitView(QWidget):
         self._alternative.show(layer_data, select=False)
 
     def _on_start(self) -> None:
-        self.empty()
-        if isinstance(self._panel.tag, FitJob):
+        # The verdict of a preview stays until the next preview.
+        if not self._tool.previewing:
+            self.empty()
+        if isinstance(self._tool.panel.tag, FitJob):
             self._redraw_timer.start()
 
     def _draw(self) -> None:
-        job = self._panel.tag
+        job = self._tool.panel.tag
         if isinstance(job, FitJob):
             start = time.perf_counter()
             self.curve.show_steps(list(job.progress.history))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,12 +15,15 @@ from qtpy.QtWidgets import QWidget
 from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.shots import shot_of_layer, source_of_shot
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import RecipeButton
-from napari_shadowinv._napari.widgets._results import describe_inputs
+from napari_shadowinv._napari.widgets._fitting import ResultView
+from napari_shadowinv._napari.widgets._panels import ToolPanel
+from napari_shadowinv._napari.widgets._results import place_together
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
@@ -31,7 +34,6 @@ from napari_shadowinv.options import (
     DETECTORS,
     REFERENCE_BEAM,
     Instrument,
-    InversionOptions,
 )
 from napari_shadowinv.physics.beam import geometry_text, setup_warnings, text_in_unit, unit_in_title
 from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
@@ -74,14 +76,15 @@ class _Entry:
 class SetupPicker(QWidget):
     """A setup, stored with its image; the user's setups are offered to the next image.
 
-    With `until_run`, a loaded setup goes with whatever image is chosen until `keep` is called.
+    With a viewer, a loaded setup goes with whatever image is chosen until `keep` is called, and the
+    image can be shown at its scale.
     """
 
     changed = Signal()
 
-    def __init__(self, *, until_run: bool = False) -> None:
+    def __init__(self, viewer: Any = None) -> None:
         super().__init__()
-        self._until_run, self._is_loaded = until_run, False
+        self._viewer, self._until_run, self._is_loaded = viewer, viewer is not None, False
         self._layer: Any = None
         self._name, self._stores = "", True
         self._last = _NONE  # the kind that the user chose last
@@ -96,6 +99,13 @@ class SetupPicker(QWidget):
         self.warning_label = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.note = forms.WrappingLabel()
         self.files = forms.TomlButtons("setup", self._to_save, self.load)
+        self.scale_button = qt.push_button(
+            "Show at scale",
+            "Store the setup with the image, and show the image at its scale, without a run.",
+            self.show_at_scale,
+        )
+        self.scale_button.setVisible(self._until_run)
+        self.files.layout().insertWidget(2, self.scale_button)
         qt.column(self, self.picker, self.geometry_label, self.warning_label, self.note, self.files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
@@ -185,6 +195,17 @@ class SetupPicker(QWidget):
             self._remember(kind, _Entry(self.picker.state()["values"][kind], origin))
             self._show_notes()
             self._store_with_image()
+
+    @qt.notify_errors
+    def show_at_scale(self) -> None:
+        """Store the setup with the image; place all images of its size."""
+        if self._layer is None:
+            raise InputError("there is no image: open one (File → Open), or a sample")
+        setup = self.setup()
+        self.keep()
+        about.store_setup(self._layer, setup, self.origin)
+        if setup is not None:
+            place_together(self._viewer, self._layer, setup, ())
 
     def _show_default(self) -> None:
         """Show the setup of images without one of their own: none, or the user's last."""
@@ -397,6 +418,14 @@ class SourcePicker(forms.ModelPicker):
             )
         return shot_of_layer(image, supplied)
 
+    def measured_for_stack(self, image: Any) -> Any:
+        """Return the measured source of a stack, or of each of its shots; None for estimates."""
+        if self.layer is None or self.layer.ndim != 3:
+            beam = self.measured(image)
+            return None if beam is None else beam.image
+        beams = layers.stack_of(self.layer)
+        return beams if image is None else source_on(self.layer, beams, image)
+
     def measured_for_each(self, images: Sequence[tuple[Any, int | None]]) -> list[Shot | None]:
         """Return the measured sources of a fit's images, each a layer and its plane; or None."""
         if self.kind != LAYER:
@@ -423,6 +452,31 @@ class SourcePicker(forms.ModelPicker):
                 "source"
             )
         return self.layer
+
+    def usable(self, source: Any, image: Any, path: Path) -> Any:
+        """Return the source of a recipe for these controls; None for uniform."""
+        is_supplied = image is not None and about.source_of(image) is not None
+        if source is None:
+            return preprocessing.MeasuredSource() if is_supplied else None
+        if not isinstance(source, preprocessing.MeasuredSource) or source.file is not None:
+            return source
+        file = None if image is None else about.metadata_of(image).get("path")
+        if source.variable is not None and file:
+            return preprocessing.MeasuredSource(file=file, variable=source.variable)
+        if not is_supplied:
+            raise InputError(
+                f"{path} uses the source in the shot's file, but this image has none: choose an "
+                "image with a source"
+            )
+        return source
+
+    def to_write(self, recipe: preprocessing.Recipe, image: Any) -> Shot | None:
+        """Return the source if it is measured and in no file where a command finds it."""
+        source = recipe.source
+        if not isinstance(source, preprocessing.MeasuredSource) or source.file is not None:
+            return None
+        is_in_shot = self.is_supplied and bool(about.metadata_of(image).get("path"))
+        return None if is_in_shot else self.measured(image)
 
     def check(self, mask: BoolArray | None) -> None:
         """Refuse a mask over the object that the source layer's estimate excluded."""
@@ -489,22 +543,6 @@ class SourcePicker(forms.ModelPicker):
         super()._on_choice()
 
 
-class OptionsForm(forms.ModelForm):
-    """A form of options, with buttons to load and save them."""
-
-    def __init__(self, model_class: type[BaseModel]) -> None:
-        super().__init__(model_class)
-        self.files = forms.TomlButtons("options", self._to_save, self._load)
-        self.layout().addWidget(self.files)
-
-    def _to_save(self) -> dict[str, object]:
-        return self.model().model_dump(exclude_none=True)
-
-    def _load(self, values: dict[str, object], path: str) -> None:
-        validate(self._model_class, values, path)
-        self.restore(values)
-
-
 class InstrumentForm(forms.ModelForm):
     """A form of an instrument; its empty numbers show their defaults in grey."""
 
@@ -535,41 +573,31 @@ class InstrumentForm(forms.ModelForm):
             entry.show_default(f"{text} ({origin})" if origin else text)
 
 
-class InversionInputs:
-    """The controls that the panels for a shot and for a stack share."""
+class ImagePanel(ToolPanel):
+    """A window with source, masks, setup, steps, instrument and options, as in a recipe."""
 
-    viewer: Any
-    crop: Any = None  # a picker, where a rectangle can be drawn
+    command: str  # that takes the same recipe
+    view: ResultView
 
     def make_inputs(
-        self, image: Callable[[], Any], kinds: tuple[str, ...], mask_tip: str, source_mask_tip: str
+        self,
+        sources: Sequence[str],
+        source_tip: str,
+        options: type[BaseModel],
+        setup: SetupPicker,
+        steps: Mapping[str, Any] = preprocessing.STEPS,
     ) -> None:
-        """Make the controls, in rows `beam` and `settings`; masks are layers of these kinds."""
-        self.source = SourcePicker(
-            self.viewer,
-            SHOT_SOURCES,
-            "The beam without the object: ideally a measured reference image, otherwise uniform "
-            "or estimated from the shot.",
-        )
-        self.masks = layers.MaskPicker(self.viewer, image, mask_tip, kinds=kinds)
-        self.source_masks = layers.MaskPicker(
-            self.viewer, image, source_mask_tip, "Source mask", kinds
-        )
-        self.setup = SetupPicker(until_run=True)
-        self.steps = forms.StepsSection()
-        self.instrument = InstrumentForm()
-        self.options = OptionsForm(InversionOptions)
+        """Make the controls; `settings` are those that are folded."""
+        self.source = SourcePicker(self.viewer, sources, source_tip)
+        tip = "Labels or shapes on bad detector pixels, which are ignored. Do not mask the object."
+        self.masks = layers.MaskPicker(self.viewer, self.chosen_image, tip)
+        self.mask_pickers = {"mask": self.masks}  # by their keys in a recipe
+        self.setup = setup
+        self.steps = forms.StepsSection(steps)
+        self.instrument, self.options = InstrumentForm(), forms.ModelForm(options)
         self.recipes = RecipeButton(self)
-        self.chosen_image = image
-        self.beam = (self.source, self.source_masks, self.masks)
-        options = forms.section("Options", self.options)
         instrument = forms.section("Instrument", self.instrument)
-        self.settings = (self.setup, self.steps, instrument, options, self.recipes)
-        self.source.changed.connect(self._show_source_mask)
-        self._show_source_mask()
-
-    def _show_source_mask(self) -> None:
-        self.source_masks.setVisible(self.source.is_estimated)
+        self.settings = (self.steps, instrument, forms.section("Options", self.options))
 
     def parts(self) -> dict[str, Any]:
         return {
@@ -579,27 +607,37 @@ class InversionInputs:
             "instrument": self.instrument,
             "options": self.options,
             "painted_is_unusable": self.masks,
-            "painted_is_object": self.source_masks,
         }
 
-    def all_steps(self) -> tuple[preprocessing.Step, ...]:
-        """Return the preprocessing steps, the crop first, or raise an `InputError`."""
-        crop = None if self.crop is None else layers.crop_of(self.crop.layer, self.chosen_image())
-        steps = self.steps.steps()
-        return steps if crop is None else (crop, *steps)
-
-    def hidden_from_source(self, image: Any) -> BoolArray | None:
-        """Return the source mask, False on the object; None without one or an estimate."""
-        return self.source_masks.usable(image) if self.source.is_estimated else None
+    def chosen_image(self) -> Any | None:
+        """Return the layer to which masks and source belong; None for files."""
+        raise NotImplementedError
 
     def recipe(self) -> preprocessing.Recipe:
         """Return the recipe of the controls, without masks and layers; or raise an `InputError`."""
+        raise NotImplementedError
+
+    def show_recipe(self, recipe: preprocessing.Recipe, path: Path) -> None:
+        """Show a recipe but for its masks; change nothing unless all of it is usable."""
+        raise NotImplementedError
+
+    def keep(self) -> None:
+        """Save the changed state soon; say so if the result shown is of other choices."""
+        super().keep()
+        if self._ready:
+            with suppress(InputError):  # Run reports the problem
+                self.view.compare(self.recipe())
+
+    def recipe_to_save(self) -> preprocessing.Recipe:
+        return self.recipe()
+
+    def input_recipe(self, **parts: Any) -> preprocessing.Recipe:
+        """Return the recipe of the common controls and other parts."""
         return preprocessing.Recipe(
-            steps=self.all_steps(),
             source=self.source.chosen(),
             setup=self.setup.setup(),
             instrument=self._instrument(),
-            options=self.options.model(),
+            **parts,
         )
 
     def _instrument(self) -> Instrument:
@@ -610,16 +648,48 @@ class InversionInputs:
             return instrument
         return Instrument(**instrument.stated, beam_rms=ASSUMED_BEAM.rms)
 
-    def job_inputs(
-        self, image: Any, name: str, recipe: preprocessing.Recipe, *others: Any
-    ) -> dict[str, Any]:
-        """Return the fields of a job about its inputs; without an image, files of that name.
+    def show_inputs(self, recipe: preprocessing.Recipe, path: Path) -> None:
+        """Show steps, setup and instrument of a recipe."""
+        self.steps.show_steps(recipe.steps)
+        self.instrument.restore(recipe.instrument.model_dump())
+        if recipe.setup is not None:
+            self.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
 
-        Its companions are the chosen masks, source and other layers that lie on the image.
+    def describe(
+        self,
+        image: Any,
+        recipe: preprocessing.Recipe,
+        on_image: Sequence[Any],
+        **rows: str,
+    ) -> dict[str, Any]:
+        """Return the fields of a job about its inputs, with their origins in words.
+
+        `on_image` are its companions besides the source, or None; further `rows` of the report are
+        ``name`` of the image, ``source_mask`` and the ``steps`` of a fit.
         """
-        chosen = (self.masks.layer, self.source_masks.layer, *others, self.source.layers.layer)
-        source_mask = self.source_masks.summary(image) if self.source.is_estimated else ""
-        return describe_inputs(self, image, recipe, chosen, name=name, source_mask=source_mask)
+        texts = {
+            "Image": rows.get("name", ""),
+            "Source": self.source.summary,
+            "Source mask": rows.get("source_mask", ""),
+            "Mask": self.masks.summary(image),
+            "Setup": self.setup.summary,
+            "Steps": rows.get("steps", ""),
+        }
+        saved = {
+            "source_origin": texts["Source"],
+            "mask_origin": texts["Mask"],
+            "source_mask_origin": texts["Source mask"],
+            "setup_origin": self.setup.origin,
+            "steps": texts["Steps"],
+        }
+        companions = (*on_image, self.source.layers.layer)
+        return {
+            "recipe": recipe,
+            "inputs": [(title, text) for title, text in texts.items() if text],
+            "attributes": {key: text for key, text in saved.items() if text},
+            "image": image,
+            "companions": tuple(c for c in companions if c is not None and c is not image),
+        }
 
 
 BOTH = " and "

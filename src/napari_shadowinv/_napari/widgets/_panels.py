@@ -21,10 +21,10 @@ from napari_shadowinv.facts import Fact, Headline, Level
 Rows = Sequence[tuple[str, str]]  # of a report: names and values
 
 _LEVEL_STYLES = {
-    Level.SOUND: "color: #4caf72;",
-    Level.CONDITIONAL: "color: #5b9bd5;",
+    Level.SOUND: "color: #2f9457;",
+    Level.CONDITIONAL: "color: #4385c7;",
     Level.DOUBTFUL: forms.PROBLEM_STYLE,
-    Level.FAILED: "color: #e05252;",
+    Level.FAILED: "color: #dc4c4c;",
 }
 _TITLE_WIDTH = "30%"
 _SETTLE_MS = 10  # merges simultaneous changes
@@ -113,7 +113,7 @@ class ToolPanel(qt.Docked):
         super().__init__()
         self.viewer, self.panel = viewer, panel
         self._ready = False
-        self._running_preview = False
+        self.previewing = False  # the running job is a preview
         self.results = ResultLayers(viewer, self)
         self._last = LastResults(viewer, self)
         self.keep_earlier = self._last.keep_earlier
@@ -169,6 +169,11 @@ class ToolPanel(qt.Docked):
             self._keeper.write()
         super().hideEvent(event)
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether something else than a preview is running."""
+        return self.panel.running and not self.previewing
+
     def request(self) -> Job:
         """Return the job of the controls, or raise an `InputError`."""
         raise NotImplementedError
@@ -181,12 +186,12 @@ class ToolPanel(qt.Docked):
 
     def start(self, job: Job, *, preview: bool = False) -> None:
         """Do a job in the thread; a preview shows no progress."""
-        self._running_preview = preview
+        self.previewing = preview
         self.panel.start(job.work, job, quiet=preview)
 
     @qt.notify_errors
     def _run_or_cancel(self) -> None:
-        if self.panel.running and not self._running_preview:
+        if self.is_busy:
             self.panel.cancel()
             return
         self.forget()

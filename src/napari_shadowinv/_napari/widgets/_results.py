@@ -211,45 +211,6 @@ class LastResults:
         return results
 
 
-def describe_inputs(
-    tool: Any,
-    image: Any,
-    recipe: Recipe,
-    on_image: Sequence[Any],
-    *,
-    name: str = "",
-    source_mask: str = "",
-    steps: str = "",
-) -> dict[str, Any]:
-    """Return the fields of a tool's job about its inputs, with their origins in words.
-
-    `on_image` are the job's companions, or None. `name` is the image's, empty for several images;
-    `steps` are those of a fit.
-    """
-    rows = {
-        "Image": name,
-        "Source": tool.source.summary,
-        "Source mask": source_mask,
-        "Mask": tool.masks.summary(image),
-        "Setup": tool.setup.summary,
-        "Steps": steps,
-    }
-    saved = {
-        "source_origin": rows["Source"],
-        "mask_origin": rows["Mask"],
-        "source_mask_origin": source_mask,
-        "setup_origin": tool.setup.origin,
-        "steps": steps,
-    }
-    return {
-        "recipe": recipe,
-        "inputs": [(title, text) for title, text in rows.items() if text],
-        "attributes": {key: text for key, text in saved.items() if text},
-        "image": image,
-        "companions": tuple(each for each in on_image if each is not None and each is not image),
-    }
-
-
 def _can_be_updated(layer: Any, keywords: dict[str, Any]) -> bool:
     """Whether a layer can be updated; a new type or rotation needs a new layer."""
     if kind_of(layer) not in ("image", "labels", "vectors"):

@@ -1,36 +1,42 @@
-"""Runs over many shots or a watched folder, and the layers over their store."""
+"""Runs over many shots or a watched folder: `StackJob`; their layers and report: `StackView`."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from qtpy import QtWidgets
-from qtpy.QtCore import Signal
+from qtpy.QtWidgets import QLabel, QWidget
 
-from napari_shadowinv._napari.form import PathEdit, labelled
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.layer_metadata import KEY, role_of
-from napari_shadowinv._napari.layers import FullLayerData, LayerData, widen_limits
-from napari_shadowinv._napari.stores import first_shot, store_layers
+from napari_shadowinv._napari.layer_metadata import KEY, main_layers, role_of
+from napari_shadowinv._napari.layers import LayerData, widen_limits
+from napari_shadowinv._napari.run import Outcome
+from napari_shadowinv._napari.stores import first_shot, follow_shots, shot_rows, store_layers
+from napari_shadowinv._napari.widgets import _panels as panels
+from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import kind_of
-from napari_shadowinv._napari.widgets._qt import column
-from napari_shadowinv._napari.widgets._results import result_frame
+from napari_shadowinv._napari.widgets._results import ResultLayers, place_together, result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import BoolArray
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
-    from napari_shadowinv.stack import RunStatus
+    from napari_shadowinv.stack import RunStatus, ShotOutcome
+
+_UPDATE_INTERVAL_S = 0.5  # while the inversion falls behind the folder
+_REFRESH_INTERVAL_MS = 200  # many small shots may finish within a second
+_MAX_FAILURES = 100
+Limits = dict[str, tuple[float, float]]
 
 
 def _empty_status() -> RunStatus:
@@ -41,109 +47,120 @@ def _empty_status() -> RunStatus:
 
 @dataclass(eq=False)
 class StackJob(Job):
-    """Shots to invert into a store, the status of the run, and the layers over the store."""
+    """Shots to invert into a store, or a folder to watch; the layers over the store grow with it.
 
-    shots: Any  # an array (shot, y, x), also a lazy one, files, or rows of a table
+    Its thread writes the last fields, which the window reads at any time.
+    """
+
+    patience: ClassVar[float] = math.inf  # it finishes writing to the store
+
+    shots: Any  # an array (shot, y, x), also a lazy one, files, rows of a table, or a folder
     out: Path
     recipe: Recipe = field(default_factory=Recipe)
     source: ArrayLike | None = None  # measured; for all shots, or one for each
     mask: BoolArray | None = None
     source_mask: BoolArray | None = None
-    run_options: RunOptions = field(default_factory=RunOptions)
+    options: RunOptions | WatchOptions = field(default_factory=RunOptions)
     scheduler: str = "threads"
     image: Any = None  # the layer of the shots
     companions: tuple[Any, ...] = ()  # layers that lie on the image
     placement: Mapping[str, Any] = field(default_factory=dict)  # keywords of the layers
     inputs: Sequence[tuple[str, str]] = ()  # rows of the report
     attributes: Mapping[str, str] = field(default_factory=dict)  # origins that are saved
-    status: RunStatus = field(default_factory=_empty_status)  # the window reads it at any time
-    waiting: int = 0  # shots that have not ended, or files that have arrived
-    note: str = ""
+    limits: Limits = field(default_factory=dict)  # by role, over all shots in the store so far
+    status: RunStatus = field(default_factory=_empty_status)
     layer_data: LayerData = field(default_factory=list)  # empty until a shot is finished
-    # Written by the run's thread; the window only reads them.
-    _limits: dict[str, tuple[float, float]] = field(default_factory=dict)
-    _earlier: dict[str, tuple[float, float]] = field(default_factory=dict)
-    _applied: set[tuple[float, float]] = field(default_factory=set)
+    longer_data: LayerData = field(default_factory=list)  # with shots that the layers do not show
+    newest: int = 0  # the last shot that could be inverted
+    _note: str = ""
+    _reference: int = 0  # the shot that decides on units
+    _new_shots: list[int] = field(default_factory=list)  # not in the limits yet
+    _described_at: float = 0.0  # s
+
+    @property
+    def is_watch(self) -> bool:
+        return isinstance(self.options, WatchOptions)
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> RunStatus:
         """Invert the pending shots, and describe the layers once one shot is done."""
+        from napari_shadowinv.stack import run_stack, watch_stack
 
         def update(status: RunStatus) -> None:
             if status.stage:
                 on_progress(Progress("prepare", 0, None, status.stage))
                 return
-            self.waiting, self.note = status.waiting, status.note or self.note
+            self._note = status.note or self._note
             # The layers must be ready before the window reads the status.
-            if self._changes_layers(status):
-                outcome = status.outcome
-                self._update(None if outcome is None or outcome.reason else outcome.index)
+            if status.done and (status.outcome is not None or not self.layer_data):
+                self._update(status)
             self.status = status
             on_progress(self._progress(status))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
         shots = Shot(self.shots, source=self.source, mask=self.mask, source_mask=self.source_mask)
-        self._start(shots, self.out, self.recipe, on_progress=update, should_stop=should_stop)
+        callbacks: dict[str, Any] = {"on_progress": update, "should_stop": should_stop}
+        if isinstance(self.options, WatchOptions):
+            watch_stack(shots, self.out, self.recipe, watch=self.options, **callbacks)
+        else:
+            scheduler = self.scheduler
+            run_stack(
+                shots, self.out, self.recipe, run=self.options, scheduler=scheduler, **callbacks
+            )
         return self.status
-
-    def _start(self, *args: Any, **keywords: Any) -> None:
-        from napari_shadowinv.stack import run_stack
-
-        run_stack(*args, run=self.run_options, scheduler=self.scheduler, **keywords)
-
-    def _changes_layers(self, status: RunStatus) -> bool:
-        """Whether the layers may change with a status that follows the current one."""
-        return bool(status.done)
-
-    def _progress(self, status: RunStatus) -> Progress:
-        return Progress("shots", status.done + status.failed, status.total, status.text)
 
     def layers(self, content: RunStatus) -> LayerData:
         """Return the layers described by the run, which grow with it."""
         return self.layer_data
 
-    def update_limits(self, layers: Sequence[Any]) -> None:
-        """Extend limits that the user has not changed to the strongest shot so far."""
-        for layer in filter(is_image, layers):
-            role, current = str(role_of(layer)), tuple(layer.contrast_limits)
-            if role in self._limits and current in self._applied:
-                limits = self._run_limits(role)
-                self._applied.add(limits)
-                if limits != current:
-                    layer.contrast_limits = limits
+    def _progress(self, status: RunStatus) -> Progress:
+        ended = status.done + status.failed
+        if not self.is_watch:
+            return Progress("shots", ended, status.total, status.text)
+        stage = "shots" if status.ended and status.waiting else "wait"
+        note = f" ({self._note})" if self._note else ""
+        return Progress(stage, status.ended, None, f"{status.text}{note}")
 
-    def continue_from(self, earlier: StackJob, layers: Sequence[Any]) -> None:
-        """Take over the contrast of an earlier run into the same store."""
-        self._applied.update(earlier._applied)
-        images = filter(is_image, layers)
-        current = {role_of(layer): tuple(layer.contrast_limits) for layer in images}
-        for _, keywords, kind in self.layer_data:
-            role = str(role_of(keywords))
-            if kind == "image" and role in earlier._limits:
-                self._earlier[role] = earlier._run_limits(role)
-                limits = self._run_limits(role)
-                self._applied.add(limits)
-                keywords["contrast_limits"] = current.get(role, limits)
-
-    def _run_limits(self, role: str) -> tuple[float, float]:
-        """Limits over all shots of this run and of earlier runs into the same store."""
-        limits = self._limits[role]
-        earlier = self._earlier.get(role, limits)
-        return min(limits[0], earlier[0]), max(limits[1], earlier[1])
-
-    def _update(self, index: int | None) -> None:
+    def _update(self, status: RunStatus) -> None:
         """Describe the layers once a shot is done, and include each shot in the limits."""
-        if not self.layer_data:
-            self._describe()
-        if index is not None:
-            self._include_shot(self.layer_data, index)
+        outcome: ShotOutcome | None = status.outcome
+        if outcome is not None and not outcome.reason:
+            self._new_shots.append(outcome.index)
+            self.newest = max(self.newest, outcome.index)
+        layer_data = self.layer_data
+        if not layer_data:
+            layer_data = self.layer_data = self._first_layers()
+        elif self.is_watch:
+            # From time to time only, so that the shots need not wait.
+            is_early = time.monotonic() <= self._described_at + _UPDATE_INTERVAL_S
+            if status.waiting > 1 and is_early:
+                return
+            layer_data = self._described(self._reference)
+            self.longer_data = layer_data or self.longer_data
+        for shot in self._new_shots if layer_data else ():
+            for data, keywords, kind in layer_data:
+                if kind == "image":
+                    role = str(role_of(keywords))
+                    self.limits[role] = widen_limits(self.limits[role], np.asarray(data[shot]))
+        self._new_shots.clear()
+        self._described_at = time.monotonic()
 
-    def _include_shot(self, layer_data: Sequence[FullLayerData], index: int) -> None:
-        for data, keywords, kind in layer_data:
+    def _first_layers(self) -> LayerData:
+        # napari's cache of a pending shot would hide that it is done.
+        placement = {"cache": False, **self.placement}
+        layer_data = [
+            (data, keywords | placement, kind) for data, keywords, kind in self._described()
+        ]
+        for _, keywords, kind in layer_data:
             if kind == "image":
-                role = str(role_of(keywords))
-                self._limits[role] = widen_limits(self._limits[role], np.asarray(data[index]))
+                role, (low, high) = str(role_of(keywords)), keywords["contrast_limits"]
+                earlier = self.limits.get(role, (low, high))
+                self.limits[role] = min(low, earlier[0]), max(high, earlier[1])
+        if layer_data:
+            self._reference = first_shot(self.out)
+            self.newest = max(self.newest, self._reference)
+        return layer_data
 
-    def _store_layers(self, shot: int | None) -> LayerData:
+    def _described(self, shot: int | None = None) -> LayerData:
         """Describe the layers of the store; none if that has to wait for the next shot."""
         try:
             layers = store_layers(self.out, shot=shot)
@@ -153,20 +170,166 @@ class StackJob(Job):
             keywords["metadata"][KEY]["made_from"] = dict(self.attributes)
         return layers
 
-    def _describe(self, shot: int | None = None) -> None:
-        layers = self._store_layers(shot)
-        # napari's cache of a pending shot would hide that it is done.
-        placement = {"cache": False, **self.placement}
-        for _, keywords, kind in layers:
+
+class StackView(QWidget):
+    """Layers over the store of a run; its failed shots, and the report of the shot in view."""
+
+    def __init__(self, viewer: Any, report: panels.ReportView) -> None:
+        super().__init__()
+        self._viewer, self._report = viewer, report
+        self.job: StackJob | None = None  # whose layers are shown
+        self.results = ResultLayers(viewer, self)
+        self._applied: Limits = {}  # other contrast is the user's
+        self._ended, self._failed, self._newest, self._resets_view = 0, 0, 0, False
+        self._arrows: Any = None
+        self._read_arrows: Callable[[], None] | None = None
+        self._refresh_timer = qt.timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
+        self._report_timer = qt.timer(self, _REFRESH_INTERVAL_MS, self.show_report, once=True)
+        self.failures_title, self.failures = QLabel("Failed shots"), panels.ReportView()
+        qt.column(self, self.failures_title, self.failures)
+        qt.while_alive(self, viewer.dims, "current_step", self._on_step)
+        self.empty()
+
+    @property
+    def busy(self) -> bool:
+        return self.results.busy or self._refresh_timer.isActive()
+
+    @property
+    def images(self) -> list[Any]:
+        return [layer for layer in self.results.layers if kind_of(layer) == "image"]
+
+    def empty(self) -> None:
+        """Forget the failures of the last run; its layers stay."""
+        self._ended = 0
+        self.show_failures([])
+
+    def limits_of(self, out: Path) -> Limits:
+        """Return the limits with which another run into a store begins."""
+        return dict(self.job.limits) if self.job is not None and self.job.out == out else {}
+
+    def show_run(self, job: StackJob) -> None:
+        """Show the failures and layers of a run."""
+        if len(job.status.failures) != self._failed:
+            self.show_failures(list(job.status.failures))
+        if job.layer_data and job is not self.job:
+            self._show_layers(job)
+        elif job.status.ended > self._ended and not self._refresh_timer.isActive():
+            self._refresh_timer.start()
+        self._ended = job.status.ended
+
+    def _show_layers(self, job: StackJob) -> None:
+        is_resumed = self.job is not None and self.job.out == job.out
+        if not is_resumed:
+            self.results, self._applied = ResultLayers(self._viewer, self), {}
+            self.results.complete.connect(self._on_layers)
+        self.job, self._resets_view = job, not is_resumed and job.image is None
+        if job.image is not None and job.recipe.setup is not None:
+            place_together(self._viewer, job.image, job.recipe.setup, job.companions)
+        current = {role_of(layer): tuple(layer.contrast_limits) for layer in self.images}
+        for _, keywords, kind in job.layer_data:
             if kind == "image":
-                limits = keywords["contrast_limits"]
-                self._limits[str(role_of(keywords))] = limits
-                self._applied.add(limits)
-        self.layer_data += [(data, keywords | placement, kind) for data, keywords, kind in layers]
+                role = str(role_of(keywords))
+                keywords["contrast_limits"] = current.get(role, job.limits[role])
+        layer_data = main_layers(job.layer_data, also=self.results.layer_keys)
+        self.results.show(layer_data, select=not is_resumed)
 
+    def _on_layers(self) -> None:
+        # The setup places the results of files, perhaps far outside the view.
+        if self._resets_view:
+            self._resets_view = False
+            self._viewer.reset_view()
+            self._follow()
+        layers = self.results.layers
+        arrows = next((layer for layer in layers if role_of(layer) == "arrows"), None)
+        if arrows is not self._arrows:
+            self._arrows = arrows
+            self._read_arrows = None if arrows is None else follow_shots(self._viewer, arrows)
+        self._refresh_timer.start()
 
-def is_image(layer: Any) -> bool:
-    return kind_of(layer) == "image"
+    def _refresh(self) -> None:
+        job = self.job
+        if job is None:
+            return
+        if job.is_watch:
+            self._grow(job)
+        for layer in self.images:
+            role, current = str(role_of(layer)), tuple(layer.contrast_limits)
+            if role in job.limits and self._applied.get(role, current) == current:
+                layer.contrast_limits = job.limits[role]
+                self._applied[role] = tuple(layer.contrast_limits)
+        for layer in self.results.layers:
+            layer.refresh()
+        if self._read_arrows is not None:
+            self._read_arrows()
+
+    def _grow(self, job: StackJob) -> None:
+        """Add new shots to the layers; follow them only if the newest shot was in view."""
+        if self.results.busy:
+            self._refresh_timer.start()
+            return
+        shot = self.shot_in_view
+        layer_data, job.longer_data = job.longer_data, []
+        content = {role_of(keywords): (data, keywords) for data, keywords, _ in layer_data}
+        for layer in self.results.layers:
+            if role_of(layer) not in content:
+                continue
+            data, keywords = content[role_of(layer)]
+            layer.metadata[KEY].update(keywords["metadata"][KEY])
+            if kind_of(layer) in ("image", "labels"):
+                layer.data = data
+        self._follow(moves=shot is not None and shot >= self._newest)
+
+    def _follow(self, *, moves: bool = True) -> None:
+        """Show the newest shot that could be inverted; a failed one would leave a black canvas."""
+        if self.job is not None and self.job.is_watch:
+            self._newest = min(self.job.newest, self._last)
+            if moves:
+                self._viewer.dims.set_current_step(self._viewer.dims.ndim - 3, self._newest)
+
+    @property
+    def _last(self) -> int:
+        """Index of the last shot of the layers."""
+        return max((len(layer.data) - 1 for layer in self.images), default=-1)
+
+    @property
+    def shot_in_view(self) -> int | None:
+        """The shot of the layers that the viewer shows; None without a shot in view."""
+        dims = self._viewer.dims
+        shot = int(dims.current_step[dims.ndim - 3]) if dims.ndim > 2 else -1
+        return shot if 0 <= shot <= self._last else None
+
+    def _on_step(self, _: Any) -> None:
+        self._report_timer.start()
+
+    def show_report(self) -> None:
+        """Show the origins of the results, and the quantities of the shot in view."""
+        job, shot = self.job, self.shot_in_view
+        if job is None or self.isHidden():
+            return
+        rows = list(job.inputs)
+        with suppress(FileFormatError):  # a damaged shot
+            rows += [] if shot is None else shot_rows(job.out, shot)
+        self._report.show_rows(rows)
+
+    def show_failures(self, failures: list[tuple[str, str]]) -> None:
+        """Show the first failures, and the number of further ones."""
+        self._failed = len(failures)
+        hidden = failures[_MAX_FAILURES:]
+        more = [("…", f"and {len(hidden)} more")] if hidden else []
+        self.failures.show_rows(failures[:_MAX_FAILURES] + more)
+        self.failures_title.setVisible(bool(failures))
+
+    def end(self, outcome: Outcome) -> str:
+        """Show the end of a run; return it as a sentence, empty if an error says more."""
+        job: StackJob = outcome.tag
+        if not job.status.total:
+            is_stopped = outcome.error is None and job.is_watch
+            return "Stopped: no shot has arrived." if is_stopped else ""
+        self.show_run(job)
+        self.show_report()
+        if outcome.cancelled:
+            return f"Cancelled: {job.status.text}. Press Run to resume."
+        return f"{job.status.text}, in {job.out.name}"
 
 
 def placement_on(layer: Any, recipe: Recipe) -> dict[str, Any]:
@@ -175,114 +338,3 @@ def placement_on(layer: Any, recipe: Recipe) -> dict[str, Any]:
     for name in ("scale", "translate", "units"):
         keywords[name] = (getattr(layer, name)[0], *keywords[name][1:])
     return keywords
-
-
-_UPDATE_INTERVAL_S = 0.5  # while the inversion falls behind the folder
-
-
-class _FolderEdit(PathEdit):
-    def ask(self) -> str:
-        return str(QtWidgets.QFileDialog.getExistingDirectory(self, self._title, self.path))
-
-
-class FolderEdit(QtWidgets.QWidget):
-    """The folder in which shots appear, and the pattern of their names."""
-
-    changed = Signal()
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.folder = _FolderEdit(
-            "Folder to watch",
-            "folder",
-            "Each new file in this folder is inverted as soon as it is complete, until you press "
-            "Cancel.",
-        )
-        tip = "Pattern of the shots' file names, such as *.tif."
-        self.pattern = QtWidgets.QLineEdit(WatchOptions().pattern, toolTip=tip, minimumWidth=60)
-        column(self, labelled("", self.folder), labelled("Names", self.pattern))
-        self.folder.changed.connect(self.changed)
-        self.pattern.editingFinished.connect(self.changed)
-
-    @property
-    def path(self) -> Path:
-        if not self.folder.path:
-            raise InputError("no folder is selected: choose the folder in which the shots appear")
-        return Path(self.folder.path).expanduser()
-
-
-@dataclass(eq=False)
-class WatchJob(StackJob):
-    """A folder to watch, as `shots`; the layers grow as shots arrive."""
-
-    watch_options: WatchOptions = field(default_factory=WatchOptions)
-    newest: int = 0  # the last shot that could be inverted
-    _reference_shot: int = 0  # decides on units and contrast
-    _new_shots: list[int] = field(default_factory=list)  # not in the limits yet
-    _updated_at: float = 0.0  # s
-    # With shots that the layers do not show yet; the window takes it from the run's thread.
-    _longer_data: LayerData | None = None
-
-    def _start(self, *args: Any, **keywords: Any) -> None:
-        from napari_shadowinv.stack import watch_stack
-
-        watch_stack(*args, watch=self.watch_options, **keywords)
-
-    def _changes_layers(self, status: RunStatus) -> bool:
-        return bool(status.done) and (status.outcome is not None or not self.status.total)
-
-    def _progress(self, status: RunStatus) -> Progress:
-        stage = "shots" if status.ended and status.waiting else "wait"
-        note = f" ({self.note})" if self.note else ""
-        return Progress(stage, status.ended, None, f"{status.text}{note}")
-
-    def add_new_shots(self, layers: Sequence[Any]) -> None:
-        """Add the shots that have arrived to the layers."""
-        layer_data, self._longer_data = self._longer_data, None
-        if layer_data is None:
-            return
-        content = {role_of(keywords): (data, keywords) for data, keywords, _ in layer_data}
-        for layer in layers:
-            if role_of(layer) not in content:
-                continue
-            data, keywords = content[role_of(layer)]
-            layer.metadata[KEY].update(keywords["metadata"][KEY])
-            if kind_of(layer) in ("image", "labels"):
-                layer.data = data
-
-    def _update(self, index: int | None) -> None:
-        """Describe the longer layers from time to time, so that the shots need not wait."""
-        if index is not None:
-            self._new_shots.append(index)
-            self.newest = max(self.newest, index)
-        is_behind = self.waiting > 1 and time.monotonic() <= self._updated_at + _UPDATE_INTERVAL_S
-        if not self.layer_data:
-            with suppress(InputError, OSError):
-                self._reference_shot = first_shot(self.out) if index is None else index
-                self.newest = max(self.newest, self._reference_shot)
-                self._describe(self._reference_shot)
-        elif index is not None and is_behind:
-            return
-        else:
-            self._longer_data = self._store_layers(self._reference_shot) or None
-        current = self._longer_data or self.layer_data
-        for number in self._new_shots if current else ():
-            self._include_shot(current, number)
-        self._new_shots.clear()
-        self._updated_at = time.monotonic()
-
-
-def shot_in_view(viewer: Any, layers: Sequence[Any]) -> int | None:
-    """Return the shot of the layers that the viewer shows; None without a shot in view."""
-    shot = int(viewer.dims.current_step[viewer.dims.ndim - 3]) if viewer.dims.ndim > 2 else -1
-    return shot if 0 <= shot <= newest_shot(layers) and any(map(is_image, layers)) else None
-
-
-def show_shot(viewer: Any, shot: int) -> None:
-    """Move the slider along the shots."""
-    viewer.dims.set_current_step(viewer.dims.ndim - 3, shot)
-
-
-def newest_shot(layers: Sequence[Any]) -> int:
-    """Return the index of the last shot of the layers."""
-    return max((len(layer.data) - 1 for layer in filter(is_image, layers)), default=0)

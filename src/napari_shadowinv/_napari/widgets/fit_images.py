@@ -11,22 +11,24 @@ import numpy as np
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, FitJob, TimeEstimate
+from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.run import Run
-from napari_shadowinv._napari.shots import shot_of_layer
+from napari_shadowinv._napari.shots import layers_of_shot, shot_of_layer
 from napari_shadowinv._napari.widgets import _inputs as inputs
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._files import FitRecipeButton, result_buttons
-from napari_shadowinv._napari.widgets._fitting import FitView
-from napari_shadowinv._napari.widgets._panels import ToolPanel
-from napari_shadowinv._napari.widgets._qt import side_by_side, while_alive
-from napari_shadowinv._napari.widgets._results import describe_inputs, result_frame
+from napari_shadowinv._napari.widgets._files import result_buttons
+from napari_shadowinv._napari.widgets._fitting import ResultView
+from napari_shadowinv._napari.widgets._qt import side_by_side
+from napari_shadowinv._napari.widgets._results import result_frame
 from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import point_spread
+from napari_shadowinv.fitting import Fit, point_spread
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
-from napari_shadowinv.preprocessing import FIT_STEPS, Recipe
+from napari_shadowinv.pipeline.files import read_part
+from napari_shadowinv.pipeline.fit_run import check_fit
+from napari_shadowinv.preprocessing import FIT_STEPS, MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.shot import Shot
 
 
@@ -46,12 +48,14 @@ def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
     ]
 
 
-class FitImages(ToolPanel):
+class FitImages(inputs.ImagePanel):
     """Choose images of one object at several energies, then press Run."""
+
+    command = "fit"
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Fit the fields, and an unknown beam, to all images together."
-        panel = Run("Fit several images", "Run", tip, patience=0.4)
+        panel = Run("Fit several images", "Run", tip)
         super().__init__(napari_viewer, "fit-images", panel)
         self._build()
         self._connect()
@@ -61,23 +65,19 @@ class FitImages(ToolPanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.source = inputs.SourcePicker(
-            self.viewer,
+        self.make_inputs(
             inputs.FIT_SOURCES,
             "The beam without the object. An unknown beam is fitted as a smooth beam, the same in "
             "all images except for its brightness.",
+            FitOptions,
+            inputs.SetupPicker(),
+            FIT_STEPS,
         )
         self.images = ImageTable(
             self.viewer, lambda layer: about.may_be_shot(layer) and layer is not self.source.layer
         )
         self.fields = inputs.ChoiceBox(
             {}, "Field that deflects the beam. Two fields require images at two energies."
-        )
-        self.masks = layers.MaskPicker(
-            self.viewer,
-            self.chosen_image,
-            "Labels or shapes on bad detector pixels, for all images. The fit ignores masked "
-            "pixels.",
         )
         self.brightness = inputs.ChoiceBox(
             {"known": "known (in the table)", "free": "unknown (fit it)"},
@@ -89,30 +89,23 @@ class FitImages(ToolPanel):
             "Noise model for χ² and error bars. Poisson counts: the images are numbers of "
             "particles or photons.",
         )
-        self.setup = inputs.SetupPicker()
         self.setup_section = forms.titled_section(self.setup)
-        self.steps = forms.StepsSection(FIT_STEPS)
-        self.instrument = inputs.InstrumentForm()
-        self.options = inputs.OptionsForm(FitOptions)
-        self.recipes = FitRecipeButton(self)
         self.cost = forms.WrappingLabel()
-        self.view = FitView(self.viewer, self.panel)
         self.save_result, self.more_layers = result_buttons(
             self,
-            lambda: self.view.results,
+            lambda: self.results,
             "Save the selected or last fit: complete with its layers (.shadowinv), or its field "
             "for other programs (.h5).",
         )
-        instrument = forms.section("Instrument", self.instrument)
-        options = forms.section("Options", self.options)
+        buttons = side_by_side((self.save_result, 1), (self.more_layers, 1))
+        self.view = ResultView(self, self._last, Fit, buttons)
         self.add(self.images, forms.labelled("Fields", self.fields), self.source, self.masks)
         self.add(forms.labelled("Brightness", self.brightness), forms.labelled("Noise", self.noise))
-        self.add(self.setup_section, self.steps, instrument, options)
+        self.add(self.setup_section, *self.settings)
         self.add(side_by_side((self.keep_earlier, 1), (self.recipes, 0)), self.cost, self.panel)
-        self.add(self.view, side_by_side((self.save_result, 1), (self.more_layers, 1)))
+        self.add(self.view)
 
     def _connect(self) -> None:
-        while_alive(self, self.viewer.layers.selection, "active", self.view.follow)
         self.images.reference_changed.connect(self._on_reference)
         self.images.reference_beam_entered.connect(self._set_beam)
         self.images.changed.connect(self._show_beams)
@@ -129,17 +122,8 @@ class FitImages(ToolPanel):
             signal.connect(self._show_cost)
 
     def parts(self) -> dict[str, Any]:
-        return {
-            "source": self.source,
-            "setup": self.setup,
-            "fields": self.fields,
-            "brightness": self.brightness,
-            "noise": self.noise,
-            "steps": self.steps,
-            "instrument": self.instrument,
-            "options": self.options,
-            "painted_is_unusable": self.masks,
-        }
+        choices = {"fields": self.fields, "brightness": self.brightness, "noise": self.noise}
+        return {**super().parts(), **choices}
 
     def recipe(self) -> Recipe:
         """Return the recipe of the controls, without table and layers; or raise an `InputError`."""
@@ -151,13 +135,35 @@ class FitImages(ToolPanel):
             noise=self.noise.state() or None,
             options=self.options.model(),
         )
-        return Recipe(
-            steps=self.steps.steps(),
-            source=self.source.chosen(),
-            setup=self.setup.setup(),
-            instrument=self.instrument.model(),
-            fit=choices,
-        )
+        return self.input_recipe(steps=self.steps.steps(), fit=choices)
+
+    def _instrument(self) -> Any:
+        return self.instrument.model()  # each shot says whether its beam was measured
+
+    def recipe_to_save(self) -> Recipe:
+        recipe = self.recipe()
+        assert recipe.fit is not None
+        choices = recipe.fit.model_copy(update={"psf": self.common_psf()})
+        return recipe.model_copy(update={"fit": choices})
+
+    def show_recipe(self, recipe: Recipe, path: Path) -> None:
+        check_fit(recipe)
+        choices = recipe.fit or FitChoices()
+        if recipe.estimate is not None and not isinstance(recipe.estimate, UniformEstimate):
+            raise InputError(
+                f"{path} estimates the source ({recipe.estimate.summary}), which a fit here does "
+                "not do: add it as a layer with 'Show source' in Invert, select it, and remove the "
+                "estimate from the recipe"
+            )
+        self.check_choices(choices, recipe.setup, path)
+        beam = None
+        if isinstance(recipe.source, MeasuredSource) and recipe.source.file is not None:
+            beam = read_part(recipe.source.file, variable=recipe.source.variable)
+        self.show_inputs(recipe, path)
+        self.show_choices(choices)
+        if beam is not None:
+            (self.source.layers.layer,) = add_layers(self.viewer, layers_of_shot(beam)[-1:])
+        self.source.show(recipe.source, choices.beam)
 
     def chosen_image(self) -> Any | None:
         """Return the layer of the reference, to which masks and source of a recipe belong."""
@@ -220,8 +226,8 @@ class FitImages(ToolPanel):
             f"{row.name}: {_beam_summary(shot)}" for row, shot in zip(rows, shots, strict=True)
         ]
         steps = "; ".join(step.summary for step in recipe.steps)
-        used_layers = (*(row.layer for row in rows), self.masks.layer, self.source.layer)
-        described = describe_inputs(self, first.layer, recipe, used_layers, steps=steps)
+        used_layers = (*(row.layer for row in rows), self.masks.layer)
+        described = self.describe(first.layer, recipe, used_layers, steps=steps)
         described["inputs"] += _warnings_of(rows)
         described["attributes"] = {"images": "; ".join(images), **described["attributes"]}
         return FitJob(
@@ -252,9 +258,7 @@ class FitImages(ToolPanel):
         )
 
     def show_result(self, finished: Finished, job: FitJob) -> None:
-        self.view.show_result(job, finished, self._last)
-        self.results = self.view.results
-        self.reveal(self.view.verdict)
+        self.results = self.view.show_fit(job, finished)
         self._show_cost()
 
     def _show_cost(self) -> None:
@@ -275,7 +279,7 @@ class FitImages(ToolPanel):
         if len(rows) < 2:
             raise InputError(
                 f"{len(rows) or 'no'} image{'s are' if not rows else ' is'} checked, expected two "
-                "or more of one object: open them, or use 'Refine' in Invert shot for one image"
+                "or more of one object: open them, or use 'Refine' in Invert for one image"
             )
         shape = tuple(rows[0].data.shape)
         for row in rows[1:]:

@@ -1,0 +1,233 @@
+"""Where the shots of a window come from, and the store that their results go to.
+
+- a layer, files, a table of them, or a folder to watch: `ShotsPicker`
+- the store, and the choices of a run of many shots: `StoreSection`
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from qtpy.QtCore import QSignalBlocker, Signal
+from qtpy.QtWidgets import QFileDialog, QWidget
+
+from napari_shadowinv._napari import form as forms
+from napari_shadowinv._napari.widgets import _layers as layers
+from napari_shadowinv._napari.widgets import _qt as qt
+from napari_shadowinv._napari.widgets._tables import ShotTable
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.store import STORE_SUFFIX
+from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
+
+LAYER, FILES, TABLE, FOLDER = "layer", "files", "table", "folder"
+_PLACES = {FILES: "Files…", TABLE: "Table (.csv)…", FOLDER: "Watched folder…"}
+_SEPARATOR = "; "
+ONCE = {"overwrite", "redo_failed"}
+"""Choices that count for one run."""
+
+
+def lasting(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the choices of runs but for those that count once."""
+    return {key: value for key, value in values.items() if key not in ONCE}
+
+
+def _ask_for_files(edit: forms.PathEdit) -> str:
+    return _SEPARATOR.join(QFileDialog.getOpenFileNames(edit, edit.title)[0])
+
+
+def _ask_for_folder(edit: forms.PathEdit) -> str:
+    return str(QFileDialog.getExistingDirectory(edit, edit.title, edit.path))
+
+
+def _ask_for_store(edit: forms.PathEdit) -> str:
+    # Choosing an existing store is safe: it is resumed unless 'Overwrite' is checked.
+    path, _ = QFileDialog.getSaveFileName(
+        edit,
+        edit.title,
+        edit.path or f"results{STORE_SUFFIX}",
+        f"stores (*{STORE_SUFFIX})",
+        options=QFileDialog.Option.DontConfirmOverwrite,
+    )
+    # A store is a folder, which the dialog enters.
+    for folder in (Path(path), *Path(path).parents) if path else ():
+        if folder.name.endswith(STORE_SUFFIX):
+            return str(folder)
+    return path + STORE_SUFFIX if path else ""
+
+
+class _ShotChoice(layers.ShotPicker):
+    """A layer, or another place that shots come from."""
+
+    @property
+    def kind(self) -> str:
+        return str(self.currentData() or LAYER)
+
+    def fill(self, _: Any = None) -> None:
+        layer, kind = self.layer, self.kind
+        with QSignalBlocker(self):
+            super().fill()
+            for key, title in _PLACES.items():
+                self.addItem(title, key)
+            if kind != LAYER:
+                self.setCurrentIndex(self.findData(kind))
+            elif not self.offered:
+                self.setCurrentIndex(-1)
+        if self.layer is not layer:
+            self.picked.emit()
+
+
+class ShotsPicker(QWidget):
+    """Where shots come from: a layer, files, a table of them, or a folder to watch."""
+
+    changed = Signal()
+
+    def __init__(self, viewer: Any) -> None:
+        super().__init__()
+        self.layers = _ShotChoice(viewer)
+        self.layers.setPlaceholderText("no image is open")
+        self.layers.setToolTip(
+            "<qt>Layer of a shot, or of a stack of shots; or shots in files, which are inverted "
+            "into one store.</qt>"
+        )
+        self.files = forms.PathEdit(
+            "Files of the shots",
+            "shots/*.tif",
+            "A pattern such as shots/*.tif, files separated by ;, or a file of frames.",
+            ask=_ask_for_files,
+        )
+        self.table = ShotTable()
+        self.folder = forms.PathEdit(
+            "Folder to watch",
+            "folder",
+            "Each new file in this folder is inverted as soon as it is complete, until you press "
+            "Cancel.",
+            ask=_ask_for_folder,
+        )
+        self._edits = {FILES: self.files, TABLE: self.table.file, FOLDER: self.folder}
+        self._rows = {
+            FILES: forms.labelled("", self.files),
+            TABLE: self.table,
+            FOLDER: forms.labelled("", self.folder),
+        }
+        qt.column(self, forms.labelled("Image", self.layers), *self._rows.values())
+        self.layers.picked.connect(self._on_choice)
+        for control in (self.files, self.table, self.folder):
+            control.changed.connect(self.changed)
+        self._on_choice()
+
+    @property
+    def kind(self) -> str:
+        return self.layers.kind
+
+    def set_kind(self, kind: str) -> None:
+        """Take the shots from files, a table or a folder."""
+        self.layers.setCurrentIndex(self.layers.findData(kind))
+
+    def _on_choice(self) -> None:
+        for kind, row in self._rows.items():
+            row.setVisible(kind == self.kind)
+        self.changed.emit()
+
+    @property
+    def is_stack(self) -> bool:
+        layer = self.layers.layer
+        return self.kind != LAYER or (layer is not None and layer.ndim > 2)
+
+    @property
+    def name(self) -> str:
+        """The name of the shots, such as a path."""
+        if self.kind in self._edits:
+            return self._edits[self.kind].path
+        return "" if self.layers.layer is None else str(self.layers.layer.name)
+
+    @property
+    def default_store(self) -> str:
+        """The store beside the files; empty for a layer, or without files."""
+        path = Path(self.name.split(_SEPARATOR.strip())[0].strip()).expanduser()
+        if self.kind == FILES:
+            path = path.parent  # shots/*.tif
+        has_name = self.kind != LAYER and path.name
+        return str(path.with_name(path.stem + STORE_SUFFIX)) if has_name else ""
+
+    def shots(self) -> Any:
+        """Return the shots of a stack for a run, or raise an `InputError`."""
+        if self.kind == LAYER:
+            return layers.stack_of(self.layers.layer)
+        if self.kind == TABLE:
+            return self.table.shots()
+        if self.kind == FOLDER:
+            if not self.folder.path:
+                raise InputError(
+                    "no folder is selected: choose the folder in which the shots appear"
+                )
+            return Path(self.folder.path).expanduser()
+        parts = [part.strip() for part in self.files.path.split(_SEPARATOR.strip())]
+        paths = [os.path.expanduser(part) for part in parts if part]
+        if not paths:
+            raise InputError(
+                "no files are selected: enter a pattern such as shots/*.tif, or choose files"
+            )
+        return paths[0] if len(paths) == 1 else paths
+
+
+class StoreSection(QWidget):
+    """The store of a stack's results, and the choices of its run."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        tip = f"Folder for the results, named …{STORE_SUFFIX}. If it exists, the run is resumed."
+        self.folder = forms.PathEdit(
+            "Store of the results", f"results{STORE_SUFFIX}", tip, ask=_ask_for_store
+        )
+        self.run, self.watch = forms.ModelForm(RunOptions), forms.ModelForm(WatchOptions)
+        self.cluster = forms.SavedLine(
+            "none: this computer",
+            "Address of a dask cluster, such as tcp://host:8786, as printed by 'dask scheduler'. "
+            "The results are the same. Its workers need access to the shots and the store at the "
+            "same paths.",
+        )
+        self.cluster.setMinimumWidth(60)
+        self._cluster_row = forms.labelled("Cluster", self.cluster)
+        run = forms.section("Run of many shots", self.run, self.watch, self._cluster_row)
+        self._proposed = ""
+        qt.column(self, forms.labelled("Store", self.folder), run)
+
+    @property
+    def path(self) -> Path:
+        if not self.folder.path:
+            raise InputError(
+                "no store is selected for the results: choose a folder whose name ends with "
+                f"{STORE_SUFFIX}"
+            )
+        return Path(self.folder.path).expanduser()
+
+    def follow(self, shots: ShotsPicker) -> None:
+        """Show the choices for a kind of shots, and their store unless the user chose another."""
+        kind = shots.kind
+        if self.folder.path in ("", self._proposed):
+            self._proposed = shots.default_store
+            self.folder.restore(self._proposed)
+        # Watched shots are inverted one by one, as they arrive.
+        for row in (self.run, self._cluster_row):
+            row.setVisible(kind != FOLDER)
+        self.watch.setVisible(kind == FOLDER)
+
+    def choices(self, kind: str) -> dict[str, Any]:
+        """Return options and scheduler of a job, or raise an `InputError`."""
+        if kind == FOLDER:
+            return {"options": self.watch.model()}
+        address = self.cluster.text().strip()
+        if address and "://" not in address:
+            raise InputError(
+                f"the cluster's address is '{address}': expected an address such as "
+                "tcp://host:8786, as printed by 'dask scheduler'"
+            )
+        return {"options": self.run.model(), "scheduler": address or "threads"}
+
+    def begin(self) -> None:
+        """Uncheck what counts for one run: another must not discard its shots."""
+        for form in (self.run, self.watch):
+            if ONCE & form.state().keys():
+                form.restore(lasting(form.state()))

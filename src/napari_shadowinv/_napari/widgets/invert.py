@@ -1,0 +1,428 @@
+"""The window that inverts a shot, a stack, files or a watched folder: `Invert`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from qtpy.QtWidgets import QCheckBox
+
+from napari_shadowinv._napari import form as forms
+from napari_shadowinv._napari import jobs
+from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.layer_metadata import main_layers
+from napari_shadowinv._napari.run import Outcome, Run
+from napari_shadowinv._napari.shots import shot_of_layer
+from napari_shadowinv._napari.viewer_sync import USER_ERRORS
+from napari_shadowinv._napari.widgets import _layers as layers
+from napari_shadowinv._napari.widgets import _qt as qt
+from napari_shadowinv._napari.widgets._files import field_of, result_buttons, shot_to_save
+from napari_shadowinv._napari.widgets._fitting import RefineSection, ResultView
+from napari_shadowinv._napari.widgets._inputs import (
+    SHOT_SOURCES,
+    ImagePanel,
+    SetupPicker,
+)
+from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
+from napari_shadowinv._napari.widgets._shot_inputs import FOLDER, ShotsPicker, StoreSection, lasting
+from napari_shadowinv._napari.widgets._stack_jobs import StackJob, StackView, placement_on
+from napari_shadowinv._system.progress import Progress
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
+from napari_shadowinv.fitting import Fit
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.pipeline import Cache
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
+from napari_shadowinv.preprocessing import Crop, Estimate, Recipe, Step
+from napari_shadowinv.preprocessing.estimates import LowPassEstimate, TotalVariationEstimate
+from napari_shadowinv.shot import Shot
+
+_NOTABLE_PATTERN = 0.25
+_PREVIEW_DELAY_MS = 10  # merges simultaneous changes
+
+
+class CostLine(forms.WrappingLabel):
+    """The estimated time and memory of an inversion of a large image, by the last one's pace."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._pace = 1.0
+
+    def show_cost(self, shape: tuple[int, ...], options: Any) -> None:
+        cost = jobs.estimate_cost(shape, options, self._pace)
+        self.show_text(cost.text, forms.PROBLEM_STYLE if cost.exceeds_memory else "")
+
+    def learn(self, inversion: Inversion) -> None:
+        seconds = inversion.report.seconds
+        estimated_s = jobs.estimate_cost(inversion.potential.shape, inversion.options).seconds
+        # Cached sites and small images would give a wrong pace.
+        if estimated_s > 1 and seconds.get("sites", 0) > 0.1:
+            self._pace = sum(seconds.values()) / estimated_s
+
+
+class Invert(ImagePanel):
+    """Choose an image or many shots, then press Run; everything else has a default."""
+
+    command = "invert"
+
+    def __init__(self, napari_viewer: Any) -> None:
+        tip = "Invert the image, or all shots that are not in the store yet."
+        super().__init__(napari_viewer, "invert", Run("Invert", "Run", tip))
+        self._cache = Cache()
+        self.previewed = ResultLayers(self.viewer, self)
+        self._preview_timer = qt.timer(self, _PREVIEW_DELAY_MS, self._preview, once=True)
+        self._build()
+        self._connect()
+        self.restore_last()
+        self._on_shots()
+        self.view.follow()
+        self._ready = True
+
+    def _build(self) -> None:
+        self.shots = ShotsPicker(self.viewer)
+        self.image = self.shots.layers
+        self.make_inputs(
+            SHOT_SOURCES,
+            "The beam without the object: ideally a measured reference image, otherwise uniform "
+            "or estimated from the shot.",
+            InversionOptions,
+            SetupPicker(self.viewer),
+        )
+        self.source_masks = layers.MaskPicker(
+            self.viewer,
+            self.chosen_image,
+            "Labels or shapes that exclude the object from the source estimate only; the "
+            "inversion still uses these pixels.",
+            "Source mask",
+        )
+        self.mask_pickers["source_mask"] = self.source_masks
+        tip = "<qt>Shapes layer with a rectangle; only the image inside is inverted.</qt>"
+        self.crop = layers.LayerPicker(self.viewer, tip, "none", kinds=("shapes",))
+        crop = qt.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
+        tip = f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
+        self.live = QCheckBox("Live preview", toolTip=tip)
+        self.store = StoreSection()
+        self.cost, self.refine_section = CostLine(), RefineSection(self.refine)
+        self._refined = ResultLayers(self.viewer, self)
+        self.save_result, self.more_layers = result_buttons(
+            self,
+            lambda: self.results,
+            "Save the selected or last result, of a stack the shot in view: complete with its "
+            "layers (.shadowinv), for other programs (.h5), or its sites (.csv).",
+            shot_to_save,
+        )
+        buttons = qt.side_by_side((self.save_result, 1), (self.more_layers, 1))
+        kinds, said = (Inversion, Fit), self.setup.warning_label.text
+        self.view = ResultView(self, self._last, kinds, buttons, said)
+        self.verdict, self.report = self.view.verdict, self.view.report
+        self.stack_view = StackView(self.viewer, self.report)
+        self.show_source = qt.push_button(
+            "Show source", "Add the estimated beam as an image layer.", self._show_source
+        )
+        self._source_row = forms.labelled("", self.show_source)
+        self._crop_row = forms.labelled("Crop", crop)
+        self.add(self.shots, self.source, self._source_row, self.source_masks, self.setup)
+        self.add(self.store, self.cost, self.panel, self.view, self.stack_view)
+        self.add(self.refine_section)
+        self.add(forms.section("Mask and crop", self.masks, self._crop_row), *self.settings)
+        self.add(self.keep_earlier, qt.side_by_side((self.live, 1), (self.recipes, 0)))
+
+    def _connect(self) -> None:
+        self.shots.changed.connect(self._on_shots)
+        self.image.edited.connect(self._forget_report)
+        self.panel.progressed.connect(self._on_progress)
+        self.setup.changed.connect(lambda: self.shots.table.show_kind(self.setup.picker.kind))
+        changes = [control.changed for name, control in self.parts().items() if name != "cluster"]
+        masks = self.masks.layers, self.source_masks.layers
+        edits = [each.edited for each in (self.image, *masks, self.crop, self.source.layers)]
+        cluster = self.store.cluster.editingFinished
+        for signal in (*changes, cluster, self.live.toggled, self.crop.picked, *edits):
+            signal.connect(self.on_change)
+
+    def parts(self) -> dict[str, Any]:
+        store = self.store
+        choices = {"run": store.run, "watch": store.watch, "cluster": store.cluster}
+        return {**super().parts(), "painted_is_object": self.source_masks, **choices}
+
+    def state(self) -> dict[str, Any]:
+        state = super().state()
+        for name in ("run", "watch"):
+            state[name] = lasting(state[name])
+        return state
+
+    def chosen_image(self) -> Any | None:
+        """Return the layer of the shot or of the stack; None for files."""
+        return self.image.layer
+
+    def choose_folder(self) -> None:
+        """Take the shots from a watched folder, and ask which."""
+        self.shots.set_kind(FOLDER)
+        self.shots.folder.choose()
+
+    @qt.notify_errors
+    def edit_setup(self, layer: Any) -> None:
+        """Show the setup of a layer, or raise an `InputError` if it can have none."""
+        if layer is None:
+            raise InputError("no layer is selected: select an image in the layer list")
+        if not any(layer is offered for offered in self.image.offered):
+            raise InputError(
+                f"layer '{layer.name}' is no image of a shot: select a shot, or a stack of shots "
+                "with a common setup"
+            )
+        self.image.layer = layer
+        self.reveal(self.setup)
+
+    def all_steps(self) -> tuple[Step, ...]:
+        """Return the preprocessing steps, the crop first, or raise an `InputError`."""
+        has_crop = not self.shots.is_stack
+        crop = layers.crop_of(self.crop.layer, self.chosen_image()) if has_crop else None
+        steps = self.steps.steps()
+        return steps if crop is None else (crop, *steps)
+
+    def show_recipe(self, recipe: Recipe, path: Path) -> None:
+        image, crop, steps = self.chosen_image(), None, recipe.steps
+        can_crop = image is not None and not self.shots.is_stack
+        if can_crop and steps and isinstance(steps[0], Crop):
+            height, width = image.data.shape[-2:]
+            crop, steps = steps[0].slices((height, width)), steps[1:]
+        source = self.source.usable(recipe.source, image, path)
+        self.show_inputs(recipe.model_copy(update={"steps": steps}), path)
+        self.source.show(source)
+        self.options.restore(recipe.options.model_dump())
+        self.crop.layer = None if crop is None else layers.new_crop(self.viewer, image, crop)
+
+    def _hidden_from_source(self, image: Any) -> Any:
+        """Return the source mask, False on the object; None without one or an estimate."""
+        return self.source_masks.usable(image) if self.source.is_estimated else None
+
+    def recipe(self) -> Recipe:
+        """Return the recipe of the controls, without masks and layers; or raise an `InputError`."""
+        return self.input_recipe(steps=self.all_steps(), options=self.options.model())
+
+    def request(self, preview: bool = False) -> jobs.InversionJob | StackJob:
+        layer: Any = self.image.layer
+        if not self.shots.is_stack:
+            layers.image_of(layer)
+        if not preview:
+            self.setup.keep()
+        recipe = self.recipe()
+        mask, hidden = self.masks.usable(layer), self._hidden_from_source(layer)
+        self.source.check(mask)
+        chosen = (self.masks.layer, self.source_masks.layer, self.crop.layer)
+        source_mask = self.source_masks.summary(layer) if self.source.is_estimated else ""
+        described = self.describe(
+            layer, recipe, chosen, name=self.shots.name, source_mask=source_mask
+        )
+        if self.shots.is_stack:
+            out = self.store.path
+            return StackJob(
+                shots=self.shots.shots(),
+                out=out,
+                source=self.source.measured_for_stack(layer),
+                mask=mask,
+                source_mask=hidden,
+                placement={} if layer is None else placement_on(layer, recipe),
+                limits=self.stack_view.limits_of(out),
+                **self.store.choices(self.shots.kind),
+                **described,
+            )
+        shot = replace(
+            shot_of_layer(layer, layers.image_of(layer)),
+            warnings=layers.warnings_of(layer),
+            mask=mask,
+            source_mask=hidden,
+            source=self.source.measured(layer),
+        )
+        return jobs.InversionJob(
+            name=", ".join(filter(None, (jobs.name_of_result(layer), self.source.short_name))),
+            frame=result_frame(layer, recipe),
+            shot=shot,
+            cache=self._cache,
+            preview=preview,
+            **described,
+        )
+
+    @qt.notify_errors
+    def refine(self) -> None:
+        """Refine the last inversion of the image, or else that of the selected layer."""
+        if self.is_busy:
+            return
+        fields = field_of(self._last.layers_of(self.image.layer))
+        chosen = fields[0] if fields else self.viewer.layers.selection.active
+        if chosen is None or about.result_of(chosen) is None:
+            raise InputError(
+                "there is no inversion of this image to refine: press Run first, then Refine"
+            )
+        self.refine_layer(chosen)
+
+    @qt.notify_errors
+    def refine_layer(self, layer: Any) -> None:
+        """Refine the inversion that a layer belongs to, such as a result from a file."""
+        self.refine_section.folded.expand()
+        image = self._last.shot_of(layer)
+        name = jobs.name_of_result(layer) if image is None else str(image.name)
+        psf = self.refine_section.psf.value()
+        job = jobs.refinement(layer, layer if image is None else image, name, psf)
+        if self.is_busy:
+            raise InputError(
+                "Invert is running: wait until it finishes, or press Cancel, then refine"
+            )
+        self.start(job)
+
+    @qt.notify_errors
+    def _show_source(self) -> None:
+        """Estimate the beam of the image, which the steps have not changed."""
+        if self.is_busy:
+            return
+        layer: Any = self.image.layer
+        image, source = layers.image_of(layer), self.source.chosen()
+        assert isinstance(source, Estimate)  # without one the button is hidden
+        estimate = source.adapt_to(self.setup.setup(), image.shape)
+        hidden = self._hidden_from_source(layer)
+        made_from = {"image": layer.name, "estimate": estimate.summary}
+        if hidden is not None:
+            made_from["source_mask"] = self.source_masks.summary(layer)
+        shot = Shot(image, source_mask=hidden)
+        self.start(jobs.SourceJob(estimate, shot, layer, made_from))
+
+    def _on_progress(self, progress: Progress) -> None:
+        job = self.panel.tag
+        has_shots = progress.stage == "shots" or (progress.stage == "wait" and progress.step)
+        if isinstance(job, StackJob) and has_shots:
+            self._show_run(job)
+
+    def _show_run(self, job: StackJob) -> None:
+        self.store.begin()
+        self.stack_view.show_run(job)
+        self.results = self.stack_view.results
+
+    @qt.notify_errors
+    def _on_end(self, outcome: Outcome) -> None:
+        job = outcome.tag
+        if not isinstance(job, StackJob):
+            super()._on_end(outcome)
+        elif text := self.stack_view.end(outcome):
+            self.results = self.stack_view.results
+            self.panel.say(text)
+            self.panel.status.setToolTip(str(job.out.absolute()))
+
+    def show_result(self, finished: jobs.Finished, job: Any) -> None:
+        if isinstance(job, jobs.InversionJob):
+            self._show_inversion(finished, job)
+        elif isinstance(job, jobs.SourceJob):
+            self._show_estimate(finished, job)
+        else:
+            self.previewed.hide()
+            self.results = self._refined = self.view.show_fit(job, finished)
+
+    def forget(self) -> None:
+        self.stack_view.empty()
+        self.panel.status.setToolTip("")
+
+    def _show_inversion(self, finished: jobs.Finished, job: jobs.InversionJob) -> None:
+        inversion = finished.content
+        moved = place_inputs(self.viewer, job, quiet=job.preview)
+        if job.preview:
+            self.view.show_preview(finished.result)
+            residual = next(f for f in inversion.facts if f.key == "image_residual")
+            self.panel.say(f"{residual.title} {residual.text}")
+            self.previewed.show(finished.layer_data, select=False, fit=moved)
+            return
+        self.view.show_report(finished.result, job)
+        self.cost.learn(inversion)
+        self._show_cost()
+        # They refine an earlier result and would cover the new one.
+        self._refined.hide()
+        self.previewed.hide()
+        self.results = self._last.layers_for_next(job.image)
+        layer_data = main_layers(finished.layer_data, also=self.results.layer_keys)
+        self.results.show(layer_data, fit=moved)
+
+    def _show_estimate(self, finished: jobs.Finished, job: jobs.SourceJob) -> None:
+        self._last.layers_for_next((job.image, about.SOURCE)).show(finished.layer_data)
+        self.panel.say(_pattern_warning(finished.content, job), problem=True)
+
+    def on_change(self) -> None:
+        """Save the state, update the preview and the estimated cost."""
+        self.keep()
+        self._start_preview()
+        self.source_masks.setVisible(self.source.is_estimated)
+        self._source_row.setVisible(self.source.is_made and not self.shots.is_stack)
+        self._show_cost()
+
+    def showEvent(self, event: Any) -> None:
+        super().showEvent(event)
+        self._start_preview()
+
+    def _start_preview(self) -> None:
+        if self._ready and self.live.isChecked() and not self.shots.is_stack:
+            self._preview_timer.start()
+
+    def _preview(self) -> None:
+        """Show a preview; the button's run has priority."""
+        if self.is_busy or not self.isVisible():
+            return
+        try:
+            job = self.request(preview=True)
+        except USER_ERRORS as error:
+            # An unfinished rectangle or number is no reason for a notification.
+            self.panel.say(str(error), problem=True)
+            return
+        self.start(job, preview=True)
+
+    def _show_cost(self) -> None:
+        """Show the estimated time and memory for large images."""
+        try:
+            recipe = Recipe(steps=self.all_steps())
+            shape = recipe.shape_after(layers.image_of(self.image.layer).shape)
+            self.cost.show_cost(shape, self.options.model())
+        except InputError:
+            self.cost.setVisible(False)  # Run reports the problem
+
+    def _on_shots(self) -> None:
+        """Show the source, setup and choices of another image or of other files."""
+        layer, is_stack = self.image.layer, self.shots.is_stack
+        self.store.follow(self.shots)
+        for row in (self.store, self.stack_view):
+            row.setVisible(is_stack)
+        for row in (self._crop_row, self.live, self.keep_earlier, self.refine_section):
+            row.setVisible(not is_stack)
+        self.source.follow(layer)
+        self.setup.follow(layer, self.shots.name if layer is None else "")
+        if layer is not None:
+            self.masks.follow(layer)
+        self._forget_report()
+        self.on_change()
+
+    def _forget_report(self) -> None:
+        """Clear the report, which does not apply to another image."""
+        self.view.empty()
+        if not self.panel.running:
+            self.forget()
+            self.panel.say("")
+
+    @qt.notify_errors
+    def _draw_crop(self) -> None:
+        layers.image_of(self.image.layer)
+        self.crop.layer = layers.new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")
+
+
+def _pattern_warning(source: FloatArray, job: jobs.SourceJob) -> str:
+    """Say how much of an image's pattern an estimate keeps that smooths the whole image."""
+    smooths = isinstance(job.estimate, LowPassEstimate | TotalVariationEstimate)
+    if not smooths or job.shot.source_mask is not None:
+        return ""
+    kept, pattern = (layers.block_pattern(np.asarray(each)) for each in (source, job.shot.image))
+    if kept is None or pattern is None or not pattern.any():
+        return ""
+    share = float(np.vdot(kept, pattern) / np.vdot(pattern, pattern))
+    if share < _NOTABLE_PATTERN:
+        return ""
+    return (
+        f"The estimate contains {percent(share)} of the pattern in the image: what of it is the "
+        "object's is missing in the field. Choose a smoother estimate, or mask the object."
+    )
