@@ -112,7 +112,7 @@ def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
     if layer is None:
         raise InputError(
             "there is no potential or result to start from: invert a shot (Plugins → Shadowinv → "
-            "Invert shot), open a .shadowinv file or an image of a potential in px² (File → Open), "
+            "Invert), open a .shadowinv file or an image of a potential in px² (File → Open), "
             "or select a simulated object"
         )
     result, title = about.result_of(layer), name_of_result(layer)
@@ -150,7 +150,7 @@ def _refuse_counts(potential: ArrayLike, name: str) -> None:
         raise InputError(
             f"'{name}' has whole numbers from {values.min():g} to {values.max():g}, as a detector "
             "counts, expected a potential in px²: invert the image first (Plugins → Shadowinv → "
-            "Invert shot), or choose a layer of a result"
+            "Invert), or choose a layer of a result"
         )
 
 

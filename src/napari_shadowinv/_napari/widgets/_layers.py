@@ -48,10 +48,9 @@ def stack_of(layer: Any) -> Any:
     """Return the 3-D array (shot, y, x) of grey images, lazy if the layer is."""
     data = _grey(layer, "stack of shots")
     if data.ndim != 3:
-        hint = "use 'Invert shot' for a single image, or " if data.ndim == 2 else ""
         raise InputError(
             f"'{layer.name}' has shape {tuple(data.shape)}, expected a stack (shot, y, x): "
-            f"{hint}choose another layer, or files"
+            "choose another layer, or files"
         )
     if isinstance(data, np.ndarray):
         return data
@@ -116,6 +115,11 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
     if is_of_labels:
         is_drawn = bool(np.any(layer.data))
         painted = np.asarray(layer.data) != 0 if image is None else labels_on(layer, image)
+    elif image is None:
+        raise InputError(
+            f"the mask '{layer.name}' is drawn as shapes, whose place in files is unknown: "
+            "press ✎ to paint labels of the shots' size"
+        )
     else:
         is_drawn, painted = bool(len(layer.data)), _pixels_in_shapes(layer, image)
     if not is_drawn:

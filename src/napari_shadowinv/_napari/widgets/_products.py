@@ -203,8 +203,8 @@ class ProductForm(ToolPanel):
         layer = self.result.layer
         if layer is None:
             raise InputError(
-                "there is no result to measure: run 'Invert shot', 'Fit several images' or "
-                "'Invert stack', or open a .shadowinv file or a store of shots"
+                "there is no result to measure: run 'Invert' or 'Fit several images', or open a "
+                ".shadowinv file or a store of shots"
             )
         choices: Any = self._picker.model()
         values = {**choices.model_dump(exclude_unset=True), "product": self.kind.name()}
@@ -289,7 +289,7 @@ class ProductForm(ToolPanel):
     def _draw(self) -> None:
         layer = self.result.layer
         if layer is None:
-            raise InputError("there is no result to draw on: run 'Invert shot' first")
+            raise InputError("there is no result to draw on: run 'Invert' first")
         mode = "add_ellipse" if "center" in self.kind.model_fields else "add_line"
         self.shapes.layer = new_shapes(self.viewer, layer, self.kind.name(), mode)
 

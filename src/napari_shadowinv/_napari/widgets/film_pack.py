@@ -315,7 +315,7 @@ class FilmPack(panels.ToolPanel):
         )
         self.to_fit = qt.push_button(
             "Layers for a fit",
-            "Add each film as an image with energy, setup and mask, for Invert shot and Fit "
+            "Add each film as an image with energy, setup and mask, for Invert and Fit "
             "several images.",
             self._add_fit_images,
         )
