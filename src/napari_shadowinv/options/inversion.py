@@ -21,6 +21,8 @@ MaxError = Annotated[
 MAX_DEFAULT_SITES = 1_000_000
 
 _MOVES_SITES: Any = {"moves_sites": True}
+# For recipes and Python: a window has no row for it unless a recipe states it.
+_RARE: Any = {"rare": True}
 
 
 class InversionOptions(CheckedModel, allow_inf_nan=False):
@@ -69,36 +71,40 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         ge=0,
         le=1000,
         description="Maximum Lloyd iterations, which space the sites evenly.",
-        json_schema_extra=_MOVES_SITES,
+        json_schema_extra=_MOVES_SITES | _RARE,
     )
     lloyd_tolerance: float = Field(
         default=0.1,
         ge=0,
         description="Lloyd relaxation stops once the r.m.s. movement of the sites falls below this "
         "fraction of their mean spacing.",
-        json_schema_extra=_MOVES_SITES,
+        json_schema_extra=_MOVES_SITES | _RARE,
     )
     readout: Literal["dual", "centroid"] = Field(
         default="dual",
         title="Read-out",
         description="'dual': the potential is half the weight of each site. 'centroid': as in the "
         "paper, natural-neighbour interpolation of the centroid displacements, then integration.",
+        json_schema_extra=_RARE,
     )
     integration: Literal["mean", "y", "x"] = Field(
         default="mean",
         description="Centroid read-out only: integrate along 'y' first, along 'x' first, or take "
         "the 'mean' of both.",
+        json_schema_extra=_RARE,
     )
     solver: Literal["newton", "lbfgs", "quasi-newton"] = Field(
         default="newton",
         description="'newton': damped Newton steps. 'lbfgs': limited-memory BFGS, as in the paper; "
         "slow, for comparison. 'quasi-newton': BFGS with a dense n × n matrix, for small numbers "
         "of sites.",
+        json_schema_extra=_RARE,
     )
     stages: Literal["multi", "single"] = Field(
         default="multi",
         description="'multi': solve with few sites first and interpolate the potential to "
         "successively more. 'single': all sites at once, starting from zero weights.",
+        json_schema_extra=_RARE,
     )
     max_iterations: int = Field(
         default=300,
@@ -165,7 +171,7 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         default=0,
         ge=0,
         description="Random seed for the site positions; the same seed gives the same result.",
-        json_schema_extra=_MOVES_SITES,
+        json_schema_extra=_MOVES_SITES | _RARE,
     )
     threads: int | None = Field(
         default=None,
