@@ -274,28 +274,6 @@ def test_two_fields_are_told_apart_and_named(
         np.testing.assert_array_equal(displacement_of(layer), field.displacement)
 
 
-def test_an_unknown_beam_is_fitted_and_shown(window: Any, tool: Any, run: Any) -> None:
-    beam = 1 + 0.2 * np.cos(np.pi * np.arange(SHAPE[1]) / SHAPE[1]) * np.ones(SHAPE)
-    for setup, layer in zip(SETUPS, window.layers, strict=True):
-        image = predict_image(TRUTH, SETUPS[0], setup, source=300 * beam)
-        layer.data = image + np.random.default_rng(2).normal(0, 3, SHAPE)
-    tool.source.set_kind("unknown")
-    run(tool)
-    fitted = layer_of(window, "source").data
-    assert np.abs(fitted / (300 * beam) - 1).max() < 0.1
-    tool.source.set_kind("layer")
-    measured = window.add_image(300 * beam, name="beam")
-    assert "beam" in texts(tool, 0)
-    tool.source.layers.layer = measured
-    assert "beam" not in texts(tool, 0)
-    for source in of_each(inputs_of(tool).shots, "source"):
-        np.testing.assert_array_equal(source, 300 * beam)
-    assert all(of_each(inputs_of(tool).shots, "measured"))
-    made_from = {"image": "14.7 MeV", "estimate": "fitted polynomial"}
-    measured.metadata.update(metadata_for("source", "", made_from=made_from))
-    assert not any(of_each(inputs_of(tool).shots, "measured"))
-
-
 def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
     before = images()
     large = np.ones((2, 2)) / 4
@@ -756,27 +734,6 @@ def test_the_menu_refines_an_inversion_of_a_file(
     window.layers.selection.active = layer_of(window, "field", "refined")
     in_loop(refine)
     assert "shows a fit: select a layer of an inversion" in messages[-1]
-
-
-def test_a_saved_fit_comes_back_as_it_was(
-    window: Any, tool: Any, show: Any, fitted: Fit, tmp_path: Any
-) -> None:
-    result = fitted
-    show(tool, result)
-    qt_path = tmp_path / "fit.shadowinv"
-    layers = [layer for layer in window.layers if result_of(layer) is not None]
-    window.layers.selection = set(layers)
-    window.layers.save(str(qt_path), selected=True, plugin="napari-shadowinv")
-    dataset = read(qt_path)
-    assert dataset.attrs["verdict"] == result.verdict.value
-    assert json.loads(dataset.attrs["fields"]) == ["B"]
-    np.testing.assert_array_equal(dataset["displacement"], result.fields[0].displacement)
-    names = {layer.name for layer in layers}
-    window.layers.clear()
-    window.open(str(qt_path), plugin="napari-shadowinv")
-    (image,) = {layer.name for layer in window.layers} - names
-    assert image.endswith("image – 14.7 MeV fit")
-    assert layer_of(window, "field").data.max() > 0
 
 
 def test_choices_are_kept_between_sessions(window: Any, tool: Any, open_widget: Any) -> None:

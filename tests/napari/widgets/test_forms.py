@@ -187,6 +187,16 @@ def test_the_command_line_reads_a_saved_setup(
         assert math.isinf(picker.setup().source_object_distance)
 
 
+def test_choices_for_recipes_have_a_row_while_they_are_stated(qtbot: Any) -> None:
+    form = ModelForm(InversionOptions)
+    qtbot.addWidget(form)
+    solver = form.entries["solver"].widget.native
+    for values in ({}, {"solver": "lbfgs"}, {}):
+        form.restore(values)
+        assert solver.isHidden() == (not values)
+        assert form.model() == InversionOptions(**values)
+
+
 def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> None:
     for number, name in enumerate(("options.toml", "options", "options.toml")):
         if name == "options":

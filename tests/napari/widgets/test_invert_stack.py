@@ -19,7 +19,6 @@ from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, read_stack
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.preprocessing import LowPassEstimate, LowPassFilter
 from napari_shadowinv.stack import _schedulers, _worker
 
 Array = np.ndarray[Any, Any]
@@ -321,23 +320,3 @@ def test_overwriting_takes_a_box_that_counts_once(tool: Any, run: Any, out: Path
     run(tool)
     assert not before.items() & written(out).items()
     assert not tool.store.run.model().overwrite
-
-
-def test_shots_are_filtered_and_their_sources_guessed(
-    window: Any, tool: Any, run: Any, stack: Array, out: Path
-) -> None:
-    mask = np.ones(SHAPE, bool)
-    mask[:3, :4] = False
-    tool.masks.paint()
-    tool.masks.layer.data[:3, :4] = 1
-    tool.source.set_kind("low-pass")
-    enter(tool.source.form.entries["width"], 6.0)
-    tool.steps.add("low-pass")
-    run(tool)
-    clean = LowPassFilter(width=1.0).filter_image(stack[1], mask)
-    source = LowPassEstimate(width=6.0).source(np.where(mask, clean, 0), mask)
-    expected = invert(clean, source=source, mask=mask, options=InversionOptions(**FEW))
-    potential = np.asarray(read_stack(out)["potential"][1])
-    np.testing.assert_allclose(
-        potential[mask], expected.potential[mask], atol=1e-4 * np.ptp(expected.potential)
-    )

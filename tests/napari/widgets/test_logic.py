@@ -21,30 +21,14 @@ from napari_shadowinv.pipeline import run
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
-    ButterworthFilter,
     Crop,
-    HighPassFilter,
-    MeasuredSource,
     PolynomialEstimate,
     Recipe,
-    Step,
 )
 from napari_shadowinv.shot import Shot
 
 FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]
-
-
-@pytest.mark.parametrize("step", [HighPassFilter(), BackgroundFilter(), ButterworthFilter()])
-def test_what_flattens_the_image_fits_no_measured_source(
-    shot: Array, tmp_path: Path, step: Step
-) -> None:
-    beam = np.linspace(1, 1.1, shot.shape[1]) * np.ones(shot.shape)
-    recipe = Recipe(steps=(step,), source=MeasuredSource())
-    with pytest.raises(InputError, match="would flatten the image but not the source"):
-        run(recipe, Shot(shot, source=beam))
-    with pytest.raises(InputError, match="would flatten the image but not the source"):
-        run_job(StackJob(shot[None], tmp_path / "a.shadowinv.zarr", recipe, beam))
 
 
 def test_a_stack_tells_that_it_compiles(

@@ -11,9 +11,8 @@ import tomli_w
 from napari.components import ViewerModel
 
 from helpers.forms import enter
-from helpers.jobs import run_job
 from helpers.reports import texts_of
-from napari_shadowinv import InputError, InversionOptions, ProtonSetup, read
+from napari_shadowinv import InputError, InversionOptions, ProtonSetup
 from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
@@ -27,7 +26,6 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets._qt import StateKeeper
-from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
@@ -221,6 +219,23 @@ def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) ->
     assert tool.setup.origin == "typed"
 
 
+def test_a_store_lies_beside_the_files_unless_another_is_chosen(
+    viewer: ViewerModel, opened: Any, tmp_path: Path
+) -> None:
+    tool = opened(Invert)
+    tool.shots.set_kind("folder")
+    tool.shots.folder.edit.setText(str(tmp_path / "night"))
+    tool.shots.folder.changed.emit()
+    assert tool.store.path == tmp_path / "night.shadowinv.zarr"
+    tool.shots.set_kind("files")
+    tool.shots.files.edit.setText(str(tmp_path / "day" / "*.tif"))
+    tool.shots.files.changed.emit()
+    assert tool.store.path == tmp_path / "day.shadowinv.zarr"
+    tool.store.folder.edit.setText("mine.shadowinv.zarr")
+    tool.shots.set_kind("folder")
+    assert tool.store.path == Path("mine.shadowinv.zarr")
+
+
 def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(
     viewer: ViewerModel, opened: Any
 ) -> None:
@@ -410,22 +425,6 @@ def test_a_mask_over_the_object_is_refused(
             later.request()
         later.masks.layer = None
         later.request()
-
-
-def test_a_stack_is_inverted_with_both_masks(
-    hump: tuple[Array, Array, Array], tmp_path: Path
-) -> None:
-    shot, potential, is_object = hump
-    job = StackJob(
-        np.stack([shot]),
-        tmp_path / "a.shadowinv.zarr",
-        Recipe(source=PolynomialEstimate(degree=2), options=InversionOptions(n_sites=1500)),
-        source_mask=~is_object,
-        scheduler="synchronous",
-    )
-    run_job(job)
-    recovered = np.asarray(read(job.out)["potential"][0])
-    assert np.ptp(recovered) == pytest.approx(np.ptp(potential), rel=0.1)
 
 
 # What is said of a run

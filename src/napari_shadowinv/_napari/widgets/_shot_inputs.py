@@ -68,6 +68,8 @@ class _ShotChoice(layers.ShotPicker):
         layer, kind = self.layer, self.kind
         with QSignalBlocker(self):
             super().fill()
+            if self.offered:
+                self.insertSeparator(self.count())
             for key, title in _PLACES.items():
                 self.addItem(title, key)
             if kind != LAYER:

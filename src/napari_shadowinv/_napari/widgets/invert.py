@@ -204,25 +204,25 @@ class Invert(ImagePanel):
         return self.input_recipe(steps=self.all_steps(), options=self.options.model())
 
     def request(self, preview: bool = False) -> jobs.InversionJob | StackJob:
-        layer: Any = self.image.layer
-        if not self.shots.is_stack:
-            layers.image_of(layer)
+        layer, is_stack = self.image.layer, self.shots.is_stack
+        image = None if is_stack else layers.image_of(layer)
         if not preview:
             self.setup.keep()
         recipe = self.recipe()
         mask, hidden = self.masks.usable(layer), self._hidden_from_source(layer)
         self.source.check(mask)
+        source = (self.source.measured_for_stack if is_stack else self.source.measured)(layer)
         chosen = (self.masks.layer, self.source_masks.layer, self.crop.layer)
         source_mask = self.source_masks.summary(layer) if self.source.is_estimated else ""
         described = self.describe(
             layer, recipe, chosen, name=self.shots.name, source_mask=source_mask
         )
-        if self.shots.is_stack:
+        if is_stack:
             out = self.store.path
             return StackJob(
                 shots=self.shots.shots(),
                 out=out,
-                source=self.source.measured_for_stack(layer),
+                source=source,
                 mask=mask,
                 source_mask=hidden,
                 placement={} if layer is None else placement_on(layer, recipe),
@@ -231,11 +231,11 @@ class Invert(ImagePanel):
                 **described,
             )
         shot = replace(
-            shot_of_layer(layer, layers.image_of(layer)),
+            shot_of_layer(layer, image),
             warnings=layers.warnings_of(layer),
             mask=mask,
             source_mask=hidden,
-            source=self.source.measured(layer),
+            source=source,
         )
         return jobs.InversionJob(
             name=", ".join(filter(None, (jobs.name_of_result(layer), self.source.short_name))),
