@@ -215,7 +215,7 @@ def test_colour_film_by_channel(folder: Path) -> None:
     content = dataset("film.shadowinv")
     image = content["image"].values
     np.testing.assert_allclose(image / image.sum(), red / red.sum())
-    warnings = json.loads(content.attrs["report"])["warnings"]
+    warnings = json.loads(content.attrs["report"])["cautions"]
     assert warnings[-1]["code"] == "film-scan"
     assert warnings[-1]["text"].startswith(
         "channel 'red' of a colour image was used as the fluence"
