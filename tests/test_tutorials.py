@@ -40,7 +40,7 @@ def test_the_script_finds_the_field_that_it_simulates(tmp_path, monkeypatch, cap
     monkeypatch.chdir(tmp_path)
     names = run_blocks("script.md")
     assert names["report"].converged
-    assert names["report"].warnings == ()
+    assert names["report"].cautions == ()
     assert names["report"].image_residual < 0.05
     true_peak = names["true_strength"].max()
     assert true_peak == pytest.approx(97, rel=0.01)
