@@ -216,10 +216,10 @@ def test_first_shadowgram_is_clicked_to_its_end(
     ends[:, 0] = middle[0]
     lines = profile.lines.layer
     lines.add_lines(np.array([lines.world_to_data(end) for end in ends]))
-    for item in range(profile.layers.count()):
-        on = profile.layers.item(item).text() == field.name
+    for row in range(profile.layers.rowCount()):
+        on = profile.layers.item(row, 0).text() == field.name
         state = Qt.CheckState.Checked if on else Qt.CheckState.Unchecked
-        profile.layers.item(item).setCheckState(state)
+        profile.layers.item(row, 0).setCheckState(state)
     qtbot.waitUntil(
         lambda: [one.name for one in profile.profiles] == [field.name], timeout=PATIENCE_MS
     )
@@ -404,14 +404,14 @@ def test_film_pack_is_clicked_to_its_end(
     press(tool, "Run")
     wait()
     fluence = layer_of(window, "fluence")
-    assert fluence.data.shape[0] == len(tool.plot.shown.energies) == 3
+    assert fluence.data.shape[0] == len(tool.spectrum.energies) == 3
     window.dims.set_current_step(0, 1)
-    energy = f"{tool.plot.shown.energies[1]:.3g} MeV"
+    energy = f"{tool.spectrum.energies[1]:.3g} MeV"
     qtbot.waitUntil(lambda: energy in overlay_text(window), timeout=PATIENCE_MS)
-    whole = np.array(tool.plot.shown.fluence)
+    whole = np.array(tool.spectrum.fluence)
     press(tool, "✎")
     tool.regions.layer.add_rectangles([[20, 30], [49, 59]])
-    qtbot.waitUntil(lambda: (tool.plot.shown.fluence != whole).all(), timeout=PATIENCE_MS)
+    qtbot.waitUntil(lambda: (tool.spectrum.fluence != whole).all(), timeout=PATIENCE_MS)
 
     press(tool, "Show corners")
     corners = np.array(tool.corners.polygon.data[0])

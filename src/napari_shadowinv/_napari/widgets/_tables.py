@@ -103,9 +103,9 @@ class NumberTable(QTableWidget):
         """Create the cells of a row, empty except the first."""
         item = QTableWidgetItem(name)
         item.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
-        item.setCheckState(Qt.CheckState.Checked if checked else Qt.CheckState.Unchecked)
         item.setToolTip(f"<qt>{tip}</qt>")
         self.setItem(row, 0, item)
+        self.check(row, checked)
         for number in range(1, self.columnCount()):
             self.setItem(row, number, QTableWidgetItem())
 
@@ -122,6 +122,9 @@ class NumberTable(QTableWidget):
 
     def is_checked(self, row: int) -> bool:
         return bool(self.item(row, 0).checkState() == Qt.CheckState.Checked)
+
+    def check(self, row: int, on: bool) -> None:
+        self.item(row, 0).setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
 
     def values(self, row: int) -> dict[str, Any]:
         """Return the values of a row by column, None where empty; or raise an `InputError`."""

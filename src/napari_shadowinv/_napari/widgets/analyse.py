@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from qtpy import QtWidgets
-from qtpy.QtCore import QSignalBlocker, Qt
+from qtpy.QtCore import QSignalBlocker
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
@@ -16,6 +16,7 @@ from napari_shadowinv._napari.placement import pixel_mapper
 from napari_shadowinv._napari.widgets import _products as products
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
+from napari_shadowinv._napari.widgets._tables import NumberTable
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.paths import (
     Profile,
@@ -29,7 +30,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import number_in_unit
 
 _REDRAW_MS = 40  # while the line moves
-_LAYER_ROLE = Qt.ItemDataRole.UserRole
 _MAX_NAME_LENGTH = 34
 _MAX_WIDTH = 1e6
 
@@ -64,8 +64,8 @@ class Analyse(qt.Docked):
         self.profiles: list[Profile] = []
         tip = "<qt>Shapes layer with the line. Of several lines, the selected one is used.</qt>"
         self.lines = LayerPicker(self.viewer, tip, "none yet", kinds=("shapes",))
-        self.layers = QtWidgets.QListWidget(toolTip="Layers to plot.", maximumHeight=110)
-        self.layers.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self._listed: list[Any] = []
+        self.layers = NumberTable("Layers to plot", (), max_rows=4)
         self.width_edit = forms.SavedLine(
             "0: line only",
             "Width of the strip, perpendicular to the line, over which values are averaged: in "
@@ -103,23 +103,18 @@ class Analyse(qt.Docked):
         for signal in (self.layers.itemChanged, self.width_edit.textChanged):
             signal.connect(lambda _: self._schedule_plot())
 
-    def _items(self) -> list[tuple[Any, Any]]:
-        items = [self.layers.item(row) for row in range(self.layers.count())]
-        return [(item, item.data(_LAYER_ROLE)) for item in items]
-
     def checked(self) -> list[Any]:
-        on = Qt.CheckState.Checked
-        return [layer for item, layer in self._items() if item.checkState() == on]
+        return [layer for row, layer in enumerate(self._listed) if self.layers.is_checked(row)]
 
     def check(self, layer: Any, on: bool = True) -> None:
-        for item, listed in self._items():
+        for row, listed in enumerate(self._listed):
             if listed is layer:
-                item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
+                self.layers.check(row, on)
 
     @qt.notify_errors
     def plot_layer(self, layer: Any) -> None:
         """Plot only one layer; without a line yet, begin to draw it."""
-        if not any(layer is listed for _, listed in self._items()):
+        if not any(layer is listed for listed in self._listed):
             raise InputError("no image is selected: select a grey image in the layer list")
         self.tabs.setCurrentIndex(0)
         for checked in self.checked():
@@ -201,21 +196,18 @@ class Analyse(qt.Docked):
 
     def _fill(self, _: Any = None) -> None:
         """List all grey images; new visible ones are checked."""
-        listed, checked = [layer for _, layer in self._items()], self.checked()
+        earlier, checked = self._listed, self.checked()
+        images = [layer for layer in reversed(self.viewer.layers) if kind_of(layer) == "image"]
+        self._listed = [layer for layer in images if not layer.rgb and layer.ndim >= 2]
         with QSignalBlocker(self.layers):
-            self.layers.clear()
-            for layer in reversed(self.viewer.layers):
-                if kind_of(layer) != "image" or layer.rgb or layer.ndim < 2:
-                    continue
-                is_new = not any(layer is old for old in listed)
+            self.layers.setRowCount(len(self._listed))
+            for row, layer in enumerate(self._listed):
+                is_new = not any(layer is old for old in earlier)
                 on = any(layer is old for old in checked) or (
-                    is_new and layer.visible and (role_of(layer) is not None or not listed)
+                    is_new and layer.visible and (role_of(layer) is not None or not earlier)
                 )
-                item = QtWidgets.QListWidgetItem(layer.name)
-                item.setData(_LAYER_ROLE, layer)
-                item.setToolTip(layer.name)
-                item.setCheckState(Qt.CheckState.Checked if on else Qt.CheckState.Unchecked)
-                self.layers.addItem(item)
+                self.layers.fill_row(row, layer.name, layer.name, checked=on)
+        self.layers.fit_height()
         self._schedule_plot()
 
     @qt.notify_errors
