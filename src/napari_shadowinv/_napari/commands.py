@@ -141,10 +141,10 @@ def crop(
     from napari_shadowinv._napari.widgets._layers import crop_of, image_of, new_shapes
 
     layer, viewer = without_proxy(layer), without_proxy(viewer)
-    shown = [] if viewer is None else [each for each in viewer.layers if each.visible]
-    shapes = [each for each in shown if _has_outline(each)]
+    visible = [] if viewer is None else [each for each in viewer.layers if each.visible]
+    shapes = [each for each in visible if _has_outline(each)]
     if layer in shapes:
-        shapes, images = [layer], [each for each in shown if _is_image(each)]
+        shapes, images = [layer], [each for each in visible if _is_image(each)]
         drawn_for = [
             each for each in images if layer.name == layer_name("crop", name_of_result(each))
         ]

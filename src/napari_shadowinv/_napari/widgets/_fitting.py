@@ -159,8 +159,8 @@ class ResultView(QWidget):
         warnings = [
             row for row in panels.warning_rows(facts) if row not in inputs and row[1] not in said
         ]
-        shown, details = (panels.fact_rows(facts, details=flag) for flag in (False, True))
-        self.report.show_rows([*warnings, *inputs, *shown], details)
+        rows, details = (panels.fact_rows(facts, details=flag) for flag in (False, True))
+        self.report.show_rows([*warnings, *inputs, *rows], details)
         return content.headline
 
     def _list_solutions(self, fit: Fit) -> None:

@@ -135,8 +135,8 @@ class SetupPicker(QWidget):
 
     def state(self) -> dict[str, Any]:
         """Return the setups that the user entered; the selection depends on the image."""
-        own = {kind: asdict(entry) for kind, entry in self._entered.items()}
-        return {"own": own, "last": self._last}
+        entries = {kind: asdict(entry) for kind, entry in self._entered.items()}
+        return {"own": entries, "last": self._last}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Restore the entered setups; select the last one only if the user prefers that."""

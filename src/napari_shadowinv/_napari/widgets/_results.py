@@ -42,13 +42,13 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
         and tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
         and about.frame_of(layer) == old
     ]
-    drawn = [layer for layer in companions if about.frame_of(layer).units == old.units]
+    on_image = [layer for layer in companions if about.frame_of(layer).units == old.units]
     about.place_image(image, setup)
     new = about.frame_of(image)
     if new == old:
         return False
     ratio = np.divide(new.scale, old.scale)
-    for layer in dict.fromkeys((*drawn, *same_size)):
+    for layer in dict.fromkeys((*on_image, *same_size)):
         if layer is image:
             continue
         frame = about.frame_of(layer)

@@ -416,10 +416,12 @@ def _pattern_warning(source: FloatArray, job: jobs.SourceJob) -> str:
     smooths = isinstance(job.estimate, LowPassEstimate | TotalVariationEstimate)
     if not smooths or job.shot.source_mask is not None:
         return ""
-    kept, pattern = (layers.block_pattern(np.asarray(each)) for each in (source, job.shot.image))
-    if kept is None or pattern is None or not pattern.any():
+    estimate, pattern = (
+        layers.block_pattern(np.asarray(each)) for each in (source, job.shot.image)
+    )
+    if estimate is None or pattern is None or not pattern.any():
         return ""
-    share = float(np.vdot(kept, pattern) / np.vdot(pattern, pattern))
+    share = float(np.vdot(estimate, pattern) / np.vdot(pattern, pattern))
     if share < _NOTABLE_PATTERN:
         return ""
     return (
