@@ -229,7 +229,9 @@ class StackView(QWidget):
         for _, keywords, kind in job.layer_data:
             if kind == "image":
                 role = str(role_of(keywords))
-                keywords["contrast_limits"] = current.get(role, job.limits[role])
+                limits = job.limits[role]
+                keywords["contrast_limits"] = current.get(role, limits)
+                self._applied.setdefault(role, limits)  # also for layers that are added later
         layer_data = main_layers(job.layer_data, also=self.results.layer_keys)
         self.results.show(layer_data, select=not is_resumed)
 
@@ -254,7 +256,7 @@ class StackView(QWidget):
             self._grow(job)
         for layer in self.images:
             role, current = str(role_of(layer)), tuple(layer.contrast_limits)
-            if role in job.limits and self._applied.get(role, current) == current:
+            if role in job.limits and np.allclose(self._applied.get(role, current), current):
                 layer.contrast_limits = job.limits[role]
                 self._applied[role] = tuple(layer.contrast_limits)
         for layer in self.results.layers:
