@@ -279,10 +279,10 @@ _NO_STEP: Step = (np.zeros(2), 1e6 * np.eye(2))
 
 @dataclass(frozen=True, eq=False)
 class _Structure:
-    """What an image or a source is compared by.
+    """Structure by which an image and a source are compared.
 
-    `levels` are means over square cells, `slopes` those of its smoothed gradient, (2, h, w), and
-    `finest` is its structure between two widths.
+    `levels` and `slopes` are means over square cells, of the plane and its smoothed gradient,
+    (2, h, w); `finest` is the structure between two widths.
     """
 
     cell: int
