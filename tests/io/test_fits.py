@@ -168,7 +168,7 @@ def test_an_incomplete_dataset_is_refused(make_fit: MakeFit) -> None:
     dataset = make_fit().to_dataset()
     with pytest.raises(InputError, match="no 'brightness': expected the result of a fit"):
         Fit.from_dataset(dataset.drop_vars("brightness"))
-    with pytest.raises(InputError, match="no displacement of the field 'B'"):
+    with pytest.raises(InputError, match="no 'displacement': expected the result of a fit"):
         Fit.from_dataset(dataset.drop_vars("displacement"))
     del dataset.attrs["verdict"]
     with pytest.raises(InputError, match="no 'verdict'"):
