@@ -142,8 +142,9 @@ class ResultView(QWidget):
         """Show the report of the result whose layer is selected, such as a layer from a file."""
         layer = self._tool.viewer.layers.selection.active
         result = None if layer is None else result_of(layer)
-        is_shown = result is None or result is self._result or self._tool.panel.running
-        if not is_shown and isinstance(result.content, self._content):
+        if result is None or result is self._result or self._tool.panel.running:
+            return
+        if isinstance(result.content, self._content):
             self.empty()
             self._show(result)
             self._tool.reveal(self.verdict)

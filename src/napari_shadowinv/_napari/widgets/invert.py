@@ -184,7 +184,8 @@ class Invert(ImagePanel):
         return steps if crop is None else (crop, *steps)
 
     def show_recipe(self, recipe: Recipe, path: Path) -> None:
-        image, crop, steps = self.chosen_image(), None, recipe.steps
+        image: Any = self.chosen_image()
+        crop, steps = None, recipe.steps
         can_crop = image is not None and not self.shots.is_stack
         if can_crop and steps and isinstance(steps[0], Crop):
             height, width = image.data.shape[-2:]
@@ -211,7 +212,8 @@ class Invert(ImagePanel):
         recipe = self.recipe()
         mask, hidden = self.masks.usable(layer), self._hidden_from_source(layer)
         self.source.check(mask)
-        source = (self.source.measured_for_stack if is_stack else self.source.measured)(layer)
+        measured = self.source.measured_for_stack if is_stack else self.source.measured
+        source: Any = measured(layer)
         chosen = (self.masks.layer, self.source_masks.layer, self.crop.layer)
         source_mask = self.source_masks.summary(layer) if self.source.is_estimated else ""
         described = self.describe(
