@@ -46,7 +46,7 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
         panels[0].draw_intensity(image, "First draw", intensity_limits(image))
         fields = {"object": true, "retrieved in the first draw": retrieved}
         _panels.draw_side_by_side(panels[1:4], fields)
-        draw_errors(panels[4].axes, plan)
+        draw_errors(panels[4].axes, plan, "black")
         panels[4].axes.set_title(f"Error made: {percent(plan.error.median)}")
         _draw_parts(panels[5].axes, plan)
     return figure
@@ -80,7 +80,9 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
     return figure
 
 
-def draw_errors(axes: Axes, content: ExperimentPlan | ExperimentSweep, ink: str = "black") -> None:
+def draw_errors(
+    axes: Axes, content: ExperimentPlan | ExperimentSweep, ink: str = QUIET_COLOUR
+) -> None:
     """Draw the errors made and reported, of each draw of a plan or of each value of a sweep.
 
     Parameters
@@ -88,17 +90,19 @@ def draw_errors(axes: Axes, content: ExperimentPlan | ExperimentSweep, ink: str 
     axes : Axes
     content : ExperimentPlan or ExperimentSweep
     ink : str
-        Colour of the marks of the errors reported in each draw.
+        Colour of the errors reported.
     """
     if isinstance(content, ExperimentSweep):
-        _draw_sweep(axes, content)
+        _draw_sweep(axes, content, ink)
         axes.set_xlabel(_axis_of(content))
     else:
         _draw_draws(axes, content, ink)
     axes.legend(fontsize=7)
 
 
-def _draw_sweep(axes: Axes, sweep: ExperimentSweep) -> tuple[FloatArray, list[ExperimentPlan]]:
+def _draw_sweep(
+    axes: Axes, sweep: ExperimentSweep, ink: str = QUIET_COLOUR
+) -> tuple[FloatArray, list[ExperimentPlan]]:
     """Draw the errors over the values; return these in their order, and the plans."""
     order = np.argsort(sweep.values)
     values = np.array(sweep.values)[order]
@@ -109,13 +113,13 @@ def _draw_sweep(axes: Axes, sweep: ExperimentSweep) -> tuple[FloatArray, list[Ex
     medians = [100 * each.median for each in spreads]
     axes.plot(values, medians, "o-", color=GOOD_COLOUR, label="error made")
     totals = [100 * plan.total.median for plan in plans]
-    axes.plot(values, totals, "--", color=QUIET_COLOUR, label="error reported")
+    axes.plot(values, totals, "--", color=ink, label="error reported")
     axes.set_ylabel("error of the field (%, r.m.s.)")
     axes.set_ylim(bottom=0)
     if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
         axes.set_xscale("log")
         axes.minorticks_off()
-    axes.set_xticks(values, [f"{value:.3g}" for value in values])
+    axes.set_xticks(values, [f"{value:.4g}" for value in values])
     return values, plans
 
 
@@ -130,6 +134,7 @@ def _draw_draws(axes: Axes, plan: ExperimentPlan, ink: str) -> None:
     axes.bar(numbers, [100 * shot.error for shot in plan.shots], color=colours)
     totals = [100 * shot.total for shot in plan.shots]
     axes.plot(numbers, totals, "_", color=ink, markersize=7, label="reported")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.set_xlabel("draw (blue: depends on the beam, red: doubtful)")
     axes.set_ylabel("error of the field (%)")
 

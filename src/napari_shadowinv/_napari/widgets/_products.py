@@ -54,7 +54,7 @@ _MORE = "more"
 # The products that most experiments need; the others follow below *more…*.
 _USUAL = ("profile", "region", "flux", "current", "current-density", "axisymmetric")
 OPEN_SHAPES = ("line", "path")
-_PANEL_HEIGHT_PX = 180
+_PANEL_HEIGHT_PX = 210
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +143,7 @@ class ProductForm(ToolPanel):
         self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",))
         self.unit = forms.SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
         self.bands, self.shots = forms.ModelForm(_Bands), forms.ModelForm(_Shots)
-        self.plot, self.report = qt.Plot(_PANEL_HEIGHT_PX), ReportView()
+        self.plot, self.report = qt.Plot(_PANEL_HEIGHT_PX, fixed=True), ReportView()
         self.export = qt.push_button("Export CSV…", "Save all measured products.", self._export)
         self.save = qt.push_button("Save with result…", "", self._save)
         self.picture = qt.push_button(
@@ -270,13 +270,12 @@ class ProductForm(ToolPanel):
         panels = len(measured.curve_groups)
         self.plot.setVisible(panels > 0)
         if panels:
-            self.plot.setMinimumHeight(_PANEL_HEIGHT_PX * panels)
+            self.plot.setFixedHeight(_PANEL_HEIGHT_PX * panels)
             self.plot.show_drawing(lambda axes: draw_groups(axes, measured), panels)
         for widget in (self.export, self.picture, self.clear):
             widget.setEnabled(True)
         self.save.setEnabled(isinstance(job.origin, about.Result))
         add_layers(self.viewer, finished.layer_data)
-        self.reveal(self.report)
 
     def _clear(self) -> None:
         self.measured, self._origin = [], None

@@ -33,7 +33,6 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
-_NO_LIMIT_PX = 16_777_215  # of Qt
 _CONSTANT_STAGES = ("samples",)  # do not change the objective
 # Errors that a saved state causes which another version wrote in another form.
 UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
@@ -269,8 +268,10 @@ class Plot(QWidget):
     def __init__(self, height: int, *, fixed: bool = False) -> None:
         super().__init__()
         self.setMinimumHeight(height)
-        self.setMaximumHeight(height if fixed else _NO_LIMIT_PX)
-        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Expanding)
+        if fixed:
+            self.setMaximumHeight(height)
+        policy = QSizePolicy.Policy
+        self.setSizePolicy(policy.Expanding, policy.Fixed if fixed else policy.Expanding)
         self.setVisible(False)
         column(self)
         self.figure: Any = None
