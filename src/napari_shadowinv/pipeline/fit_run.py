@@ -461,11 +461,7 @@ def _image_origins(
 
 
 def read_row_images(
-    rows: Sequence[ShotRow],
-    recipe: Recipe,
-    *,
-    channel: str | None = None,
-    variable: str | None = None,
+    rows: Sequence[ShotRow], recipe: Recipe, *, channel: str | None = None
 ) -> tuple[Shot, ...]:
     """Read the images of rows, whose energies or wavelengths complete the setups.
 
@@ -475,12 +471,12 @@ def read_row_images(
         Description of each image.
     recipe : Recipe
         Its setup applies to images without one.
-    channel, variable : str, optional
-        Part of each file to read; the channel also applies to sources.
+    channel : str, optional
+        Part of each file to read, and of its source.
     """
     images = []
     for row in rows:
-        recorded = read_part(row.file, channel, variable)
+        recorded = read_part(row.file, channel)
         source: Any = row.source
         if isinstance(source, Path):
             source = read_part(source, channel)
