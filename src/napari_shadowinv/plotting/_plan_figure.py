@@ -129,12 +129,14 @@ def _axis_of(sweep: ExperimentSweep) -> str:
 
 def _draw_draws(axes: Axes, plan: ExperimentPlan, ink: str) -> None:
     """Errors made and reported in each draw; draws that are not determined in another colour."""
+    from matplotlib.ticker import MaxNLocator
+
     numbers = [shot.number for shot in plan.shots]
     colours = [LEVEL_COLOURS[shot.verdict.level] for shot in plan.shots]
     axes.bar(numbers, [100 * shot.error for shot in plan.shots], color=colours)
     totals = [100 * shot.total for shot in plan.shots]
     axes.plot(numbers, totals, "_", color=ink, markersize=7, label="reported")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("draw (blue: depends on the beam, red: doubtful)")
     axes.set_ylabel("error of the field (%)")
 
