@@ -40,14 +40,20 @@ def write_recipe(path: Path, recipe: Recipe, *, overwrite: bool = False) -> None
     """
     folder = resolved_path(Path(path).parent)
     relative = map_paths(recipe, lambda file: Path(os.path.relpath(resolved_path(file), folder)))
-    content = relative.model_dump(exclude_none=True)
-    # Options at their defaults are left out.
-    content["instrument"] = relative.instrument.stated or ()
-    content["options"] = relative.options.model_dump(exclude_defaults=True) or ()
-    if relative.fit is not None:  # an empty section still requests a fit
-        content["fit"] = relative.fit.model_dump(exclude_defaults=True)
-    content = {name: _to_toml(value) for name, value in content.items() if value != ()}
-    write_toml(path, content, overwrite)
+    write_toml(path, recipe_entries(relative), overwrite)
+
+
+def recipe_entries(recipe: Recipe) -> dict[str, Any]:
+    """Return a recipe as values of TOML, from which it can be made again.
+
+    Options at their defaults are left out.
+    """
+    content = recipe.model_dump(exclude_none=True)
+    content["instrument"] = recipe.instrument.stated or ()
+    content["options"] = recipe.options.model_dump(exclude_defaults=True) or ()
+    if recipe.fit is not None:  # an empty section still requests a fit
+        content["fit"] = recipe.fit.model_dump(exclude_defaults=True)
+    return {name: _to_toml(value) for name, value in content.items() if value != ()}
 
 
 def read_part(path: Path, channel: str | None = None, variable: str | None = None) -> Shot:

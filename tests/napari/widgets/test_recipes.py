@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from napari.components import ViewerModel
-from qtpy.QtWidgets import QFileDialog
+from qtpy.QtWidgets import QApplication, QFileDialog
 
 from helpers.command_line import undrawn
 from helpers.forms import enter
@@ -307,6 +307,34 @@ def test_the_command_does_what_the_window_saves(
     np.testing.assert_array_equal(*pixels)
 
 
+def test_copied_python_makes_the_same_result(
+    viewer: ViewerModel, opened: Any, run: Any, image: Any, proton_setup: ProtonSetup
+) -> None:
+    clipboard = QApplication.clipboard()
+    clipboard.setText("")
+    tool = opened()
+    tool._draw_crop()
+    tool.crop.layer.add_rectangles(np.array([[4, 10], [4, 57], [43, 57], [43, 10]]))
+    tool.steps.show_steps(STEPS_FIRST[1:])
+    tool.source.show(PolynomialEstimate(degree=1))
+    tool.setup.show_setup(proton_setup.model_dump())
+    run(tool)
+    field = next(layer for layer in viewer.layers if role_of(layer) == "field")
+    mine = field.metadata["napari-shadowinv"]["result"].content
+    tool.recipes.copy()
+    lines, names = clipboard.text(), {}
+    assert len(lines.splitlines()) <= 8
+    exec(lines, names)
+    np.testing.assert_array_equal(names["inversion"].displacement, mine.displacement)
+    assert names["recipe"] == mine.provenance.recipe
+    assert names["inversion"].setup == mine.provenance.setup
+    clipboard.setText("")
+    tool.masks.paint()
+    tool.masks.layer.data[6:9, 12:15] = 1
+    tool.recipes.copy()  # a mask in no file
+    assert clipboard.text() == ""
+
+
 def test_the_selected_result_is_repeated_from_its_files(
     viewer: ViewerModel, opened: Any, image: Any, shot_file: Path, run: Any, qtbot: Any,
     monkeypatch: pytest.MonkeyPatch,
@@ -483,7 +511,7 @@ def test_the_menu_asks_for_a_file(
     monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (path, ""))
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (path, ""))
     tool = opened()
-    load, save, _ = tool.recipes.menu().actions()
+    load, save, *_ = tool.recipes.menu().actions()
     assert (load.text(), save.text()) == ("Load recipe…", "Save…")
     tool.steps.add("bin")
     save.trigger()

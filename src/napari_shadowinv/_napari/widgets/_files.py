@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from napari.utils.notifications import show_info
-from qtpy.QtWidgets import QFileDialog, QMenu, QPushButton, QSizePolicy
+from qtpy.QtWidgets import QApplication, QFileDialog, QMenu, QPushButton, QSizePolicy
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.form import TOML
@@ -44,6 +44,7 @@ from napari_shadowinv.io.formats import (
 )
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import read_recipe, write_recipe
+from napari_shadowinv.pipeline.files import recipe_entries
 from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
 from napari_shadowinv.pipeline.rerun import Rerun, collect_rerun
 from napari_shadowinv.preprocessing import MeasuredSource
@@ -99,7 +100,7 @@ class _Repetition(Job):
 
 
 class RecipeButton(QPushButton):
-    """A menu to load and save the recipe of an `ImagePanel` as TOML, and to repeat a result."""
+    """A menu to load, save and copy the recipe of an `ImagePanel`, and to repeat a result."""
 
     def __init__(self, tool: Any) -> None:
         super().__init__("Recipe")
@@ -112,6 +113,8 @@ class RecipeButton(QPushButton):
         menu = QMenu(self)
         menu.addAction("Load recipe…").triggered.connect(lambda: self._ask_and_load())
         menu.addAction("Save…").triggered.connect(lambda: self._ask_and_save())
+        if tool.command == "invert":
+            menu.addAction("Copy as Python").triggered.connect(lambda: self.copy())
         menu.addAction("Repeat").triggered.connect(lambda: self.repeat())
         self.setMenu(menu)
         tool.panel.ended.connect(self._on_end)
@@ -125,6 +128,32 @@ class RecipeButton(QPushButton):
         path, _ = QFileDialog.getSaveFileName(self, "Save recipe", "recipe.toml", TOML)
         if path:
             self.save(Path(path))
+
+    @notify_errors
+    def copy(self) -> None:
+        """Put lines of Python on the clipboard that make the same result from the image's file."""
+        tool = self._tool
+        image = tool.chosen_image()
+        path = None if image is None else about.metadata_of(image).get("path") or image.source.path
+        if not path:
+            raise InputError("Python reads the image from its file: open one, or save the image")
+        recipe = tool.recipe_to_save()
+        masks = (each.usable(image) for each in tool.mask_pickers.values() if not each.isHidden())
+        is_drawn = any(mask is not None for mask in masks)
+        if is_drawn or tool.source.to_write(recipe, image) is not None:
+            raise InputError(
+                "masks or the source are in no file: save the recipe, which writes them, and use "
+                "it by read_recipe"
+            )
+        lines = (
+            "from napari_shadowinv import Recipe",
+            "from napari_shadowinv.pipeline import run",
+            "",
+            f"recipe = Recipe.model_validate({recipe_entries(recipe)!r})",
+            f"inversion = run(recipe, {str(path)!r})",
+        )
+        QApplication.clipboard().setText("\n".join([*lines, ""]))
+        show_info("Copied Python that makes this result")
 
     @notify_errors
     def repeat(self) -> None:
