@@ -303,10 +303,11 @@ class Plot(QWidget):
         axes = self._fresh_axes(rows)
         with _plain_style():
             draw(axes)
-        for legend in filter(None, (each.get_legend() for each in axes)):
+        of_axes = (each.get_legend() for each in axes)
+        for legend in filter(None, (*self.figure.legends, *of_axes)):
             legend.get_frame().set(facecolor=self.paper, edgecolor=self.ink)
             for text in legend.get_texts():
-                text.set(color=self.ink, fontsize=8)
+                text.set(color=self.ink, fontsize=7)
         self._canvas.draw_idle()
 
     def _make_canvas(self) -> None:
@@ -378,5 +379,5 @@ class ObjectiveCurve(Plot):
         axis.set_yscale("log")
         axis.set_ylabel("objective")
         axis.set_xlabel("step")
-        above: Any = {"loc": "lower center", "bbox_to_anchor": (0.5, 1)}
-        axis.legend(ncols=3, frameon=False, **above)
+        compact: Any = {"ncols": 3, "fontsize": 7, "handlelength": 1.0, "columnspacing": 0.8}
+        self.figure.legend(loc="outside upper center", frameon=False, **compact)

@@ -47,7 +47,8 @@ def draw_profiles(
                 if len(name) > _MAX_NAME_LENGTH:
                     name = f"…{name[1 - _MAX_NAME_LENGTH :]}"
                 axes.plot(distance, profile.values, color=colour, label=name)
-        axes.legend()
+        if len(profiles) > 1:  # of a single one the table shows the name
+            axes.legend()
     averaging = f", {profiles[0].averaging}" if profiles and profiles[0].averaging else ""
     columns[-1].set_xlabel(f"distance ({unit}){averaging}")
 
