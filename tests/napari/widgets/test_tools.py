@@ -40,7 +40,8 @@ def test_a_widget_fits_beside_the_canvas(
     for size in ((1280, 800), (2560, 1440)):
         window.window._qt_window.resize(*size)
         qtbot.wait(30)
-        assert widget.width() >= widget.minimumSizeHint().width()
+        fits = widget.minimumSizeHint().width
+        qtbot.waitUntil(lambda: widget.width() >= fits(), timeout=PATIENCE)  # noqa: B023
         bottom = widget.mapTo(window.window._qt_window, widget.rect().bottomLeft()).y()
         assert bottom <= size[1]
 
