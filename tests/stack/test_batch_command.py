@@ -27,7 +27,7 @@ from napari_shadowinv import InversionOptions, invert, read, synthetic_image
 from napari_shadowinv.cli._batch import _Printer
 from napari_shadowinv.cli._terminal import progress_bars
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.facts import Level, Verdict
+from napari_shadowinv.facts import Level, Verdict, percent
 from napari_shadowinv.io import store_writing
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.provenance import Provenance
@@ -225,7 +225,7 @@ def test_a_table_of_all_shots_is_exported_as_csv(night, folder):
     store = read("n.shadowinv.zarr")
     assert float(rows[3]["image_residual"]) == float(store.image_residual[3])
     status = shadowinv("info", "n.shadowinv.zarr", "--all").output
-    assert f"{float(store.image_residual[3]):.2%}" in flat(status)
+    assert percent(float(store.image_residual[3])) in flat(status)
     largest = np.hypot(*store.displacement.values[3]).max()
     assert float(rows[3]["displacement_peak (px)"]) == pytest.approx(largest, rel=1e-6)
 

@@ -30,7 +30,7 @@ def site_column(monkeypatch) -> ShotColumn:
         kind=int,
         stores=(INVERSIONS,),
         value=lambda inversion: len(inversion.cells.sites),
-        format="04d",
+        show="{:04d}".format,
     )
     monkeypatch.setattr(store_columns, "COLUMNS", (*COLUMNS, column))
     return column

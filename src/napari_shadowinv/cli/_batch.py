@@ -328,7 +328,7 @@ def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[T
     is_damaged = bool(store.damage.shots or store.damage.files)
     if not every:
         return tables, is_damaged
-    listed = _column_table(store, [column for column in store.columns if column.format])
+    listed = _column_table(store, [column for column in store.columns if column.show])
     # A column of the table above would leave them a few letters a line.
     notes: Rows = [(f"shot {index}", text) for index, _, _, text in _troubles(store)]
     tables += [listed, *([two_columns("Reasons and warnings", notes)] if notes else [])]

@@ -2,7 +2,7 @@
 
 A column is described once. Who reads a store gets an array of each of its columns, ``shadowinv
 export --format csv`` writes them all, ``shadowinv info --all`` and the window of a stack list those
-with a format. A store itself holds them in the reports of its shots.
+that have a function to `show` them. A store itself holds them in the reports of its shots.
 
 - add a column: one entry of `COLUMNS`
 - the columns of a kind of stores: `columns_of`; their values from a result: `column_values`
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._typing import AnyArray
+from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.units import PIXEL, display_unit
 
 # Kinds of stores
@@ -41,7 +42,7 @@ class ShotColumn:
     # Returns the value of an `Inversion` or a `Fit`, None if this result has none. Without it, the
     # value comes from the run.
     value: Callable[[Any], Any] | None = None
-    format: str = ""  # specification in tables for people, which omit columns without one
+    show: Callable[[Any], str] | None = None  # in tables for people, which omit columns without it
     width: int = 0  # least number of characters of a table's column
 
     def __post_init__(self) -> None:
@@ -65,7 +66,7 @@ class ShotColumn:
 
     def text(self, report: Mapping[str, Any]) -> str:
         """Return the value from a shot's report as text, empty without a value."""
-        return format(report[self.key], self.format) if self.key in report else ""
+        return self.show(report[self.key]) if self.show and self.key in report else ""
 
 
 _of_inversions = partial(ShotColumn, stores=(INVERSIONS, ROWS))
@@ -90,7 +91,7 @@ COLUMNS: tuple[ShotColumn, ...] = (
         "Whether the field may be believed",
         kind=str,
         value=lambda result: str(result.verdict),
-        format="s",
+        show=str,
         width=len("determined"),  # not broken into letters
     ),
     ShotColumn(
@@ -104,14 +105,14 @@ COLUMNS: tuple[ShotColumn, ...] = (
         "Largest χ² of the shot's images",
         title="χ²",
         value=lambda fit: float(fit.chi2.max()),
-        format=".3g",
+        show="{:.3g}".format,
     ),
     _of_fits(
         "folded",
         "Share of the pixels whose rays have crossed",
         title="crossed",
         value=attrgetter("folded"),
-        format=".1%",
+        show=percent,
     ),
     ShotColumn(
         "total_error",
@@ -124,7 +125,7 @@ COLUMNS: tuple[ShotColumn, ...] = (
         "Largest part of the error, as a share of the displacement",
         kind=str,
         value=attrgetter("limited_by"),
-        format="s",
+        show=str,
         width=len("beam 12 %"),
     ),
     ShotColumn(
@@ -148,7 +149,7 @@ COLUMNS: tuple[ShotColumn, ...] = (
         "image_residual",
         "Image minus re-projection, r.m.s. relative to the mean",
         value=attrgetter("report.image_residual"),
-        format=".2%",
+        show=percent,
     ),
     _of_inversions(
         "noise_error",
@@ -183,7 +184,7 @@ def _beam_column(setup_kind: str) -> ShotColumn:
         unit=quantity.unit,
         stores=(ROWS,),
         value=lambda inversion: inversion.setup and inversion.setup.beam_value,
-        format="g",
+        show="{:g}".format,
     )
 
 

@@ -43,7 +43,7 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import to_figures
+from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.setup import Setup, bin_setup
 from napari_shadowinv.preprocessing import pixels
@@ -534,7 +534,7 @@ def uniform_warnings(
         return ()
     text = (
         f"the source is assumed uniform, but a point source {setup.source_object_distance:.3g} m "
-        f"from the object lights this image unevenly, by {fall:.1%} between brightest and "
+        f"from the object lights this image unevenly, by {percent(fall)} between brightest and "
         "dimmest pixel: if yours emits isotropically, choose the source 'isotropic'"
     )
     return (Caution("source", text),)

@@ -34,6 +34,7 @@ from scipy import ndimage
 from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, order_by_value
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.facts import percent
 from napari_shadowinv.preprocessing.pixels import LEAST_LIGHT, complete_blocks, nonnegative_fit
 
 _WINDOW_PX = 4  # side of the squares in which noise is measured
@@ -275,9 +276,9 @@ def mask_dark(
     if not is_recorded:
         where, remedy = "the image up to its border", f"{remedy}, or the recorded source"
     text = (
-        f"pixels without light: {int(dark.sum()):,} ({dark.mean():.1%}) are dark in {where}, as at "
-        "the rim of a window or behind a beam stop; they were masked, because their noise looks "
-        f"like a field, and the field there is only a smooth continuation: {remedy}"
+        f"pixels without light: {int(dark.sum()):,} ({percent(dark.mean())}) are dark in {where}, "
+        "as at the rim of a window or behind a beam stop; they were masked, because their noise "
+        f"looks like a field, and the field there is only a smooth continuation: {remedy}"
     )
     return usable & ~dark, [Caution("unlit", text)]
 
@@ -386,17 +387,17 @@ def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
     if dark := dark_level(list(planes.values())):
         yield Caution(
             "dark-level",
-            f"dark level: the noise of the image vanishes at {dark:.0%} of its mean instead of at "
-            "zero, so the detector's dark level seems to be left in it: the field comes out too "
-            "weak, by this share or more; subtract it from image and source",
+            f"dark level: the noise of the image vanishes at {percent(dark)} of its mean instead "
+            "of at zero, so the detector's dark level seems to be left in it: the field comes out "
+            "too weak, by this share or more; subtract it from image and source",
         )
     for name, plane in planes.items():
         if (share := plane.saturated) > 0:
             yield Caution(
                 "saturation",
-                f"saturation: {share:.2%} of the {name}'s pixels are at its maximum: bright lines "
-                "are cut off there, and the field around them is too weak; mask these pixels, or "
-                "record with less exposure",
+                f"saturation: {percent(share)} of the {name}'s pixels are at its maximum: bright "
+                "lines are cut off there, and the field around them is too weak; mask these "
+                "pixels, or record with less exposure",
             )
         if count := int(plane.stray.sum()):
             yield Caution(

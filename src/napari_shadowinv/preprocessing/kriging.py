@@ -24,6 +24,7 @@ from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.options import BeamComponents, BeamPrior
 from napari_shadowinv.preprocessing.pixels import beam_pixels, complete_blocks, with_flux_of
 
@@ -149,8 +150,8 @@ class _Blocks:
             bare &= means > dimmest * means[bare].mean()
         if bare.sum() < _least_blocks(bare):
             raise InputError(
-                f"{bare.mean():.0%} of the image is free of the object, too little to predict the "
-                "beam behind it: mask less, or choose another estimate"
+                f"{percent(bare.mean())} of the image is free of the object, too little to predict "
+                "the beam behind it: mask less, or choose another estimate"
             )
         level = float(means[bare].mean())
         logs = np.log(np.where(bare, means / level, 1.0))

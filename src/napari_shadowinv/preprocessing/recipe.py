@@ -22,6 +22,7 @@ from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import percent
 from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.estimates import Estimate
@@ -223,7 +224,7 @@ def check_masks(mask: BoolArray | None, bare: BoolArray | None) -> None:
     hidden, visible = hidden[objects], visible[objects]
     if (visible < _MIN_VISIBLE_SHARE * hidden).all():
         raise InputError(
-            f"the mask hides {1 - visible.sum() / hidden.sum():.0%} of what the source mask "
+            f"the mask hides {percent(1 - visible.sum() / hidden.sum())} of what the source mask "
             "hides, so the object would be excluded from the inversion: use the mask for "
             "unusable pixels only and the source mask for the object; if the object itself is "
             "unusable, leave the source mask out, as estimates ignore masked pixels anyway"
