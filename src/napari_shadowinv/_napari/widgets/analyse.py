@@ -86,6 +86,7 @@ class Analyse(qt.Docked):
         controls = (forms.labelled("Line", lines), self.layers, width)
         results = (self.hint, self.plot, self.measures, self.export, self.problem)
         page, self.products = QtWidgets.QWidget(), products.ProductForm(self.viewer)
+        self.products.setMinimumWidth(0)  # that of the window counts
         self.tabs = QtWidgets.QTabWidget()
         self.tabs.addTab(page, "Layers along a line")
         self.tabs.addTab(self.products, "Products of a result")
