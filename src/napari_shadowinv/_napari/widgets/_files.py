@@ -135,8 +135,8 @@ class RecipeButton(QPushButton):
         tool = self._tool
         image = tool.chosen_image()
         path = None if image is None else about.metadata_of(image).get("path") or image.source.path
-        if not path:
-            raise InputError("Python reads the image from its file: open one, or save the image")
+        if not path or tool.shots.is_stack:
+            raise InputError("Python reads a single image from its file: open one, or save it")
         recipe = tool.recipe_to_save()
         masks = (each.usable(image) for each in tool.mask_pickers.values() if not each.isHidden())
         is_drawn = any(mask is not None for mask in masks)
