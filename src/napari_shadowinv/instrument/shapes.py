@@ -105,13 +105,10 @@ class Shapes:
         along_y, along_x = self.modes
         strengths = np.zeros((len(along_y), len(along_x)))
         strengths[tuple(self.places)] = of_modes
-        # Products of matrices have the same bits on any number of threads.
-        total = along_y.T @ (strengths @ along_x) - np.einsum("k,k", self.means, of_modes)
-        if self.envelope is not None:
-            total *= self.envelope
-        if len(of_planes):
-            total += np.einsum("k,kyx->yx", of_planes, self.planes)
-        return np.asarray(total)
+        lines = np.einsum("nm,mx->nx", strengths, along_x)
+        total = np.einsum("ny,nx->yx", along_y, lines) - np.einsum("k,k", self.means, of_modes)
+        total = total if self.envelope is None else self.envelope * total
+        return np.asarray(total + np.einsum("k,kyx->yx", of_planes, self.planes))
 
     def pull(self, image: FloatArray) -> FloatArray:
         """Return the transpose of `sum` times an image."""
@@ -169,7 +166,8 @@ class Shapes:
 
     def _along(self, image: FloatArray, modes: tuple[FloatArray, FloatArray]) -> FloatArray:
         along_y, along_x = modes
-        table = (along_y @ image) @ along_x.T
+        lines = np.einsum("ny,yx->nx", along_y, image)
+        table = np.einsum("nx,mx->nm", lines, along_x)
         return np.asarray(table[tuple(self.places)])
 
 
