@@ -51,6 +51,26 @@ def test_measure_next_of_noise_is_an_average(image):
     assert errors.measure_next(1.1 * errors.share) == ""
 
 
+@pytest.mark.parametrize("share_wanted", [0.05, 0.3, 0.45])
+def test_measure_next_promises_no_less_than_the_edge_leaves(make_inversion, share_wanted):
+    """A better beam uncovers the error at the edge that a worse one hides."""
+    solved = make_inversion((48, 64))
+    rms = solved.errors.rms
+    quiet = dict.fromkeys(("noise", "discretisation"), ErrorEstimate(0.0, 0.0))
+    hiding = {"edge": ErrorEstimate(0.4 * rms, 0.0), "beam": ErrorEstimate(0.5 * rms, 0.0)}
+    errors = dataclasses.replace(solved.errors, effects={}, beam_variation=0.05, **quiet, **hiding)
+    assert "edge" not in errors.parts
+    text = errors.measure_next(share_wanted)
+    beam = 20 * stated_deviations(text)["beam"]
+    better = dataclasses.replace(errors, beam=errors.beam.times(beam))
+    if "a larger field" in text:
+        assert better.share > share_wanted
+        edge = errors.edge.times(share_wanted / 0.4)
+        better = dataclasses.replace(better, edge=edge)
+    assert better.share <= share_wanted * (1 + 1e-9)
+    assert text.endswith(f" for errors of {better.share_text}")
+
+
 def test_an_edge_that_the_assumed_beam_partly_explains_is_named_once(make_inversion):
     """The error at the edge counts what exceeds the others, with what was assumed among them."""
     solved = make_inversion((48, 64))

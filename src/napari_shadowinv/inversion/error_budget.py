@@ -350,23 +350,31 @@ class ErrorBudget:
         """
         if not self.rms > 0:
             return ""
-        squares = {name: error.rms**2 for name, error in self.parts.items()}
+        parts = dict(self.parts)
+        # Smaller errors elsewhere do not reduce the edge's, which they hide.
+        edge = 0.0 if self.edge is None else self.edge.rms**2
         wanted, rest = (share * self.rms) ** 2, self.total.rms**2
+        if "edge" in parts:
+            rest -= parts.pop("edge").rms ** 2
+        squares = {name: error.rms**2 for name, error in parts.items()}
         large: list[str] = []
         for name, square in squares.items():
             if rest <= wanted * (1 - _REDUCED_SHARE if large else 1):
                 break
             large.append(name)
             rest -= square
-        if not large:
-            return ""
         statements = []
         for name in large:
             allowed = math.sqrt(max(wanted - rest, 0) / len(large) / squares[name])
             statement, reached = self._statement(name, min(allowed, 1.0))
             statements.append(statement)
             squares[name] *= reached**2
-        total = math.sqrt(sum(squares.values()))
+        if edge > wanted:
+            statements.append(_REMEDIES["edge"])
+            edge = wanted
+        if not statements:
+            return ""
+        total = math.sqrt(max(sum(squares.values()), edge))
         *others, last = statements
         listed = f"{', '.join(others)} and {last}" if others else last
         return f"{listed} for errors of {share_of(total, self.rms)}"
