@@ -322,7 +322,7 @@ def test_the_verdict_of_a_fit_is_on_top_in_its_colour(make_fit: MakeFit) -> None
         ]
         assert fit.explanation in line.get_text()
         colours.append(line.get_color())
-    assert colours == ["#1b6e3c", "#b00020"]
+    assert colours == ["#1b6e3c", "#b35c00"]
 
 
 def test_a_fit_without_error_bars_or_misfit_is_no_error(make_fit: MakeFit) -> None:

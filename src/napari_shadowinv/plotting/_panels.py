@@ -26,12 +26,12 @@ _CUT_COLOURS = ("#1f9bff", "#18b368")
 _REFERENCE_STYLE: dict[str, Any] = {"color": "black", "linewidth": 2.4, "alpha": 0.45}
 
 
-ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR = "#b00020", "#1b6e3c", "0.3"
+ALARM_COLOUR, GOOD_COLOUR, QUIET_COLOUR = "#b35c00", "#1b6e3c", "0.3"
 LEVEL_COLOURS = {
     Level.SOUND: GOOD_COLOUR,
     Level.CONDITIONAL: "#1f4e79",
     Level.DOUBTFUL: ALARM_COLOUR,
-    Level.FAILED: ALARM_COLOUR,
+    Level.FAILED: "#b00020",
 }
 _STYLE: Any = {
     "font.family": ["DejaVu Sans"],

@@ -137,7 +137,7 @@ def _draw_draws(axes: Axes, plan: ExperimentPlan, ink: str) -> None:
     totals = [100 * shot.total for shot in plan.shots]
     axes.plot(numbers, totals, "_", color=ink, markersize=7, label="reported")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("draw (blue: depends on the beam, red: doubtful)")
+    axes.set_xlabel("draw (blue: depends on the beam, orange: doubtful)")
     axes.set_ylabel("error of the field (%)")
 
 
