@@ -331,6 +331,7 @@ def coarser(scene: Scene, factor: int) -> Scene:
         1, variance, out=np.zeros_like(variance), where=(count >= factor**2 / 2) & (variance > 0)
     )
     fiducials = scene.fiducials
+    in_pixels = np.array([float(factor) ** (6 - 2 * power) for power in POWERS])
     return replace(
         scene,
         images=images,
@@ -338,7 +339,7 @@ def coarser(scene: Scene, factor: int) -> Scene:
         beams=complete_block_means(scene.beams, factor),
         psf=[_narrower(width, factor) for width in scene.psf],
         # What is held against a potential is the same in all pixels.
-        smoothness=scene.smoothness * smoothness_in_pixels(factor),
+        smoothness=scene.smoothness * in_pixels,
         tie=scene.tie * factor**4,
         decay=scene.decay / factor,
         pad=scene.pad // factor,
@@ -346,11 +347,6 @@ def coarser(scene: Scene, factor: int) -> Scene:
         imperfect=scene.imperfect.coarsen(factor),
         bin=scene.bin * factor,
     )
-
-
-def smoothness_in_pixels(factor: int) -> FloatArray:
-    """Return the factors of λ and κ in larger pixels."""
-    return np.array([float(factor) ** (6 - 2 * power) for power in POWERS])
 
 
 def _narrower(width: float | FloatArray, factor: int) -> float:

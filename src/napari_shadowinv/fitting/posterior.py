@@ -114,33 +114,29 @@ class Posterior:
         roots = np.sqrt(self.scene.weights)
         return np.divide(1, roots, out=np.zeros_like(roots), where=roots > 0)
 
-    def likely_smoothness(
-        self, *, tolerance: float = 0.05, overshoot: float = 1.7, most_change: float = 15.0
-    ) -> tuple[FloatArray, float]:
-        """Return λ and κ nearer to the likeliest, shape (M, 2), and by how much they have changed.
+    def smoothness_ratios(
+        self, signs: FloatArray, *, tolerance: float = 0.05, most: float = 15.0
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return how much larger likely λ and κ are, logarithms (M, 2), and what data determine.
 
         Each holds as much against the field as there are coefficients that the data determine and
-        it would. The change is the logarithm's, weighted with that number. The step is `overshoot`
-        times as long, since that alone approaches its end too slowly, and before that limited to
-        a factor of `most_change`.
+        it would: their number is returned, too. It follows from random `signs` (M, …) of the
+        coefficients. The ratios are limited to a factor of `most`.
         """
-        prior, smoothness = self.scene.prior, self.scene.smoothness
-        determined, energy = np.empty(smoothness.shape), np.empty(smoothness.shape)
-        for m in range(len(smoothness)):
+        prior = self.scene.prior
+        determined, energy = np.empty((2, *self.scene.smoothness.shape))
+        for m, sign in enumerate(signs):
             each, roughness = prior.of_rough[m], prior.roughness[m]
-            signs = self._rng.choice([-1.0, 1.0], roughness.shape)
             slope = self._unknowns.zeros()
-            slope.potentials[m] = prior.root_of_smoothness(m, signs)
+            slope.potentials[m] = prior.root_of_smoothness(m, sign)
             solved = self._change(slope, tolerance)
-            open_part = np.sqrt(roughness) * signs * dctn(solved.potentials[m], norm="ortho")
+            open_part = np.sqrt(roughness) * sign * dctn(solved.potentials[m], norm="ortho")
             shares = np.divide(each, roughness, out=np.zeros_like(each), where=roughness > 0)
             determined[m] = np.maximum((shares * (1 - open_part)).sum(axis=(1, 2)), 1e-3)
             waves = dctn(self._unknowns.potentials[m], norm="ortho")
             energy[m] = (each * waves**2).sum(axis=(1, 2))
-        ratio = np.clip(determined / np.maximum(energy, 1e-300), 1 / most_change, most_change)
-        change = np.log(ratio) * overshoot
-        weights = determined / determined.sum(axis=1, keepdims=True)
-        return smoothness * np.exp(change), float((np.abs(change) * weights).sum(axis=1).max())
+        ratios = np.clip(determined / np.maximum(energy, 1e-300), 1 / most, most)
+        return np.log(ratios), determined
 
     def draw_samples(
         self,

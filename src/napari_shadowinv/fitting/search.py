@@ -15,14 +15,7 @@ from napari_shadowinv._system.progress import OnStep, run_in_parallel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
-from napari_shadowinv.fitting.descent import (
-    NewtonSteps,
-    coarser,
-    descend,
-    finer,
-    settle,
-    smoothness_in_pixels,
-)
+from napari_shadowinv.fitting.descent import NewtonSteps, coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.posterior import Posterior, Response
 from napari_shadowinv.fitting.preconditioner import Preconditioner
@@ -252,22 +245,32 @@ def _likely_smoothness(
     rng: np.random.Generator,
     on_step: OnStep,
     *,
-    rounds: int = 6,
-    settled: float = 0.25,
+    rounds: int = 8,
+    settled: float = 0.05,
+    slope: float = 0.6,
+    slopes: tuple[float, float] = (0.4, 3.0),
 ) -> tuple[FloatArray, Minimum]:
     """Return λ and κ nearer to the likeliest, and the minimum that moves with them.
 
-    They have `settled` where they change by less, as a share. The minimum moves so little that the
-    scene to first order serves in all rounds.
+    They have `settled` where their logarithms change by less, weighted with what they determine.
+    How fast the ratios to the likeliest fall with them, about the `slope`, follows from two rounds,
+    within the limits of `slopes`. The minimum moves so little that the scene to first order serves
+    in all rounds; so do the random signs, for rounds that can be compared.
     """
     linear = end.coarsen(scene).linear(end.unknowns)
+    signs = rng.choice([-1.0, 1.0], end.unknowns.potentials.shape)
+    falls = np.full(scene.smoothness.shape, slope)
+    before, step = np.zeros_like(falls), np.zeros_like(falls)
     for _ in range(rounds):
         linear = replace(linear, scene=end.coarsen(scene))
         report = partial(on_step, "smoothness", end.value)
         posterior = Posterior(linear.scene, end.unknowns, rng, report, end.modes, linear)
-        estimate, change = posterior.likely_smoothness()
-        smoothness = estimate / smoothness_in_pixels(end.bin)
-        if change < settled:
+        ratios, determined = posterior.smoothness_ratios(signs)
+        np.divide(before - ratios, step, out=falls, where=step != 0)
+        before, step = ratios, ratios / np.clip(falls, *slopes)
+        smoothness = scene.smoothness * np.exp(step)
+        weights = determined / determined.sum(axis=1, keepdims=True)
+        if (np.abs(step) * weights).sum(axis=1).max() < settled:
             break
         scene = replace(scene, smoothness=smoothness)
         end = settle_minimum(scene, end, on_step, linear=linear, limits=_ROUGH)

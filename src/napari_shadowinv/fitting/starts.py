@@ -7,13 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv._system.progress import OnStep, ShouldStop
+from napari_shadowinv._system.progress import OnStep, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.search import Stages, Start
-from napari_shadowinv.inversion import invert
+from napari_shadowinv.inversion import plan_sites
+from napari_shadowinv.inversion.normalise import prepare
+from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.transport.solvers import Target, solve
 
 
 def collect_starts(
@@ -76,9 +79,12 @@ def _transport_potential(
         threads=scene.threads,
         tolerance=0.05,
     )
+    # The potential alone: a start needs no errors of it.
     try:
-        return invert(
-            image, source=beam, mask=used, options=options, should_stop=should_stop
-        ).potential
+        prepared = prepare(image, beam, options, used)
+        plan = plan_sites(prepared.source, options, mask=used, should_stop=should_stop)
+        target = Target.of(prepared.floored_image, options)
+        solved = solve(plan.levels, target, Reporter(None, should_stop))
     except InputError:
         return None
+    return read_out(solved[-1], options)[0]
