@@ -218,7 +218,7 @@ def _explore(
 def _find_pattern(
     data: FitData, minima: _Minima, refined: FineMinimum, summary: PosteriorSummary, on_step: OnStep
 ) -> Pattern:
-    pattern = find_pattern(data, refined.scene, refined.unknowns)
+    pattern = find_pattern(data, refined)
     if pattern.lacks_counts() and summary.posterior is not None:
         posterior = summary.posterior.reporting(lambda: on_step("samples", refined.objective))
         absorbed = posterior.count_determined(np.random.default_rng(data.options.seed))

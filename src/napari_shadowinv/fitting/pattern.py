@@ -23,8 +23,13 @@ from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
-from napari_shadowinv.fitting.search import SMOOTHNESS_RATIO, Minimum, posterior_of, settle_minimum
-from napari_shadowinv.fitting.unknowns import Unknowns
+from napari_shadowinv.fitting.search import (
+    SMOOTHNESS_RATIO,
+    FineMinimum,
+    Minimum,
+    posterior_of,
+    settle_minimum,
+)
 
 
 def pattern_strength(
@@ -224,17 +229,15 @@ class Pattern:
         return self.missing_counts > deviations * self.counts_deviation
 
 
-def find_pattern(
-    data: FitData, scene: Scene, unknowns: Unknowns, least_counts: float = 5.0
-) -> Pattern:
-    """Test the residuals of all images for structure, and for the noise of counts.
+def find_pattern(data: FitData, refined: FineMinimum, least_counts: float = 5.0) -> Pattern:
+    """Test the residuals of a fit for structure, and for the noise of counts.
 
     That is where the model has `least_counts` in a pixel. The noise is as correlated as it is
     stated, else as it is measured in the residuals and before.
     """
     height, width = data.size
+    scene, seen = refined.scene, refined.seen
     roots = np.sqrt(scene.weights[:, :height, :width])
-    seen = scene.model(unknowns)
     models = seen[:, :height, :width]
     residuals = roots * (scene.images[:, :height, :width] - models)
     used = roots > 0

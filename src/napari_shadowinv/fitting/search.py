@@ -378,10 +378,14 @@ def settle_minimum(
 
 
 class FineMinimum(NamedTuple):
-    """Where a descent in recorded pixels has ended, and whether within the allowed steps."""
+    """Where a descent in recorded pixels has ended, and whether within the allowed steps.
+
+    The images of its model, (L, H', W'), are `seen`.
+    """
 
     scene: Scene
     unknowns: Unknowns
+    seen: FloatArray
     objective: float
     iterations: int
     converged: bool
@@ -420,8 +424,9 @@ def refine_minimum(
             modes=modes,
         )
         steps += taken
-        is_explained = not denser or scene.chi2(scene.model(unknowns)).max() < explained
+        seen = scene.model(unknowns)
+        is_explained = not denser or scene.chi2(seen).max() < explained
         if steps >= options.max_iterations or (ended and is_explained):
-            return FineMinimum(scene, unknowns, value, steps, ended)
+            return FineMinimum(scene, unknowns, seen, value, steps, ended)
         if not is_explained:
             scene = replace(scene, spacing=denser.pop(0))

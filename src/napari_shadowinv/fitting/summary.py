@@ -102,8 +102,7 @@ def summarise(
     units = data.units[:, None, None]
     used = scene.weights[:, :height, :width] > 0
     images = scene.images[:, :height, :width] * units
-    seen = scene.model(unknowns)
-    model = seen[:, :height, :width] * units
+    model = refined.seen[:, :height, :width] * units
     brightness = np.exp(unknowns.brightness)
     beams = scene.beam(unknowns)[:, :height, :width] * units * brightness[:, None, None]
     displacements = scene.displacement(unknowns)[..., :height, :width].copy()
@@ -134,7 +133,7 @@ def summarise(
         frames=unknowns.frames,
         reprojection=model,
         residual=np.where(used, images - model, 0.0),
-        chi2=data.noise.relative_chi2(scene.chi2(seen)),
+        chi2=data.noise.relative_chi2(scene.chi2(refined.seen)),
         basins=basins,
         folded=float((jacobian < 0).mean()),
         assessment=Assessment(Verdict.UNCERTAIN, ""),
