@@ -4,7 +4,7 @@ A form holds what the user stated, and the model reads it; grey text shows the d
 
 - the entry of a field: `Entry`; the entries of a model: `ModelForm`
 - one of several models: `ModelPicker`; a list of them: `StepsSection`
-- files: `PathEdit`, `TomlButtons`, `save_text`
+- files: `PathEdit`, `TomlButtons`
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from superqt import QCollapsible
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import read_toml, replacing
+from napari_shadowinv.io import read_toml
 from napari_shadowinv.physics.beam import number_in_unit, text_in_unit, unit_in_title
 from napari_shadowinv.preprocessing import STEPS, Step
 
@@ -493,15 +493,6 @@ class ModelPicker(QtWidgets.QWidget):
         return self._forms.get(kind)
 
 
-def save_text(text: str, name: str | Path, suffix: str) -> Path:
-    """Write a file; a name without a suffix gets one, and then replaces no file."""
-    entered = Path(name)
-    path = entered if entered.suffix else entered.with_suffix(suffix)
-    with replacing(path, overwrite=path == entered) as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
-    return path
-
-
 class TomlButtons(QtWidgets.QWidget):
     """Buttons for TOML files; `load` gets entries and path, `values` returns entries to save."""
 
@@ -531,11 +522,9 @@ class TomlButtons(QtWidgets.QWidget):
         values = self._values()
         if not values:
             raise InputError(f"there is no {self._subject} to save: select one first")
-        path, _ = QtWidgets.QFileDialog.getSaveFileName(
-            self, f"Save {self._subject}", f"{self._subject}.toml", TOML
-        )
-        if path:
-            save_text(tomli_w.dumps(values), path, ".toml")
+        title, proposal = f"Save {self._subject}", f"{self._subject}.toml"
+        if path := qt.ask_file(self, title, proposal, TOML):
+            qt.write_text(path, tomli_w.dumps(values))
 
 
 class StepForm(QWidget):

@@ -108,6 +108,23 @@ def assert_it_fits(window: Any, qtbot: Any) -> Callable[[Any], None]:
     return check
 
 
+@pytest.fixture
+def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Answer the dialogs for a file with a path and the first filter, and whether to replace it."""
+    from qtpy.QtWidgets import QFileDialog, QMessageBox
+
+    def answer(path: Path | str, replace: bool = False) -> None:
+        def ask(parent: Any, title: str, proposal: str, filters: str, **_: Any) -> tuple[str, str]:
+            return str(path), filters.split(";;")[0]
+
+        button = QMessageBox.StandardButton.Yes if replace else QMessageBox.StandardButton.No
+        monkeypatch.setattr(QFileDialog, "getSaveFileName", ask)
+        monkeypatch.setattr(QFileDialog, "getOpenFileName", ask)
+        monkeypatch.setattr(QMessageBox, "question", lambda *_: button)
+
+    return answer
+
+
 def running_threads() -> list[Any]:
     import threading
 

@@ -16,12 +16,11 @@ from pydantic import BaseModel
 from qtpy.QtWidgets import QFileDialog, QWidget
 
 from helpers.forms import enter
-from napari_shadowinv import InputError, Instrument, InversionOptions, OpticalSetup, ProtonSetup
-from napari_shadowinv._napari.form import ModelForm, ModelPicker, kinds_of, save_text
+from napari_shadowinv import InputError, Instrument, InversionOptions, ProtonSetup
+from napari_shadowinv._napari.form import ModelForm, ModelPicker, kinds_of
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._qt import StateKeeper
 from napari_shadowinv._system.validation import labels_of, validate
-from napari_shadowinv.io import read_toml
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.phantom_models import PHANTOMS
 from napari_shadowinv.physics.phantoms import paper_setup, wakefield_setup
@@ -169,24 +168,6 @@ def test_an_instrument_is_shown_by_what_is_stated(qtbot: Any) -> None:
         form.model()
 
 
-@pytest.mark.parametrize("name", ["proton_setup", "optical_setup"])
-def test_the_command_line_reads_a_saved_setup(
-    name: str, request: pytest.FixtureRequest, qtbot: Any, tmp_path: Path
-) -> None:
-    setup = request.getfixturevalue(name)
-    picker = SetupPicker()
-    qtbot.addWidget(picker)
-    picker.show_setup(setup.model_dump())
-    path = save_text(tomli_w.dumps(picker._to_save()), tmp_path / "setup", ".toml")
-    assert path.suffix == ".toml"
-    assert setup_from(path) == setup
-    picker.picker.set_kind("none")
-    picker.load(read_toml(path), str(path))
-    assert picker.setup() == setup
-    if isinstance(setup, OpticalSetup):
-        assert math.isinf(picker.setup().source_object_distance)
-
-
 def test_choices_for_recipes_have_a_row_while_they_are_stated(qtbot: Any) -> None:
     form = ModelForm(InversionOptions)
     qtbot.addWidget(form)
@@ -197,38 +178,28 @@ def test_choices_for_recipes_have_a_row_while_they_are_stated(qtbot: Any) -> Non
         assert form.model() == InversionOptions(**values)
 
 
-def test_a_file_that_the_dialog_did_not_name_is_not_replaced(tmp_path: Path) -> None:
-    for number, name in enumerate(("options.toml", "options", "options.toml")):
-        if name == "options":
-            with pytest.raises(OSError, match="exists"):
-                save_text(f"seed = {number}", tmp_path / name, ".toml")
-        else:
-            save_text(f"seed = {number}", tmp_path / name, ".toml")
-    assert read_toml(tmp_path / "options.toml") == {"seed": 2}
-
-
-def test_the_buttons_save_and_load(
-    qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, messages: list[str],
-    proton_setup: ProtonSetup,
-) -> None:  # fmt: skip
-    picker = SetupPicker()
+@pytest.mark.parametrize("name", ["proton_setup", "optical_setup"])
+def test_buttons_save_and_load_what_the_command_reads(
+    name: str, request: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
+) -> None:
+    setup, picker = request.getfixturevalue(name), SetupPicker()
     qtbot.addWidget(picker)
-    path = str(tmp_path / "setup.toml")
-    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (path, ""))
-    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (path, ""))
+    path = tmp_path / "setup.toml"
+    choose(path)
     picker.files.save_button.click()
     assert len(messages) == 1
     assert "no setup to save" in messages[0]
-    picker.show_setup(proton_setup.model_dump())
+    picker.show_setup(setup.model_dump())
     picker.files.save_button.click()
+    assert setup_from(path) == setup
     picker.picker.set_kind("none")
     picker.files.load_button.click()
-    assert picker.setup() == proton_setup
-    Path(path).write_text("kind = 'proton'\nenergie = 3")
+    assert picker.setup() == setup
+    path.write_text("kind = 'proton'\nenergie = 3")
     picker.files.load_button.click()
     assert len(messages) == 2
     assert "energie" in messages[1]
-    assert picker.setup() == proton_setup
+    assert picker.setup() == setup
 
 
 def test_a_file_is_chosen_for_a_number_that_may_be_one(

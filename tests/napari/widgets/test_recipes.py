@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from napari.components import ViewerModel
-from qtpy.QtWidgets import QApplication, QFileDialog
+from qtpy.QtWidgets import QApplication
 
 from helpers.command_line import undrawn
 from helpers.forms import enter
@@ -504,12 +504,8 @@ def test_what_cannot_be_loaded_or_saved_is_one_sentence_and_changes_nothing(
     assert (tmp_path / "new_mask.png").read_text() == "somebody's"
 
 
-def test_the_menu_asks_for_a_file(
-    opened: Any, image: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = str(tmp_path / "how.toml")
-    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (path, ""))
-    monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (path, ""))
+def test_the_menu_asks_for_a_file(opened: Any, image: Any, tmp_path: Path, choose: Any) -> None:
+    choose(tmp_path / "how.toml")
     tool = opened()
     load, save, *_ = tool.recipes.menu().actions()
     assert (load.text(), save.text()) == ("Load recipe…", "Save…")

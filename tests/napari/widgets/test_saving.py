@@ -9,28 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from qtpy.QtWidgets import QFileDialog, QMessageBox
 
 from napari_shadowinv import ProtonSetup, read
 from napari_shadowinv._napari.layer_metadata import metadata_for, result_of, role_of
 from napari_shadowinv.physics.phantoms import paper_setup
 
 PATIENCE = 60_000  # ms
-
-
-@pytest.fixture
-def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    """Answer the dialog of files with a path, and the question about replacing."""
-
-    def answer(path: Path | str, replace: bool = False) -> None:
-        def ask(parent: Any, title: str, proposal: str, filters: str, **_: Any) -> Any:
-            return str(path), filters.split(";;")[0]
-
-        button = QMessageBox.StandardButton.Yes if replace else QMessageBox.StandardButton.No
-        monkeypatch.setattr(QFileDialog, "getSaveFileName", ask)
-        monkeypatch.setattr(QMessageBox, "question", lambda *_: button)
-
-    return answer
 
 
 @pytest.fixture

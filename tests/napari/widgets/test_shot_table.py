@@ -11,7 +11,6 @@ import pytest
 from qtpy.QtCore import Qt
 
 from napari_shadowinv._napari.layer_metadata import role_of
-from napari_shadowinv._napari.widgets import _tables
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read
 from napari_shadowinv.io.store import DONE, FAILED, StackStore
@@ -158,18 +157,13 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:
     assert not tool.store.path.exists()
 
 
-def test_the_rows_are_saved_as_they_are_shown(
-    tool: Any, pack: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_rows_are_saved_as_they_are_shown(tool: Any, pack: Path, choose: Any) -> None:
     write(tool, 0, ENERGY, "6")
     write(tool, 1, GAIN, "0.8")
     use(tool, 2, used=False)
     folder = pack.with_name("other")
     folder.mkdir()
-    chosen = str(folder / "new")
-    monkeypatch.setattr(
-        _tables.QFileDialog, "getSaveFileName", staticmethod(lambda *_: (chosen, ""))
-    )
+    choose(folder / "new")
     tool.shots.table.save_button.click()
     rows = table_rows(folder / "new.csv")
     assert [row.beam.get("energy") for row in rows] == [6.0, None, 30.0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib import rc_context
 from matplotlib.text import Text
-from qtpy.QtWidgets import QFileDialog, QLabel
+from qtpy.QtWidgets import QLabel
 
 from helpers.forms import enter
 from napari_shadowinv._napari.form import PROBLEM_STYLE, ModelPicker
@@ -204,22 +204,16 @@ def test_a_profile_follows_the_line_and_the_layers(window: Any, profile: Any, qt
 
 
 def test_a_profile_is_exported_whole(
-    profile: Any, qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, messages: list[str]
+    profile: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
 ) -> None:
     profile.export.click()
     assert len(messages) == 1
     assert "no profile" in messages[0]
     profile.lines.layer.add_lines(np.array([[10.0, 5.0], [10.0, 45.0]]))
     qtbot.waitUntil(lambda: bool(profile.profiles), timeout=PATIENCE)
-    path = tmp_path / "line.csv"
-    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (str(path), ""))
+    choose(tmp_path / "line")
     profile.export.click()
-    assert path.read_text(encoding="utf-8") == profile.table()
-    monkeypatch.setattr(
-        QFileDialog, "getSaveFileName", lambda *_, **__: (str(tmp_path / "line"), "")
-    )
-    profile.export.click()
-    assert "exists" in messages[-1]
+    assert (tmp_path / "line.csv").read_text(encoding="utf-8") == profile.table()
 
 
 def test_a_line_needs_an_image(window: Any, open_widget: Any, messages: list[str]) -> None:

@@ -24,7 +24,7 @@ from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._layers import new_mask
 from napari_shadowinv._napari.widgets._panels import ToolPanel
-from napari_shadowinv._napari.widgets._qt import may_replace, notify_errors
+from napari_shadowinv._napari.widgets._qt import ask_file, filter_of, notify_errors
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import BoolArray
@@ -125,9 +125,8 @@ class RecipeButton(QPushButton):
             self.load(Path(path))
 
     def _ask_and_save(self) -> None:
-        path, _ = QFileDialog.getSaveFileName(self, "Save recipe", "recipe.toml", TOML)
-        if path:
-            self.save(Path(path))
+        if path := ask_file(self, "Save recipe", "recipe.toml", TOML):
+            self.save(path)
 
     @notify_errors
     def copy(self) -> None:
@@ -185,9 +184,7 @@ class RecipeButton(QPushButton):
     def save(self, path: Path) -> None:
         """Write a recipe, with drawn masks and a source layer as files next to it."""
         tool, image = self._tool, self._tool.chosen_image()
-        # The dialog asks about replacing the entered name only.
-        overwrite = bool(path.suffix) and path.exists()
-        path = path if path.suffix else path.with_suffix(".toml")
+        overwrite = path.exists()  # the dialog has asked
         recipe = tool.recipe_to_save()
         pickers = {key: each for key, each in tool.mask_pickers.items() if not each.isHidden()}
         masks = {key: picker.usable(image) for key, picker in pickers.items()}
@@ -299,8 +296,9 @@ class SaveButton(QPushButton):
     def ask_and_save(self) -> None:
         """Ask for a file and save the content, unless the user cancels."""
         content = self._savable()
-        path = self._ask(content)
-        if path is None or (path.exists() and not may_replace(self, "Save result", path.name)):
+        filters = ";;".join(filter_of(_TITLES[form], form.suffixes) for form in content.formats)
+        path = ask_file(self, "Save result", _file_name(content.name), filters)
+        if path is None:
             return
         write(path, content.content, setup=content.setup, overwrite=True)
         suffix = path.suffix.lower()
@@ -308,23 +306,6 @@ class SaveButton(QPushButton):
         text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
         self._tool.panel.say(text)
         show_info(text)
-
-    def _ask(self, content: Savable) -> Path | None:
-        filters = {f"{_TITLES[form]} (*{form.suffix})": form for form in content.formats}
-        # may_replace asks about the complete name, with its suffix.
-        text, selected_filter = QFileDialog.getSaveFileName(
-            self,
-            "Save result",
-            _file_name(content.name) + content.formats[0].suffix,
-            ";;".join(filters),
-            options=QFileDialog.Option.DontConfirmOverwrite,
-        )
-        if not text:
-            return None
-        path = Path(text).expanduser()
-        if any(path.suffix.lower() in form.suffixes for form in content.formats):
-            return path
-        return path.with_name(path.name + filters.get(selected_filter, content.formats[0]).suffix)
 
 
 class MoreLayersButton(QPushButton):

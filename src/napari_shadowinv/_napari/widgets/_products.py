@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, count
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from napari.utils.notifications import show_info
@@ -40,8 +40,8 @@ from napari_shadowinv.analysis import (
 )
 from napari_shadowinv.analysis.series import shot_times
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import replacing, write
-from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
+from napari_shadowinv.io import write
+from napari_shadowinv.io.formats import FIGURE_SUFFIXES
 from napari_shadowinv.io.store_shots import open_shots
 from napari_shadowinv.physics.beam import number_in_unit
 from napari_shadowinv.physics.units import prefix_for
@@ -304,19 +304,20 @@ class ProductForm(ToolPanel):
 
     @qt.notify_errors
     def _save_figure(self) -> None:
-        if chosen := ask_file(self, "Save figure", "products", FIGURE_SUFFIXES):
+        formats = ";;".join(qt.filter_of(end[1:].upper(), [end]) for end in FIGURE_SUFFIXES)
+        if path := qt.ask_file(self, "Save figure", "products", formats):
             figure = products_figure(self.measured)
-            show_info(f"Wrote {save_figure(chosen.path, figure, overwrite=chosen.overwrite)}")
+            show_info(f"Wrote {save_figure(path, figure, overwrite=True)}")
 
     @qt.notify_errors
     def _save(self) -> None:
         result: Any = self._origin
-        if chosen := ask_file(self, "Save with result", "products", RESULT.suffixes[:1]):
+        if path := qt.ask_file(self, "Save with result", "products", qt.RESULT_FILES):
             content = result.content
             if result.setup is not None and content.setup is None:
                 content = content.in_units(result.setup)
             dataset = add_products(content.to_dataset(), self.measured)
-            show_info(f"Wrote {write(chosen.path, dataset, overwrite=chosen.overwrite)}")
+            show_info(f"Wrote {write(path, dataset, overwrite=True)}")
 
 
 def _is_drawn(kind: type[Product]) -> bool:
@@ -358,36 +359,11 @@ def _seconds(times: str, shots: list[int]) -> list[float] | None:
     return shot_times(numbers, shots, received)
 
 
-class ChosenFile(NamedTuple):
-    """A file to write, and whether the user agreed to replace it."""
-
-    path: Path
-    overwrite: bool
-
-
-def ask_file(
-    parent: QtWidgets.QWidget, title: str, stem: str, suffixes: Sequence[str]
-) -> ChosenFile | None:
-    """Ask for a file with one of several endings, the first by default; None if cancelled."""
-    filters = {f"{suffix[1:].upper()} (*{suffix})": suffix for suffix in suffixes}
-    name, selected = QtWidgets.QFileDialog.getSaveFileName(
-        parent, title, stem + suffixes[0], ";;".join(filters)
-    )
-    if not name:
-        return None
-    path = Path(name)
-    if path.suffix.lower() in suffixes:
-        return ChosenFile(path, overwrite=True)
-    # The dialog asked about the entered name only.
-    return ChosenFile(path.with_name(path.name + filters.get(selected, suffixes[0])), False)
-
-
 def export_csv(parent: QtWidgets.QWidget, stem: str, text: str) -> None:
     """Ask for a file, offering a name, and write a table."""
-    if chosen := ask_file(parent, "Export CSV", stem, SITES.suffixes):
-        with replacing(chosen.path, chosen.overwrite) as unfinished:
-            unfinished.write_text(text, encoding="utf-8")
-        show_info(f"Wrote {chosen.path}")
+    if path := qt.ask_file(parent, "Export CSV", stem, qt.TABLES):
+        qt.write_text(path, text)
+        show_info(f"Wrote {path}")
 
 
 def selected_shape(shapes: Any, suits: Callable[[str], bool]) -> int | None:

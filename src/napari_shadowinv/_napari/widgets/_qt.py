@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import functools
 import json
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from itertools import groupby
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from qtpy.QtCore import QObject, QSettings, QSize, Qt, QTimer
 from qtpy.QtWidgets import (
     QDockWidget,
+    QFileDialog,
     QFrame,
     QHBoxLayout,
     QMainWindow,
@@ -27,6 +30,8 @@ from qtpy.QtWidgets import (
 
 from napari_shadowinv._napari.events import Callback, connect, connect_layers
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
+from napari_shadowinv.io import replacing
+from napari_shadowinv.io.formats import RESULT, SITES
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -95,10 +100,52 @@ def _with_action(button: Any, tip: str, action: Callable[[], Any]) -> Any:
     return button
 
 
-def may_replace(parent: QWidget, title: str, file: object) -> bool:
+def may_write(parent: QWidget, title: str, path: Path) -> bool:
     """Ask whether an existing file may be replaced."""
-    answer = QMessageBox.question(parent, title, f"{file} already exists. Replace it?")
+    if not path.exists():
+        return True
+    answer = QMessageBox.question(parent, title, f"{path.name} already exists. Replace it?")
     return bool(answer == QMessageBox.StandardButton.Yes)
+
+
+def filter_of(title: str, endings: Sequence[str]) -> str:
+    """Return the filter of a dialog for files with some endings, the usual one first."""
+    return f"{title} ({' '.join(f'*{ending}' for ending in endings)})"
+
+
+TABLES = filter_of("Tables", SITES.suffixes)
+RESULT_FILES = filter_of("Results", RESULT.suffixes)
+
+
+def ask_file(parent: QWidget, title: str, proposal: str, filters: str) -> Path | None:
+    """Ask for a file to write, which may be replaced if it exists; None if the user cancels.
+
+    It has an ending of Qt's `filters`, such as ``"TIFF (*.tif *.tiff);;PNG (*.png)"``; a name
+    without one gets the first of the chosen filter.
+    """
+
+    def complete(name: str, chosen: str = filters) -> Path:
+        path = Path(name).expanduser()
+        if path.suffix.lower() in re.findall(r"\*(\.\w+)", filters):
+            return path
+        return path.with_name(path.name + re.findall(r"\*(\.\w+)", chosen)[0])
+
+    # The dialog would ask about the name as entered, perhaps without its ending.
+    entered, chosen = QFileDialog.getSaveFileName(
+        parent,
+        title,
+        str(complete(proposal)),
+        filters,
+        options=QFileDialog.Option.DontConfirmOverwrite,
+    )
+    path = complete(entered, chosen or filters) if entered else None
+    return path if path is not None and may_write(parent, title, path) else None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text whole, or not at all, where `ask_file` allowed it."""
+    with replacing(path, overwrite=True) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
 
 
 def timer(parent: QObject, interval: int, action: Callable[[], Any], once: bool = False) -> QTimer:

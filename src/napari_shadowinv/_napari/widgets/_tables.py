@@ -14,7 +14,6 @@ from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
 from qtpy.QtWidgets import (
-    QFileDialog,
     QHeaderView,
     QSizePolicy,
     QTableWidget,
@@ -28,7 +27,6 @@ from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.formats import SITES
 from napari_shadowinv.physics.beam import BeamQuantity, number_in_unit, text_in_unit
 from napari_shadowinv.physics.setup import SETUPS, Setup, beam_quantities
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
@@ -364,9 +362,6 @@ def _setup_summary(row: ImageRow) -> str:
     return f"with its own setup ({row.setup.probe}{f', {origin}' if origin else ''})"
 
 
-_FILE_FILTER = "tables (*.csv)"
-
-
 class ShotTable(QWidget):
     """The rows of a table of shots; changes are written to the file only by Save."""
 
@@ -381,7 +376,7 @@ class ShotTable(QWidget):
             "shots.csv",
             "A table (.csv) with a row for each shot and the columns file, setup, energy or "
             "wavelength, brightness, mask, source, exclude.",
-            _FILE_FILTER,
+            qt.TABLES,
         )
         self.save_button = qt.small_button("Save…", "Save the rows as a table (.csv).", self._save)
         self._kind = "proton"
@@ -472,12 +467,8 @@ class ShotTable(QWidget):
     @qt.notify_errors
     def _save(self) -> None:
         rows = self.shots()
-        path, _ = QFileDialog.getSaveFileName(
-            self, "Save the table", self._loaded or "shots.csv", _FILE_FILTER
-        )
-        if path:
-            target = Path(path)
-            write_table(target if target.suffix else target.with_suffix(SITES.suffix), rows)
+        if path := qt.ask_file(self, "Save the table", self._loaded or "shots.csv", qt.TABLES):
+            write_table(path, rows)
 
 
 def _tip(row: ShotRow) -> str:

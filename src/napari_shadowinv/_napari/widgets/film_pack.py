@@ -24,7 +24,6 @@ from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, mask_of, new_shapes
-from napari_shadowinv._napari.widgets._products import ask_file
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._napari.widgets._tables import Column, NumberTable
 from napari_shadowinv._typing import AnyArray, FloatArray
@@ -33,7 +32,6 @@ from napari_shadowinv.film.pack import FILM_TYPES
 from napari_shadowinv.film.scans import checked_corners
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import write
-from napari_shadowinv.io.formats import RESULT
 from napari_shadowinv.io.images import read_scan
 from napari_shadowinv.pipeline import film_files, read_pack, write_layers
 
@@ -97,7 +95,7 @@ class NewPackDialog(QtWidgets.QDialog):
         try:
             path = self._folder / film_files.PACK_FILE
             entries = self.entries()
-            overwrite = path.exists() and qt.may_replace(self, "New film pack", path)
+            overwrite = qt.may_write(self, "New film pack", path)
             self.written = film_files.write_new_pack(self._folder, entries, overwrite=overwrite)
         except (InputError, OSError, ValueError) as error:
             self._problem.show_text(str(error))
@@ -497,10 +495,10 @@ class FilmPack(panels.ToolPanel):
     @qt.notify_errors
     def _save(self) -> None:
         layer, doses = self._selected()
-        if chosen := ask_file(self, "Save the result", "pack", RESULT.suffixes[:1]):
+        if path := qt.ask_file(self, "Save the result", "pack", qt.RESULT_FILES):
             result: Any = about.result_of(layer)
-            doses = packs.copy_edits(doses, self._scratch, chosen.path)
+            doses = packs.copy_edits(doses, self._scratch, path)
             saved = about.Result(doses, result.setup, result.attributes)
             layers = about.layers_of(self.viewer, layer)
             dataset = dataset_of_layers([each.as_layer_data_tuple() for each in layers], saved)
-            show_info(f"Wrote {write(chosen.path, dataset, overwrite=chosen.overwrite)}")
+            show_info(f"Wrote {write(path, dataset, overwrite=True)}")
