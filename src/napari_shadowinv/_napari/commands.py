@@ -18,11 +18,10 @@ from napari_shadowinv._napari import viewer_sync
 from napari_shadowinv._napari.events import without_proxy
 from napari_shadowinv._napari.layer_metadata import Frame, frame_of, layer_name, main_layers
 from napari_shadowinv._napari.placement import source_on
-from napari_shadowinv._napari.preferences import use_preferred_threads
 from napari_shadowinv._napari.shots import shot_layer, shot_of_layer
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.errors import InputError, InversionCancelled
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.units import intensity_limits
 
 if TYPE_CHECKING:
@@ -292,33 +291,13 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
     """Do the work now, or in a thread if there is a window."""
     if viewer is None or not viewer_sync.in_event_loop():
         return list(work(selection, lambda: False))
-    from napari.qt.threading import create_worker
-    from napari.utils import cancelable_progress
+    from napari_shadowinv._napari.run import run_in_background
 
-    use_preferred_threads()
-    bar = cancelable_progress(total=0, desc=f"{activity} {selection.name}")
-
-    def finish(outcome: tuple[results.LayerData, Exception | None]) -> None:
-        layers, error = outcome
-        bar.close()
-        if error is None:
-            results.add_layers(viewer, layers)
-        elif isinstance(error, viewer_sync.USER_ERRORS):
-            viewer_sync.show_user_error(error)
-        elif not isinstance(error, InversionCancelled):
-            raise error
-
-    # Errors stay in the worker: versions of napari differ in their handling.
-    def run() -> tuple[results.LayerData, Exception | None]:
-        # A closing window asks its workers to stop; the cross only marks the bar.
-        try:
-            return work(selection, lambda: bar.is_canceled or worker.abort_requested), None
-        except Exception as error:
-            return [], error
-
-    worker = create_worker(run)
-    worker.returned.connect(finish)
-    worker.start()
+    run_in_background(
+        f"{activity} {selection.name}",
+        lambda _, should_stop: work(selection, should_stop),
+        lambda layers: results.add_layers(viewer, layers),
+    )
     return []
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from napari.utils import progress as activity
+from napari.utils import cancelable_progress as activity
 from napari.utils.notifications import notification_manager
 from qtpy import QtWidgets
 from qtpy.QtCore import Signal
@@ -160,10 +160,10 @@ class Run(QtWidgets.QWidget):
         self._to_stop.append(box)
         use_preferred_threads()
         sys.setswitchinterval(min(sys.getswitchinterval(), _SWITCH_INTERVAL_S))
+        if not quiet:
+            self._show_start()  # napari handles events meanwhile
         threading.Thread(target=box.fill, args=(work,), name="shadowinv", daemon=False).start()
         self._mailbox_timer.start()
-        if not quiet:
-            self._show_start()
         self.started.emit()
 
     def cancel(self) -> None:
@@ -184,6 +184,8 @@ class Run(QtWidgets.QWidget):
         box = self._box
         if box is None:
             return
+        if any(bar.is_canceled for bar in self._activity) and not self.cancelling:
+            self.cancel()
         outcome, progress = box.outcome, box.progress
         if progress is not None:
             box.progress = None
@@ -210,6 +212,7 @@ class Run(QtWidgets.QWidget):
         self.bar.setRange(0, 1)
         self.bar.setValue(0)
         self.bar.setVisible(True)
+        self._show_activity(self._task, Progress("", 0, None))
         self.say("Starting…")
         self._progress_timer.start()
 
@@ -226,7 +229,7 @@ class Run(QtWidgets.QWidget):
         self.say(f"{text} ({seconds:.0f} s)" if seconds >= _MIN_SHOWN_TIME_S else text)
 
     def _show_activity(self, text: str, progress: Progress) -> None:
-        """Show the stage in napari's activity dock while the button is hidden."""
+        """Show the stage, with a cross to cancel, in napari's dock while the button is hidden."""
         total = progress.total or 0
         bar = next(iter(self._activity), None)
         if self.isVisible() or bar is None or (bar.desc, bar.total) != (text, total):
@@ -260,3 +263,19 @@ class Run(QtWidgets.QWidget):
 def _close(bars: list[activity]) -> None:
     while bars:
         bars.pop().close()
+
+
+def run_in_background(task: str, work: Work, done: Callable[[Any], Any]) -> None:
+    """Run some work, shown in napari's activity dock only, until its window closes."""
+    app: Any = QtWidgets.QApplication
+    windows = [each for each in app.topLevelWidgets() if isinstance(each, QtWidgets.QMainWindow)]
+    run = Run(task, "", "")
+    run.setParent(app.activeWindow() or next(iter(windows), None))
+
+    def end(outcome: Outcome) -> None:
+        run.deleteLater()
+        if outcome.value is not None:
+            done(outcome.value)
+
+    run.ended.connect(end)
+    run.start(work)
