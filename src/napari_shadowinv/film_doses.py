@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -214,13 +213,8 @@ class FilmDoses(Summarised):
             "shift": f"y {dy:+.1f}, x {dx:+.1f} px (± {self.shift_errors[k]:.1f})",
         }
 
-    def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
+    def to_dataset(self) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.
-
-        Parameters
-        ----------
-        attributes : mapping of str to str, optional
-            Further attributes.
 
         Returns
         -------
@@ -255,7 +249,7 @@ class FilmDoses(Summarised):
         if self.setups:
             coordinates["time_of_flight"] = ("layer", self.times_of_flight, {"units": "s"})
             history["setups"] = json.dumps([setup.model_dump(mode="json") for setup in self.setups])
-        return xr.Dataset(variables, coordinates, history | dict(attributes or {}))
+        return xr.Dataset(variables, coordinates, history)
 
     @classmethod
     def from_dataset(cls, dataset: xarray.Dataset) -> FilmDoses:

@@ -95,12 +95,13 @@ def test_nothing_of_the_result_is_lost(
     add_to_viewer(viewer, solved, proton_setup, attributes={"setup_origin": "typed"})
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     dataset = read(tmp_path / "a.shadowinv")
+    (*_, layer) = viewer.open(tmp_path / "a.shadowinv", plugin=PLUGIN)
     expected = solved.in_units(proton_setup).to_dataset()
     for name in expected.variables:
         np.testing.assert_array_equal(dataset[name], expected[name])
     assert dataset.attrs["options"] == expected.attrs["options"]
     assert dataset.attrs["setup"] == expected.attrs["setup"]
-    assert dataset.attrs["setup_origin"] == "typed"
+    assert metadata_of(layer)["made_from"] == {"setup_origin": "typed"}
 
 
 def test_one_saved_layer_stands_for_the_main_ones(

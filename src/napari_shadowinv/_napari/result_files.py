@@ -29,10 +29,11 @@ from napari_shadowinv.results import result_from_dataset
 if TYPE_CHECKING:
     import xarray
 
-    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.results import AnyResult
 
-_LOOKS, _NAME = "napari_layers", "napari_name"
+_STATE = (
+    "napari"  # attribute with the name of a result, its origins in words, and its layers' looks
+)
 _MAX_NAMES = 3  # in a message
 
 _PLACEMENT = ("scale", "translate", "units")
@@ -58,13 +59,11 @@ def layers_of_result(result: Result[AnyResult], frame: Frame, name: str = "") ->
 
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
     """Describe the saved layers of a result, the main layers, and its image."""
-    name = dataset.attrs.get(_NAME, name)
-    looks: dict[str, dict[str, Any]] = json.loads(dataset.attrs.get(_LOOKS, "{}"))
+    state = json.loads(dataset.attrs.get(_STATE, "{}"))
+    looks: dict[str, dict[str, Any]] = state.get("looks", {})
     content = result_from_dataset(dataset)
     setup = content.setup
-    computed = {*_content_dataset(content, setup, {}).attrs, _LOOKS, _NAME}
-    attributes = {key: value for key, value in dataset.attrs.items() if key not in computed}
-    result = Result(content, setup, attributes)
+    result = Result(content, setup, state.get("origins", {}))
     placement = next(iter(looks.values()), {})
     shape = dataset.sizes["y"], dataset.sizes["x"]
     places = {key: placement.get(key) for key in _PLACEMENT}
@@ -76,7 +75,7 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
             shear=float(placement["shear"][-1]),
             affine=about.matrix_of(np.array(placement["affine"])[-3:, -3:]),
         )
-    layers = layers_of_result(result, frame, name)
+    layers = layers_of_result(result, frame, state.get("name", name))
     return [
         (data, keywords | looks.get(about.layer_key(keywords), {}), kind)
         for data, keywords, kind in main_layers(layers, also={*looks, "image"})
@@ -132,22 +131,16 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]
     """Return the dataset of a result with its layers' appearance and painted caustics."""
     content: Any = result.content
     looks = {about.layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
-    name = next((about.metadata_of(keywords).get("name") for _, keywords, _ in layers), None)
-    attributes = {**result.attributes, _LOOKS: json.dumps(looks, default=_plain)}
-    if name is not None:
-        attributes[_NAME] = name
+    state = {"looks": looks, "origins": dict(result.attributes)}
     for data, keywords, _ in layers:
+        if (name := about.metadata_of(keywords).get("name")) is not None:
+            state["name"] = name
         if about.role_of(keywords) == "caustic":  # of an inversion
             content = replace(content, caustic=np.asarray(data) > 0)
-    return _content_dataset(content, result.setup, attributes)
-
-
-def _content_dataset(
-    content: AnyResult, setup: Setup | None, attributes: dict[str, str]
-) -> xarray.Dataset:
     if isinstance(content, Inversion):
-        content = content.in_units(setup)
-    return content.to_dataset(attributes=attributes)
+        content = content.in_units(result.setup)
+    saved: xarray.Dataset = content.to_dataset()
+    return saved.assign_attrs({_STATE: json.dumps(state, default=_plain)})
 
 
 def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:

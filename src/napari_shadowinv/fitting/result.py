@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -434,15 +434,10 @@ class Fit(Summarised):
         for key, peak in zip(("field", "displacement"), peaks, strict=False):
             yield Fact(f"{key}_{field.name}", f"{key.capitalize()} {field.name}", peak.text)
 
-    def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
+    def to_dataset(self) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.
 
         The first setup adds fields in SI units, and coordinates in metres.
-
-        Parameters
-        ----------
-        attributes : mapping of str to str, optional
-            Further attributes.
 
         Returns
         -------
@@ -468,7 +463,7 @@ class Fit(Summarised):
             "setups": json.dumps([each.model_dump(mode="json") for each in self.setups]),
         }
         merged = merge_fields(names, [field_dataset(field, self.setup) for field in self.fields])
-        merged.attrs.update(history | dict(attributes or {}))
+        merged.attrs.update(history)
         merged["field"] = ("field", names)
         merged["basin"] = ("basin", [basin.start for basin in self.basins])
         arrays = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -503,15 +503,10 @@ class Inversion(Summarised):
         report = replace(self.report, cautions=(*self.report.cautions, *cautions))
         return replace(self, report=report)
 
-    def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
+    def to_dataset(self) -> xarray.Dataset:
         """Return everything as one labelled dataset, with units.
 
         The setup adds the line-integrated fields in SI units, and coordinates in metres.
-
-        Parameters
-        ----------
-        attributes : mapping of str to str, optional
-            Further attributes.
 
         Returns
         -------
@@ -540,9 +535,7 @@ class Inversion(Summarised):
             factor = np.abs(setup.field_in_si(field.name, np.ones((2, 1, 1)))).max()
             in_si = errors.times(float(factor)).to_dict()
             history["errors_si"] = json.dumps({"field": field.name, "unit": unit, **in_si})
-        dataset = dataset_from_field(
-            self.displacement, self.potential, setup, attributes=history | dict(attributes or {})
-        )
+        dataset = dataset_from_field(self.displacement, self.potential, setup, attributes=history)
         if (std := per_pixel_of(self.errors)) is not None:
             dims, *words = DISPLACEMENT_STD
             dataset["displacement_std"] = dims, std, label(*words)
@@ -701,9 +694,9 @@ class RetrievedField(Summarised):
         """Regions where the displacement stands above its error; None without pixel errors."""
         return structures_of(self.displacement, self.displacement_std)
 
-    def to_dataset(self, *, attributes: Mapping[str, str] | None = None) -> xarray.Dataset:
-        """Return the dataset with further attributes."""
-        return self.dataset.assign_attrs(attributes or {})
+    def to_dataset(self) -> xarray.Dataset:
+        """Return the dataset."""
+        return self.dataset
 
     @classmethod
     def from_dataset(cls, dataset: xarray.Dataset) -> RetrievedField:
