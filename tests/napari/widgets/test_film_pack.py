@@ -347,6 +347,11 @@ def test_new_pack_is_described_in_the_window(
             path.name for path in film_pack.files
         ]
         assert dialog._problem.isHidden()
+        films = dialog.table.cellWidget(0, 1)
+        assert films.currentText() == "HDV2"
+        films.setCurrentText("EBT3")
+        assert dialog.entries()["layers"][0]["film"] == "EBT3"
+        films.setCurrentText("HDV2")
         dialog.table.item(0, 2).setText("13 Al")
         dialog.accept()
         assert "expected thickness, unit" in dialog._problem.text()

@@ -109,6 +109,8 @@ def test_a_profile_has_true_units_on_both_axes(profile: Any, qtbot: Any) -> None
     axes = profile.plot.figure.axes
     assert {axis.get_ylabel() for axis in axes} == {"nm", "T"}
     assert axes[-1].get_xlabel() == "distance (µm)"
+    assert {axis.get_title(loc="left") for axis in axes} == {"height", "field"}
+    assert all(axis.get_legend() is None for axis in axes)
 
 
 def test_a_plot_ignores_the_settings_of_other_figures(qtbot: Any) -> None:

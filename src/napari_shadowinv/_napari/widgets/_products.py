@@ -54,7 +54,6 @@ _MORE = "more"
 # The products that most experiments need; the others follow below *more…*.
 _USUAL = ("profile", "region", "flux", "current", "current-density", "axisymmetric")
 OPEN_SHAPES = ("line", "path")
-_MAX_COLUMN = 3  # entries of a legend inside the axes; longer ones are above
 _PANEL_HEIGHT_PX = 210
 
 
@@ -94,13 +93,6 @@ def draw_groups(columns: Sequence[Any], result: ProductResult) -> None:
     for axes, names in zip(columns, result.curve_groups, strict=True):
         draw_curves(axes, result, names, qt.COLOURS)
         axes.label_outer()
-        if len(names) > _MAX_COLUMN:
-            above: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
-            compact: Any = {"fontsize": 7, "handlelength": 1.0, "columnspacing": 0.8}
-            compact["ncols"] = len(names)
-            # Its width takes none of the axes'.
-            axes.legend(frameon=False, **above, **compact).set_in_layout(False)
-            axes.set_title(" ", fontsize=7)
 
 
 class _Bands(CheckedModel):

@@ -38,6 +38,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
+_LEGEND_CHARACTERS, _HANDLE_CHARACTERS = 60, 5  # of a row above a plot
 _CONSTANT_STAGES = ("samples",)  # do not change the objective
 # Errors that a saved state causes which another version wrote in another form.
 UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
@@ -345,17 +346,27 @@ class Plot(QWidget):
         return axes
 
     def show_drawing(self, draw: Callable[[list[Any]], Any], rows: int = 1) -> None:
-        """Draw on empty axes in a column, and give their legends napari's colours."""
+        """Draw on empty axes in a column, with the names of their curves above them."""
         self.setVisible(True)
         axes = self._fresh_axes(rows)
         with _plain_style():
             draw(axes)
-        of_axes = (each.get_legend() for each in axes)
-        for legend in filter(None, (*self.figure.legends, *of_axes)):
-            legend.get_frame().set(facecolor=self.paper, edgecolor=self.ink)
-            for text in legend.get_texts():
-                text.set(color=self.ink, fontsize=7)
+            for each in axes:
+                self._name_curves(each)
         self._canvas.draw_idle()
+
+    def _name_curves(self, axes: Any) -> None:
+        """Replace a legend on the curves by a title for a single one, else by a legend above."""
+        if axes.get_legend() is not None:
+            axes.get_legend().remove()
+        _, names = axes.get_legend_handles_labels()
+        if len(names) == 1:
+            axes.set_title(names[0], loc="left", color=self.ink, fontsize=7)
+        elif names:
+            columns = max(1, _LEGEND_CHARACTERS // (max(map(len, names)) + _HANDLE_CHARACTERS))
+            above: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
+            compact: Any = {"fontsize": 7, "handlelength": 1.0, "columnspacing": 0.8}
+            axes.legend(ncols=columns, frameon=False, labelcolor=self.ink, **above, **compact)
 
     def _make_canvas(self) -> None:
         # Importing matplotlib takes half a second.
@@ -426,5 +437,3 @@ class ObjectiveCurve(Plot):
         axis.set_yscale("log")
         axis.set_ylabel("objective")
         axis.set_xlabel("step")
-        compact: Any = {"ncols": 3, "fontsize": 7, "handlelength": 1.0, "columnspacing": 0.8}
-        self.figure.legend(loc="outside upper center", frameon=False, **compact)

@@ -22,7 +22,7 @@ from qtpy.QtWidgets import (
 )
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.form import PROBLEM_COLOUR, PathEdit, labelled
+from napari_shadowinv._napari.form import PROBLEM_COLOUR, PathEdit, SteadyComboBox, labelled
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, kind_of, stack_of
 from napari_shadowinv._system.validation import validate
@@ -36,7 +36,7 @@ _PREFIXED_UNIT = "m"  # cells show it, with the prefix of each number
 
 @dataclass(frozen=True)
 class Column:
-    """A column of numbers in a unit, or of texts if the unit is None."""
+    """A column of numbers in a unit, or of texts if the unit is None, perhaps from a list."""
 
     name: str
     title: str
@@ -44,6 +44,7 @@ class Column:
     tip: str
     width_px: int = 90
     default: float | None = None
+    choices: tuple[str, ...] = ()
 
     @property
     def heading(self) -> str:
@@ -104,8 +105,12 @@ class NumberTable(QTableWidget):
         item.setToolTip(f"<qt>{tip}</qt>")
         self.setItem(row, 0, item)
         self.check(row, checked)
-        for number in range(1, self.columnCount()):
+        for number, spec in enumerate(self._columns, 1):
             self.setItem(row, number, QTableWidgetItem())
+            if spec.choices:
+                box = SteadyComboBox({each: each for each in ("", *spec.choices)}, spec.tip)
+                box.currentTextChanged.connect(self.item(row, number).setText)
+                self.setCellWidget(row, number, box)
 
     def fit_height(self) -> None:
         """Fit the height to the rows, up to a maximum."""
@@ -153,6 +158,8 @@ class NumberTable(QTableWidget):
             # The shown text is rounded.
             item.setData(Qt.ItemDataRole.UserRole, value)
             item.setText(spec.show(value))
+            if spec.choices:
+                self.cellWidget(row, column).setCurrentText(spec.show(value))
             item.setData(Qt.ItemDataRole.ForegroundRole, PROBLEM_COLOUR if problem else None)
             item.setToolTip(f"<qt>{problem or spec.tip}</qt>")
 

@@ -45,10 +45,8 @@ def draw_profiles(
             if profile.unit == of_unit:
                 colour, name = qt.COLOURS[number % len(qt.COLOURS)], profile.name
                 if len(name) > _MAX_NAME_LENGTH:
-                    name = f"…{name[1 - _MAX_NAME_LENGTH :]}"
+                    name = f"{name[: _MAX_NAME_LENGTH - 1]}…"
                 axes.plot(distance, profile.values, color=colour, label=name)
-        if len(profiles) > 1:  # of a single one the table shows the name
-            axes.legend()
     averaging = f", {profiles[0].averaging}" if profiles and profiles[0].averaging else ""
     columns[-1].set_xlabel(f"distance ({unit}){averaging}")
 

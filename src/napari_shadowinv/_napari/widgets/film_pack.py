@@ -36,7 +36,7 @@ from napari_shadowinv.io.images import read_scan
 from napari_shadowinv.pipeline import film_files, read_pack, write_layers
 
 _COLUMNS = (
-    Column("film", "Film", None, f"Type of the film: {', '.join(FILM_TYPES)}."),
+    Column("film", "Film", None, "Type of the film.", choices=tuple(FILM_TYPES)),
     Column(
         "filters",
         "Filters in front",
