@@ -349,12 +349,15 @@ def _text_of(value: Any, unit: str) -> str:
 
 
 class ModelForm(QWidget):
-    """Entries for a model's fields; its state has those that are stated, as in a TOML file."""
+    """Entries for a model's fields; its state has those that are stated, as in a TOML file.
+
+    With `names`, only for these fields.
+    """
 
     changed = Signal()
     defaults_vary = False  # with the stated values, so that a default may be stated, too
 
-    def __init__(self, model_class: type[BaseModel]) -> None:
+    def __init__(self, model_class: type[BaseModel], names: Sequence[str] | None = None) -> None:
         super().__init__()
         self._model_class = model_class
         self._fixed: dict[str, Any] = {}
@@ -365,6 +368,8 @@ class ModelForm(QWidget):
         rows.setFieldGrowthPolicy(QtWidgets.QFormLayout.FieldGrowthPolicy.AllNonFixedFieldsGrow)
         rows.setLabelAlignment(Qt.AlignmentFlag.AlignLeft | Qt.AlignmentFlag.AlignVCenter)
         for name, field in model_class.model_fields.items():
+            if names is not None and name not in names:
+                continue
             choices = _choices_in(field.annotation)
             if len(choices) == 1:
                 self._fixed[name] = choices[0]

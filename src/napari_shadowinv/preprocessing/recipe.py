@@ -41,9 +41,11 @@ class MeasuredSource(Choice):
     title = "measured"
     key = "method"
     method: Literal["measured"] = "measured"
-    file: Path | None = Field(default=None, description="Image of the undisturbed beam.")
+    file: Path | None = Field(
+        default=None, title="File", description="Image of the undisturbed beam."
+    )
     variable: str | None = Field(
-        default=None, description="Name of the array in a file with several."
+        default=None, title="Array", description="Name of the array in a file with several."
     )
 
 

@@ -18,6 +18,7 @@ from scipy.ndimage import zoom
 
 from helpers.command_line import undrawn
 from helpers.fit_images import of_each
+from helpers.forms import enter
 from helpers.jobs import run_job
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
@@ -650,16 +651,16 @@ def test_refine_starts_from_the_last_inversion(
     window.add_image(shot, name="shot", metadata=metadata_for("shot", "", SETUPS[0]))
     tool = open_widget("Invert")
     tool.options.restore({"n_sites": 600})
-    tool.refine_section.button.click()
+    tool.refine_button.click()
     assert "there is no inversion of this image" in messages.pop().lower()
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     inversion = result_of(layer_of(window, "field")).content
-    tool.refine_section.psf.setValue(0.5)
+    enter(tool.refine_form.entries["psf"], 0.5)
     answers: list[Any] = []
     tool.panel.ended.connect(answers.append)
-    tool.refine_section.button.click()
+    tool.refine_button.click()
     assert tool.panel.button.text() == "Cancel"
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
     result = answers[0].value.content
@@ -702,7 +703,7 @@ def test_the_button_refines_an_inversion_of_a_file(
     write(path, inversion, setup=SETUPS[0])
     tool = open_widget("Invert")
     window.open(str(path), plugin="napari-shadowinv")
-    in_loop(tool.refine_section.button.click)
+    in_loop(tool.refine_button.click)
     assert not any("no inversion" in text for text in messages)
     assert tool.panel.running
 
@@ -723,7 +724,7 @@ def test_the_menu_refines_an_inversion_of_a_file(
     in_loop(refine)
     (dock,) = window.window.dock_widgets.values()
     tool = dock if hasattr(dock, "refine_section") else dock._magic_widget
-    assert tool.refine_section.folded.isExpanded()
+    assert tool.refine_section.isExpanded()
     assert tool.panel.running
     in_loop(refine)
     assert messages[-1].startswith("Invert is running")
@@ -849,10 +850,10 @@ def test_a_refined_inversion_is_made_again(
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    tool.refine_section.psf.setValue(0.5)
+    enter(tool.refine_form.entries["psf"], 0.5)
     answers: list[Any] = []
     tool.panel.ended.connect(answers.append)
-    tool.refine_section.button.click()
+    tool.refine_button.click()
     qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     result = answers[0].value.content

@@ -204,12 +204,13 @@ def test_crop_mask_and_source_are_used(
     metadata = metadata_for("shot", "", proton_setup, source=beam)
     window.add_image(shot, name="measured", metadata=metadata)
     tool.source.layers.layer = window.layers["beam"]
-    tool.source.file.edit.setText(f"{tmp_path / 'run.nxs'}::/entry/beam")
     tool.image.layer = window.layers["measured"]
     assert tool.setup.setup() == proton_setup
     assert tool.source.kind == "own"
     for kind in ("own", "layer", "file"):
         tool.source.set_kind(kind)
+        if kind == "file":
+            enter(tool.source.form.entries["file"], f"{tmp_path / 'run.nxs'}::/entry/beam")
         np.testing.assert_allclose(computed(tool).source, beam)
     tool.source.set_kind("own")
     tool.image.layer = window.layers["shot"]

@@ -1,4 +1,4 @@
-"""Results in a window: `ResultView` shows verdict and report; `RefineSection` starts a fit."""
+"""Results in a window: `ResultView` shows verdict and report, of a fit also its course."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt
-from qtpy.QtWidgets import QDoubleSpinBox, QWidget
+from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.fit_layers import alternative_layers, start_name
@@ -18,7 +18,6 @@ from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._qt import (
     ObjectiveCurve,
     column,
-    push_button,
     timer,
     while_alive,
 )
@@ -30,30 +29,6 @@ from napari_shadowinv.preprocessing import Recipe
 
 _REDRAW_MS = 500
 _MIN_REDRAW_RATIO = 10  # interval over the time of a drawing
-_MAX_BLUR_PX = 100.0
-
-
-class RefineSection(QWidget):
-    """Folded controls to refine an inversion: the blur's σ in px, and a button."""
-
-    def __init__(self, refine: Callable[[], None]) -> None:
-        super().__init__()
-        tip = (
-            "<qt>Standard deviation of the image's blur from source size and detector, in pixels "
-            "of the object plane.</qt>"
-        )
-        self.psf = QDoubleSpinBox(maximum=_MAX_BLUR_PX, singleStep=0.1, suffix=" px", toolTip=tip)
-        self.psf.setSpecialValueText("none")
-        self.button = push_button(
-            "Refine",
-            "Fit the forward model to the image, starting from its last inversion. The fit "
-            "includes blur, gives error bars, and works beyond the first caustic. The verdict "
-            "says whether the image determines the field.",
-            refine,
-        )
-        blur = forms.labelled("Blur σ", self.psf)
-        self.folded = forms.section("Refine the result", blur, self.button)
-        column(self, self.folded)
 
 
 class ResultView(QWidget):

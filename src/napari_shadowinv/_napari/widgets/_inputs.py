@@ -314,18 +314,15 @@ class SourcePicker(forms.ModelPicker):
         self._image: Any = None
         self._own_kind = UNIFORM  # without a source that came with the image or is likely
         self.is_chosen, self._is_guessed = False, False
-        self._recipe_source = preprocessing.MeasuredSource()
         layer_tip = "Image layer of the undisturbed beam."
         if UNKNOWN in kinds:
             layer_tip = "Image layer of the undisturbed beam, or a stack with one for each image."
         self.layers = layers.LayerPicker(viewer, layer_tip, "choose a layer", self._offers)
-        self.file = forms.PathEdit("Image of the undisturbed beam")
-        rows = {LAYER: forms.labelled("", self.layers), FILE: forms.labelled("", self.file)}
+        rows = {LAYER: forms.labelled("", self.layers), FILE: preprocessing.MeasuredSource}
         below = preprocessing.ESTIMATES | rows
         described = {kind: (_SOURCE_TITLES[kind], below.get(kind)) for kind in kinds}
         super().__init__("Source", described, tip)
         self.layers.picked.connect(self.changed)
-        self.file.changed.connect(self.changed)
         for box in (self.choice, self.layers):
             box.activated.connect(self._choose)
         qt.while_alive(self, viewer.layers, ("inserted", "removed"), self._guess)
@@ -355,11 +352,11 @@ class SourcePicker(forms.ModelPicker):
     def summary(self) -> str:
         if self.layer is not None:
             return f"layer '{self.layer.name}'"
-        if self.kind == FILE:
-            return f"file {Path(self.file.path).name}"
         if self.kind in (SUPPLIED, UNKNOWN):
             return "came with the shot" if self.is_supplied else "fitted"
         model: Any = self.model()
+        if self.kind == FILE:
+            return f"file {model.file.name}"
         return f"estimate: {model.summary}" if self.is_estimated else model.summary
 
     @property
@@ -371,17 +368,10 @@ class SourcePicker(forms.ModelPicker):
 
     def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource | None:
         """Return the source as a recipe describes it, None if it is fitted; or an `InputError`."""
-        model = self.model()
-        if isinstance(model, preprocessing.Estimate):
-            return model
-        if self.kind != FILE:
-            return None if self.kind == UNKNOWN else preprocessing.MeasuredSource()
-        if not self.file.path:
+        model: Any = self.model()
+        if self.kind == FILE and model.file is None:
             raise InputError("no source file is selected: choose one, or choose another source")
-        if self._recipe_source.file is not None and str(self._recipe_source.file) == self.file.path:
-            # With the variable in the file, which the form does not show.
-            return self._recipe_source
-        return preprocessing.MeasuredSource(file=Path(self.file.path))
+        return model or (None if self.kind == UNKNOWN else preprocessing.MeasuredSource())
 
     def show(self, source: Any, beam: str = "known") -> None:
         """Show the source of a recipe; None for uniform, unless the beam is unknown."""
@@ -397,10 +387,7 @@ class SourcePicker(forms.ModelPicker):
         elif source.file is None:
             self.set_kind(SUPPLIED)
         else:
-            self._recipe_source = source
-            self.file.edit.setText(str(source.file))
-            self.set_kind(FILE)
-            self.changed.emit()
+            self.restore({"kind": FILE, "values": {FILE: source.values()}})
 
     def measured(self, image: Any) -> Shot | None:
         """Return the measured source of an image layer; None for estimates and files."""
@@ -487,9 +474,11 @@ class SourcePicker(forms.ModelPicker):
 
     def state(self) -> dict[str, Any]:
         """Return the choice without layers and files, which belong to a session."""
-        state = super().state()
-        kind = self._own_kind if self.is_supplied or self._is_guessed else state["kind"]
-        return {**state, "kind": UNIFORM if kind in (LAYER, FILE) else kind}
+        kind = self._own_kind if self.is_supplied or self._is_guessed else self.kind
+        values = {
+            name: stated for name, stated in super().state()["values"].items() if name != FILE
+        }
+        return {"kind": UNIFORM if kind in (LAYER, FILE) else kind, "values": values}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)

@@ -19,7 +19,7 @@ from napari_shadowinv._napari.viewer_sync import USER_ERRORS
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import field_of, result_buttons, shot_to_save
-from napari_shadowinv._napari.widgets._fitting import RefineSection, ResultView
+from napari_shadowinv._napari.widgets._fitting import ResultView
 from napari_shadowinv._napari.widgets._inputs import (
     SHOT_SOURCES,
     ImagePanel,
@@ -34,7 +34,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 from napari_shadowinv.preprocessing import Crop, Estimate, Recipe, Step
@@ -106,7 +106,17 @@ class Invert(ImagePanel):
         tip = f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
         self.live = QCheckBox("Live preview", toolTip=tip)
         self.store = StoreSection()
-        self.cost, self.refine_section = CostLine(), RefineSection(self.refine)
+        self.cost, self.refine_form = CostLine(), forms.ModelForm(FitChoices, ["psf"])
+        self.refine_button = qt.push_button(
+            "Refine",
+            "Fit the forward model to the image, starting from its last inversion. The fit "
+            "includes blur, gives error bars, and works beyond the first caustic. The verdict "
+            "says whether the image determines the field.",
+            self.refine,
+        )
+        self.refine_section = forms.section(
+            "Refine the result", self.refine_form, self.refine_button
+        )
         self._refined = ResultLayers(self.viewer, self)
         self.save_result, self.more_layers = result_buttons(
             self,
@@ -264,11 +274,11 @@ class Invert(ImagePanel):
     @qt.notify_errors
     def refine_layer(self, layer: Any) -> None:
         """Refine the inversion that a layer belongs to, such as a result from a file."""
-        self.refine_section.folded.expand()
+        self.refine_section.expand()
         image = self._last.shot_of(layer)
         name = jobs.name_of_result(layer) if image is None else str(image.name)
-        psf = self.refine_section.psf.value()
-        job = jobs.refinement(layer, layer if image is None else image, name, psf)
+        choices: Any = self.refine_form.model()
+        job = jobs.refinement(layer, layer if image is None else image, name, choices.psf or 0.0)
         if self.is_busy:
             raise InputError(
                 "Invert is running: wait until it finishes, or press Cancel, then refine"
