@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
+from helpers.layers import by_role
 from napari_shadowinv import OpticalSetup, ProtonSetup, add_to_viewer
 from napari_shadowinv._napari.layer_metadata import (
-    frame_for,
-    place_image,
     result_of,
     role_of,
     setup_of,
@@ -22,18 +21,6 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import direction_colours, inversion_layers, sample_arrows
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.inversion import Cells, Inversion
-
-
-def by_role(layers: list[Any]) -> dict[str, Any]:
-    return {str(role_of(layer)): layer for layer in layers}
-
-
-def test_result_shows_its_main_layers(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
-) -> None:
-    layers = by_role(add_to_viewer(viewer, solved, proton_setup, name="shot 7"))
-    assert list(layers) == ["residual", "field", "caustic", "arrows"]
-    assert {role for role, layer in layers.items() if layer.visible} == {"field", "arrows"}
 
 
 def test_all_of_a_result_is_there_on_request(
@@ -115,29 +102,12 @@ def test_without_a_setup_lengths_are_pixels(viewer: ViewerModel, solved: Inversi
         np.testing.assert_array_equal(layer.scale, 1)
 
 
-def test_large_objects_are_measured_in_millimetres(optical_setup: OpticalSetup) -> None:
-    assert frame_for((500, 500), optical_setup).units == ("um", "um")
-    large = frame_for((500, 1000), optical_setup)
-    assert large.units == ("mm", "mm")
-    np.testing.assert_allclose(large.scale, 12e-3)
-
-
 def test_a_binned_crop_lies_on_its_original(solved: Inversion, proton_setup: ProtonSetup) -> None:
     layers = inversion_layers(
         solved, proton_setup, scale=(3.0, 3.0), translate=(7.5, 9.0), units=("um", "um")
     )
     for _, keywords, _ in layers:
         assert (keywords["scale"], keywords["translate"]) == ((3.0, 3.0), (7.5, 9.0))
-
-
-def test_place_gives_a_stack_the_pixels_of_a_setup(
-    viewer: ViewerModel, proton_setup: ProtonSetup
-) -> None:
-    layer = viewer.add_image(np.zeros((3, 20, 20)), contrast_limits=(0, 1))
-    place_image(layer, proton_setup)
-    np.testing.assert_allclose(layer.scale, [1, 1.5, 1.5])
-    assert [str(unit) for unit in layer.units] == ["pixel", "micrometer", "micrometer"]
-    assert layer.axis_labels[-2:] == ("y", "x")
 
 
 def test_arrows_are_true_displacements_on_a_grid_that_can_be_read(

@@ -21,7 +21,6 @@ from napari_shadowinv._napari.layer_metadata import (
     result_of,
     role_of,
     setup_of,
-    source_of,
 )
 from napari_shadowinv._napari.layers import add_layers, sample_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
@@ -100,19 +99,6 @@ def test_formats_that_napari_does_not_know_need_no_choice(
     (layer,) = viewer.open(path, plugin=None)  # raises where several plugins could
     np.testing.assert_array_equal(layer.data, counts)
     assert layer.source.reader_plugin == PLUGIN
-
-
-def test_text_with_a_header_brings_scale_and_source(viewer: ViewerModel, tmp_path: Path) -> None:
-    image, reference = np.full((4, 5), 7.0), np.full((4, 5), 8.0)
-    path = tmp_path / "praline.txt"
-    header = "s2r_cm 1.0\ns2d_cm 11.0\nEp_MeV 14.7\nbin_um 110.0\nflux2D (4, 5)\nflux2D_ref (4, 5)"
-    np.savetxt(path, np.vstack([image, reference]), header=header)
-    source, layer = viewer.open(path, plugin=PLUGIN)
-    assert (role_of(source), role_of(layer)) == ("source", "shot")
-    assert not source.visible
-    np.testing.assert_array_equal(source_of(layer), reference)
-    np.testing.assert_array_equal(source.data, reference)
-    np.testing.assert_allclose(layer.scale, 10.0)
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".nxs"])

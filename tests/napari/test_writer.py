@@ -10,16 +10,13 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
+from helpers.layers import by_role
 from napari_shadowinv import FileFormatError, ProtonSetup, add_to_viewer, read
 from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, role_of
 from napari_shadowinv._napari.result_files import write_result
 from napari_shadowinv.inversion import Inversion
 
 PLUGIN = "napari-shadowinv"
-
-
-def by_role(layers: Any) -> dict[str, Any]:
-    return {str(role_of(layer)): layer for layer in layers}
 
 
 @pytest.fixture

@@ -109,6 +109,19 @@ def assert_it_fits(window: Any, qtbot: Any) -> Callable[[Any], None]:
 
 
 @pytest.fixture
+def run(qtbot: Any) -> Callable[[Any], None]:
+    """Press Run and wait until the layers are there."""
+
+    def pressed(tool: Any) -> None:
+        before = getattr(tool, "results", None)
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: getattr(tool, "results", None) is not before, timeout=60_000)
+        qtbot.waitUntil(lambda: not tool.results.busy, timeout=60_000)
+
+    return pressed
+
+
+@pytest.fixture
 def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     """Answer the dialogs for a file with a path and the first filter, and whether to replace it."""
     from qtpy.QtWidgets import QFileDialog, QMessageBox

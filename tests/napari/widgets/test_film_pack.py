@@ -16,6 +16,7 @@ from napari.components import ViewerModel
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QFileDialog
 
+from helpers.layers import layer_of
 from helpers.reports import texts_of
 from napari_shadowinv import read, write
 from napari_shadowinv._napari import packs
@@ -60,11 +61,6 @@ def evaluated(viewer: ViewerModel, tool: Any, pack_doses: Any, tmp_path: Path) -
     return tool
 
 
-def of_role(viewer: Any, role: str) -> Any:
-    (match,) = [layer for layer in viewer.layers if role_of(layer) == role]
-    return match
-
-
 def scratch_of(tool: Any) -> list[Path]:
     return list(tool._scratch.rglob("*"))
 
@@ -81,7 +77,7 @@ def test_a_run_shows_the_fluences_of_the_films(
         "fluence (1/(m² MeV)) – trio",
         "unusable – trio",
     ]
-    fluence = of_role(window, "fluence")
+    fluence = layer_of(window, "fluence")
     np.testing.assert_array_equal(fluence.data, pack_doses.fluence)
     assert window.layers.selection.active is fluence
     assert tool.packs.layer is fluence
@@ -131,7 +127,7 @@ def test_corners_are_shown_dragged_and_used(
     viewer: ViewerModel, evaluated: Any, pack_doses: Any, wait: Callable[[Any], None], qtbot: Any
 ) -> None:
     tool = evaluated
-    of_role(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
+    layer_of(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
     viewer.dims.set_current_step(0, 1)
     tool.show_corners.click()
     corners = pack_doses.corners
@@ -189,7 +185,7 @@ def test_painted_pixels_are_not_used(
 ) -> None:
     tool = evaluated
     tool.paint.click()
-    marks = of_role(viewer, "unusable")
+    marks = layer_of(viewer, "unusable")
     assert marks.visible
     assert marks.mode == "paint"
     assert marks.selected_label == BY_HAND
@@ -239,7 +235,7 @@ def test_cancelling_leaves_nothing(
 
     tool = evaluated
     monkeypatch.setattr(packs, "run_film", work_slowly)
-    of_role(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
+    layer_of(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
     before = list(viewer.layers)
     tool.run_again.click()
     qtbot.waitUntil(lambda: bool(written), timeout=PATIENCE)

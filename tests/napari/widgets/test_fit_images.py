@@ -20,13 +20,13 @@ from helpers.command_line import undrawn
 from helpers.fit_images import of_each
 from helpers.forms import enter
 from helpers.jobs import run_job
+from helpers.layers import layer_of
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
 from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layer_metadata import (
     Result,
-    displacement_of,
     metadata_for,
     result_of,
     role_of,
@@ -43,7 +43,7 @@ from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.physics.projection import predict_image, transferred_displacement
+from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
@@ -120,12 +120,6 @@ def run(qtbot: Any) -> Callable[[Any], Any]:
         return answers[0].value.content
 
     return pressed
-
-
-def layer_of(viewer: Any, role: str, word: str = "") -> Any:
-    matches = [layer for layer in viewer.layers if role_of(layer) == role and word in layer.name]
-    assert len(matches) == 1, [layer.name for layer in viewer.layers]
-    return matches[0]
 
 
 def inputs_of(tool: Any) -> FitInputs:
@@ -241,69 +235,6 @@ def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
     assert not tool.view.verdict.isVisible()
 
 
-def test_two_fields_are_told_apart_and_named(
-    window: Any, open_widget: Any, run: Any, proton_setup: ProtonSetup
-) -> None:
-    rng = np.random.default_rng(2)
-    electric = gaussian_blob(SHAPE, 14.0, 7.0, (28.0, 24.0)).displacement
-    setups = [ProtonSetup(energy=energy, **LENGTHS) for energy in (20.0, 3.0)]
-    for setup in setups:
-        moved = sum(
-            transferred_displacement(d, setups[0], setup, deflector=f"{kind} field")
-            for d, kind in ((0.5 * TRUTH, "magnetic"), (0.5 * electric, "electric"))
-        )
-        metadata = metadata_for("shot", "", setup)
-        noisy = synthetic_image(moved) + rng.normal(0, 0.01, SHAPE)
-        window.add_image(noisy, name=f"{setup.energy}", metadata=metadata)
-    tool = open_widget("Fit several images")
-    tool.options.restore(QUICK)
-    tool.fields.restore("B and E")
-    result = run(tool)
-    assert [field.name for field in result.fields] == ["B", "E"]
-    magnetic, electric_layer = (
-        layer_of(window, "field", "∫B×dz"),
-        layer_of(window, "field", "∫E dz"),
-    )
-    assert magnetic.visible
-    assert not electric_layer.visible
-    assert unit_of(electric_layer).endswith("V")
-    factor = {"V": 1.0, "kV": 1e-3, "MV": 1e-6}[unit_of(electric_layer)]
-    expected = factor * np.hypot(*setups[0].path_integrated_e(result.fields[1].displacement))
-    np.testing.assert_allclose(electric_layer.data, expected, rtol=1e-6, atol=1e-6 * expected.max())
-    assert result_of(electric_layer).content is result_of(magnetic).content is result
-    for layer, field in zip((magnetic, electric_layer), result.fields, strict=True):
-        np.testing.assert_array_equal(displacement_of(layer), field.displacement)
-
-
-def test_steps_are_done_to_all_images_first(window: Any, tool: Any) -> None:
-    before = images()
-    large = np.ones((2, 2)) / 4
-    for layer in window.layers:
-        layer.data = np.kron(layer.data, large)
-    beam = 300 + np.arange(SHAPE[1]) + np.zeros(SHAPE)
-    window.add_image(np.kron(beam, large), name="beam", metadata=metadata_for("source", ""))
-    tool.source.layers.layer = window.layers["beam"]
-    tool.source.set_kind("layer")
-    painted = np.zeros((96, 128), np.uint8)
-    painted[:4, :6] = 1
-    tool.masks.layer = window.add_labels(painted)
-    tool.steps.add("bin")
-    job = tool.request()
-    inputs = inputs_of(tool)
-    planes, masks, sources, setups = (
-        of_each(inputs.shots, name) for name in ("image", "mask", "source", "setup")
-    )
-    usable = np.ones((2, *SHAPE), bool)
-    usable[:, :2, :3] = False
-    np.testing.assert_array_equal(masks, usable)
-    np.testing.assert_allclose(np.stack(planes)[usable], np.stack(before)[usable])
-    np.testing.assert_allclose(np.stack(sources)[usable], np.stack([beam, beam])[usable])
-    assert [setup.object_pixel_size for setup in setups] == pytest.approx([3e-6, 3e-6])
-    assert job.frame.scale == pytest.approx((3, 3))
-    assert job.frame.translate == pytest.approx((0.75, 0.75))
-    assert "bin" in dict(job.inputs)["Steps"].lower()
-
-
 def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None:
     stack = np.stack([*images(), images()[0]])
     layer = window.add_image(stack, name="run", metadata=metadata_for("shot", "", SETUPS[0]))
@@ -356,7 +287,6 @@ def test_light_has_wavelengths_and_its_own_fields(window: Any, open_widget: Any)
 
 
 def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
-    second = tool.images.table.item(1, 0)
     mistakes: list[tuple[Callable[[], None], Callable[[], None], str]] = [
         (
             lambda: type_in(tool, 1, BEAM, "fast"),
@@ -369,16 +299,17 @@ def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
             "the setup of '6.0 MeV': 'Energy' is -2",
         ),
         (
-            lambda: second.setCheckState(Qt.CheckState.Unchecked),
-            lambda: second.setCheckState(Qt.CheckState.Checked),
-            "1 image is checked, expected two or more",
-        ),
-        (
             lambda: tool.source.set_kind("layer"),
             lambda: tool.source.set_kind("uniform"),
             "no source layer is selected",
         ),
     ]
+    for row, sentence in ((1, "1 image is checked"), (0, "No images are checked")):
+        tool.images.table.item(row, 0).setCheckState(Qt.CheckState.Unchecked)
+        tool.panel.button.click()
+        assert messages[-1].startswith(sentence)
+    for row in (0, 1):
+        tool.images.table.item(row, 0).setCheckState(Qt.CheckState.Checked)
     for spoil, mend, sentence in mistakes:
         messages.clear()
         spoil()
@@ -388,21 +319,6 @@ def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
         assert text[1:].startswith(sentence[1:])  # apart from its capital
         assert tool.panel.status.text() == text
         mend()
-
-
-def test_without_images_it_says_what_is_needed(
-    window: Any, open_widget: Callable[[str], Any], messages: list[str]
-) -> None:
-    tool = open_widget("Fit several images")
-    tool.panel.button.click()
-    assert messages[0].startswith("No images are checked, expected two or more")
-    (first,) = (window.add_image(image, name="a") for image in images()[:1])
-    tool.panel.button.click()
-    assert messages[1].startswith("1 image is checked")
-    window.layers.remove(first)
-    assert texts(tool, 0) == []
-    tool.panel.button.click()
-    assert messages[2] == messages[0]
 
 
 def test_what_other_widgets_change_is_followed(window: Any, tool: Any, qtbot: Any) -> None:
@@ -550,26 +466,6 @@ def test_the_compiler_is_told_and_does_not_hold_up_cancelling(
     at_work.set()
     qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
     assert not [layer for layer in window.layers if role_of(layer) == "field"]
-
-
-def test_a_window_is_closed_during_a_fit(
-    make_napari_viewer: Any, qtbot: Any, messages: list[str], traced_images: list[int]
-) -> None:
-    viewer = make_napari_viewer(show=True)
-    for energy, setup, image in zip(ENERGIES, SETUPS, images(), strict=True):
-        viewer.add_image(image, name=f"{energy} MeV", metadata=metadata_for("shot", "", setup))
-    _, tool = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Fit several images")
-    tool.view._redraw_timer.setInterval(REDRAW_MS)
-    tool.options.restore({"samples": 1000})
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: len(tool.panel.tag.progress.history) > 100, timeout=PATIENCE)
-    stop = tool.panel._box.stop
-    viewer.close()
-    qtbot.waitUntil(stop.is_set, timeout=PATIENCE)
-    traced_images.clear()
-    qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
-    assert len(traced_images) <= 8 * len(ENERGIES)  # a line search of the step under way
-    assert messages == []
 
 
 def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
@@ -831,38 +727,6 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     ]
     command(*by_flags)
     assert_same(Fit.from_dataset(read(tmp_path / "command.shadowinv")), result)
-
-
-def test_a_refined_inversion_is_made_again(
-    window: Any,
-    open_widget: Any,
-    files: list[Path],
-    qtbot: Any,
-    tmp_path: Path,
-    messages: list[str],
-) -> None:
-    tifffile.imwrite(tmp_path / "fast.tif", np.loadtxt(files[0])[MIDDLE])
-    window.open("fast.tif", plugin="napari")
-    tool = open_widget("Invert")
-    tool.options.restore({"n_sites": 500})
-    tool.setup.show_setup(SETUPS[0].model_dump())
-    tool.steps.add("low-pass")
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    enter(tool.refine_form.entries["psf"], 0.5)
-    answers: list[Any] = []
-    tool.panel.ended.connect(answers.append)
-    tool.refine_button.click()
-    qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    result = answers[0].value.content
-    assert result.provenance.start.image.file == "fast.tif"
-    save(window, result, tmp_path / "refined.shadowinv")
-    again = command("rerun", "refined.shadowinv", "--out", "again.shadowinv")
-    assert "bit for bit" in again
-    assert_same(Fit.from_dataset(read(tmp_path / "again.shadowinv")), result)
-    assert "low-pass" in command("info", "refined.shadowinv")
 
 
 def test_what_was_no_file_is_asked_for(

@@ -155,19 +155,6 @@ def test_an_instrument_shows_its_defaults_in_grey(qtbot: Any) -> None:
     assert placeholders(form) == exact
 
 
-def test_an_instrument_is_shown_by_what_is_stated(qtbot: Any) -> None:
-    """A recipe contains all numbers."""
-    form = InstrumentForm()
-    qtbot.addWidget(form)
-    instrument = Instrument.of("film", source="laser", gamma=0, noise_correlation=0)
-    form.restore(instrument.model_dump())
-    assert form.state() == instrument.stated
-    assert {"gamma", "noise_correlation"}.isdisjoint(placeholders(form))
-    form.restore({"detector": "film", "blur": -1, "gamma": 0.1})
-    with pytest.raises(InputError, match="Blur"):
-        form.model()
-
-
 def test_choices_for_recipes_have_a_row_while_they_are_stated(qtbot: Any) -> None:
     form = ModelForm(InversionOptions)
     qtbot.addWidget(form)
@@ -243,17 +230,6 @@ def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot: Any, settings_fol
     assert form.model() == InversionOptions()
     form.restore({"seed": "many"})
     assert "'many'" in form._problem.text()
-
-
-def test_mistakes_name_the_fields_by_their_labels(qtbot: Any) -> None:
-    form = the_form(qtbot, ProtonSetup)
-    form.restore({"energy": 14.7e6, "pixel_size": 1e-6})
-    with pytest.raises(InputError) as refused:
-        form.model()
-    text = str(refused.value)
-    assert "'Source to object (m)' is missing" in text
-    assert "'Kinetic energy (MeV)' is 14700000.0: it must be at most" in text
-    assert not any(key in text for key in ("source_object_distance", "'energy'"))
 
 
 def test_contradictions_name_the_fields_by_their_labels(qtbot: Any) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import math
 import sys
 import threading
 import time
@@ -11,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import dask.array
 import h5py
 import numpy as np
 import pytest
@@ -19,8 +16,9 @@ from napari.utils import progress
 
 from helpers.forms import enter
 from helpers.jobs import run_job
+from helpers.layers import layer_of
 from helpers.reports import texts_of
-from napari_shadowinv import Instrument, InversionOptions, ProtonSetup, invert, read
+from napari_shadowinv import Instrument, InversionOptions, ProtonSetup, invert
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari.jobs import Job
 from napari_shadowinv._napari.layer_metadata import (
@@ -35,10 +33,8 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
-from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.pipeline.run_options import RunOptions
-from napari_shadowinv.preprocessing import STEPS, Crop, LowPassFilter, PolynomialEstimate, Recipe
-from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.preprocessing import STEPS
 
 Array = np.ndarray[Any, Any]
 FEW = {"n_sites": 500}
@@ -51,19 +47,6 @@ def tool(window: Any, open_widget: Callable[[str], Any], shot: Array) -> Any:
     widget = open_widget("Invert")
     widget.options.restore(FEW)
     return widget
-
-
-@pytest.fixture
-def run(qtbot: Any) -> Callable[[Any], None]:
-    """Press Run and wait until the layers are there."""
-
-    def pressed(widget: Any) -> None:
-        before = getattr(widget, "results", None)
-        widget.panel.button.click()
-        qtbot.waitUntil(lambda: getattr(widget, "results", None) is not before, timeout=PATIENCE)
-        qtbot.waitUntil(lambda: not widget.results.busy, timeout=PATIENCE)
-
-    return pressed
 
 
 @pytest.fixture
@@ -88,12 +71,6 @@ def computed(tool: Any) -> Any:
 
 def settled(tool: Any) -> bool:
     return not tool.panel.running and not tool._preview_timer.isActive()
-
-
-def layer_of(viewer: Any, role: str, word: str = "") -> Any:
-    matches = [layer for layer in viewer.layers if role_of(layer) == role and word in layer.name]
-    assert len(matches) == 1, [layer.name for layer in viewer.layers]
-    return matches[0]
 
 
 def test_the_window_thread_computes_nothing_during_a_run(
@@ -234,31 +211,8 @@ def test_what_a_file_brings_is_used_and_told(window: Any, tool: Any, shot: Array
     assert inversion.report.cautions[-1].text == "it may be film"
 
 
-def test_a_saved_result_tells_how_it_was_made(
-    window: Any, tool: Any, shot: Array, run: Any, tmp_path: Path
-) -> None:
-    np.save(tmp_path / "flame.npy", shot)
-    window.open(str(tmp_path / "flame.npy"), plugin="napari")
-    tool.image.layer = window.layers["flame"]
-    tool.steps.add("low-pass")
-    tool.source.set_kind("polynomial")
-    tool.crop.layer = window.add_shapes(np.array([[4, 8], [4, 50], [40, 50], [40, 8]]))
-    run(tool)
-    window.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
-    provenance = Provenance.of(read(tmp_path / "a.shadowinv").attrs)
-    assert provenance is not None
-    file = (tmp_path / "flame.npy").read_bytes()
-    assert provenance.image.file == "flame.npy"
-    assert provenance.image.sha256 == hashlib.sha256(file).hexdigest()
-    assert provenance.recipe == Recipe(
-        steps=(Crop(y=(4, 41), x=(8, 51)), LowPassFilter(width=1.0)),
-        source=PolynomialEstimate(degree=2),
-        options=InversionOptions(**FEW),
-    )
-
-
 def test_cancel_ends_the_work_itself(
-    window: Any, tool: Any, slow: threading.Event, qtbot: Any, monkeypatch: pytest.MonkeyPatch
+    window: Any, tool: Any, slow: threading.Event, qtbot: Any
 ) -> None:
     tool.panel.button.click()
     qtbot.waitUntil(lambda: tool.panel.button.text() == "Cancel", timeout=PATIENCE)
@@ -268,36 +222,6 @@ def test_cancel_ends_the_work_itself(
     assert not tool.panel.button.isEnabled()
     qtbot.waitUntil(lambda: tool.panel.button.text() == "Run", timeout=PATIENCE)
     assert tool.panel.status.text() == "Cancelled."
-
-    cancelled = threading.Event()
-    stages_after_cancel: list[str] = []
-    work = Job.work
-
-    def held(job: Job, on_progress: Any, should_stop: Any) -> Any:
-        """Hold the work at its first site until it is cancelled, and record its later stages."""
-
-        def watch(progress: Any) -> None:
-            if cancelled.is_set():
-                stages_after_cancel.append(progress.stage)
-            on_progress(progress)
-            if progress.stage == "sites":
-                cancelled.wait()
-
-        return work(job, watch, should_stop)
-
-    monkeypatch.setattr(Job, "work", held)
-    slow.set()
-    shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement)
-    window.layers["shot"].data = shot
-    tool.options.restore({"tolerance": 1e-12, "lloyd_iterations": 1000, "lloyd_tolerance": 0})
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: "Placing the sites" in tool.panel.status.text(), timeout=PATIENCE)
-    monkeypatch.setattr(Job, "patience", math.inf)
-    tool.panel.button.click()
-    cancelled.set()
-    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
-    # Of a thousand iterations at most the one at hand is finished.
-    assert stages_after_cancel in ([], ["sites"])
     assert [layer.name for layer in window.layers] == ["shot"]
     assert not progress._all_instances
 
@@ -357,44 +281,34 @@ USER_ERRORS = {
     "no image": None,
     "colour": np.ones((20, 20, 3)),
     "o store is selected": np.ones((3, 20, 20)),
-    "at least 4 × 4": np.ones((1, 1)),
-    "no positive pixel": np.zeros((20, 20)),
     "NaN": np.full((20, 20), np.nan),
-    "negative": np.where(np.eye(20) * np.arange(20) == 10, -0.5, 1.0),
 }
 
 
-@pytest.fixture
-def expecting(messages: list[str], qtbot: Any) -> Any:
-    """Press Run, and check that it sends one notification with these words."""
-
-    def of_tool(tool: Any) -> Any:
-        def expect(words: str) -> None:
-            messages.clear()
-            tool.panel.button.click()
-            qtbot.waitUntil(lambda: bool(messages) and not tool.panel.running, timeout=PATIENCE)
-            qtbot.wait(30)
-            assert len(messages) == 1, messages
-            assert words in messages[0]
-            assert "\n" not in messages[0]
-            # It can be read when the notification is gone.
-            assert words.lower() in tool.panel.status.text().lower()
-            assert tool.panel.status.isVisible()
-            assert tool.panel.button.text() == "Run"
-            assert tool.panel.button.isEnabled()
-
-        return expect
-
-    return of_tool
-
-
 def test_a_mistake_is_told_once_and_the_viewer_lives(
-    window: Any, open_widget: Any, expecting: Any, monkeypatch: pytest.MonkeyPatch
+    window: Any,
+    open_widget: Any,
+    messages: list[str],
+    qtbot: Any,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tool = open_widget("Invert")
     tool.options.restore(FEW)
 
-    expect = expecting(tool)
+    def expect(words: str) -> None:
+        """Press Run, and check that it sends one notification with these words."""
+        messages.clear()
+        tool.panel.button.click()
+        qtbot.waitUntil(lambda: bool(messages) and not tool.panel.running, timeout=PATIENCE)
+        qtbot.wait(30)
+        assert len(messages) == 1, messages
+        assert words in messages[0]
+        assert "\n" not in messages[0]
+        # It can be read when the notification is gone.
+        assert words.lower() in tool.panel.status.text().lower()
+        assert tool.panel.status.isVisible()
+        assert tool.panel.button.text() == "Run"
+        assert tool.panel.button.isEnabled()
 
     for words, data in USER_ERRORS.items():
         window.layers.clear()
@@ -417,6 +331,10 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     tool.source.set_kind("file")
     expect("o source file")
     tool.source.set_kind("uniform")
+    tool._draw_crop()
+    tool.crop.layer.add_rectangles(np.array([[500, 500], [500, 600], [600, 600], [600, 500]]))
+    expect("0 × 0 pixels")
+    tool.crop.layer = None
     tool.setup.picker.set_kind("proton")
     expect("energy")
     tool.setup.picker.set_kind("none")
@@ -426,24 +344,6 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
 
     monkeypatch.setattr(jobs, "run", broken)
     expect("a fault of the program's")
-
-
-def test_a_mistake_in_a_layer_of_another_kind_is_told_once(
-    window: Any, tool: Any, shot: Array, expecting: Any
-) -> None:
-    expect = expecting(tool)
-    some = shot.copy()
-    some[3, 5] = np.nan
-    tool.image.layer = window.add_image(some, name="nan", contrast_limits=(0, 500))
-    expect("1 pixel")
-    lazy = dask.array.ones((3, 20, 20), chunks=(1, 20, 20))
-    tool.image.layer = window.add_image(lazy, name="stack", contrast_limits=(0, 1))
-    expect("o store is selected")
-    tool.image.layer = window.layers["shot"]
-    tool._draw_crop()
-    tool.crop.layer.add_rectangles(np.array([[500, 500], [500, 600], [600, 600], [600, 500]]))
-    expect("0 × 0 pixels")
-    assert window.layers["shot"] in window.layers
 
 
 def test_whole_numbers_and_the_finest_of_many_scales_are_inverted(
@@ -625,18 +525,6 @@ def test_camera_fits_after_units_change(
     zoom = camera.zoom
     window.reset_view()
     assert camera.zoom == pytest.approx(zoom)
-
-
-def test_a_recipe_keeps_detector_and_beam_source(tool: Any, tmp_path: Path) -> None:
-    stated = Instrument.of("film", source="TNSA", gamma=0.2, noise_correlation=1)
-    tool.instrument.restore(stated.stated)
-    tool.recipes.save(tmp_path / "recipe.toml")
-    assert read_recipe(tmp_path / "recipe.toml").instrument == stated
-    tool.instrument.restore({})
-    assert tool.instrument.model() == Instrument()
-    tool.recipes.load(tmp_path / "recipe.toml")
-    assert tool.instrument.model() == stated
-    assert tool.instrument.state() == stated.stated
 
 
 def test_a_layer_of_an_estimated_source_was_not_measured(

@@ -8,15 +8,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import dask.array as da
 import numpy as np
 import pytest
 
 from helpers.forms import enter
+from helpers.layers import layer_of
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert
 from napari_shadowinv._napari.layer_metadata import role_of
-from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, read_stack
+from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.stack import _schedulers, _worker
@@ -84,11 +84,6 @@ def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     return let_go
 
 
-def layer_of(viewer: Any, role: str) -> Any:
-    (match,) = [layer for layer in viewer.layers if role_of(layer) == role]
-    return match
-
-
 def written(out: Path) -> dict[str, int]:
     """When each shot's potential was written."""
     chunks = out / "potential" / "c"
@@ -134,28 +129,6 @@ def test_a_stack_layer_becomes_a_store_and_layers(
     run(tool)
     assert written(out) == before
     assert [role_of(layer) for layer in window.layers].count("field") == 1
-
-
-def test_a_lazy_layer_is_read_shot_by_shot(
-    window: Any, tool: Any, run: Any, stack: Array, out: Path
-) -> None:
-    at_once: list[int] = []
-
-    def read(block: Array) -> Array:
-        at_once.append(len(block))
-        return block
-
-    lazy = da.from_array(stack, chunks=(1, -1, -1)).map_blocks(read, meta=np.empty((0, 0, 0)))
-    tool.image.layer = window.add_image(lazy, name="lazy", contrast_limits=(0, 200))
-    run(tool)
-    assert set(at_once) == {1}
-    stored = StackStore(out)
-    assert (stored.statuses() == DONE).all()
-    expected = invert(stack[3], options=InversionOptions(**FEW))
-    potential = np.asarray(read_stack(out)["potential"][3])
-    np.testing.assert_allclose(
-        potential, expected.potential, atol=1e-5 * np.ptp(expected.potential)
-    )
 
 
 def test_a_corrupt_file_is_listed_and_the_others_are_done(

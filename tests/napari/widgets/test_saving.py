@@ -25,17 +25,10 @@ def tool(window: Any, open_widget: Callable[[str], Any], shot: Any) -> Any:
     return widget
 
 
-def run(tool: Any, qtbot: Any) -> None:
-    before = getattr(tool, "results", None)
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: getattr(tool, "results", None) is not before, timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-
-
 def test_saved_result_comes_back_and_is_inverted_again(
-    window: Any, tool: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
+    window: Any, tool: Any, run: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
 ) -> None:
-    run(tool, qtbot)
+    run(tool)
     verdict, peak = tool.verdict.text(), window.layers.selection.active.data.max()
     choose(tmp_path / "a")
     tool.save_result.click()
@@ -55,14 +48,14 @@ def test_saved_result_comes_back_and_is_inverted_again(
     # The image has its setup and source, and is a shot again.
     assert role_of(tool.image.layer) == "image"
     assert tool.setup.setup() == paper_setup()
-    run(tool, qtbot)
+    run(tool)
     assert window.layers.selection.active.data.max() == pytest.approx(peak, rel=1e-6)
 
 
 def test_save_asks_before_it_replaces_a_file(
-    tool: Any, qtbot: Any, tmp_path: Path, choose: Any
+    tool: Any, run: Any, tmp_path: Path, choose: Any
 ) -> None:
-    run(tool, qtbot)
+    run(tool)
     path = tmp_path / "a.shadowinv"
     path.write_text("precious")
     choose(tmp_path / "a")
@@ -83,9 +76,9 @@ def test_save_without_a_result_says_what_to_do(
 
 
 def test_save_that_fails_leaves_no_file(
-    tool: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
+    tool: Any, run: Any, tmp_path: Path, choose: Any, messages: list[str]
 ) -> None:
-    run(tool, qtbot)
+    run(tool)
     choose(tmp_path / "nowhere" / "a")
     tool.save_result.click()
     assert "nowhere" in messages[-1]
@@ -94,8 +87,10 @@ def test_save_that_fails_leaves_no_file(
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_more_layers_adds_those_that_are_missing(tool: Any, window: Any, qtbot: Any) -> None:
-    run(tool, qtbot)
+def test_more_layers_adds_those_that_are_missing(
+    tool: Any, window: Any, run: Any, qtbot: Any
+) -> None:
+    run(tool)
     few = [role_of(layer) for layer in window.layers]
     assert few == ["shot", "residual", "field", "caustic", "arrows"]
     tool.more_layers.click()
@@ -111,7 +106,7 @@ def test_more_layers_adds_those_that_are_missing(tool: Any, window: Any, qtbot: 
     }
     count = len(window.layers)
     tool.more_layers.click()
-    run(tool, qtbot)
+    run(tool)
     assert len(window.layers) == count
 
 

@@ -12,7 +12,7 @@ from napari.components import ViewerModel
 
 from helpers.forms import enter
 from helpers.reports import texts_of
-from napari_shadowinv import InputError, InversionOptions, ProtonSetup
+from napari_shadowinv import InputError, ProtonSetup
 from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
@@ -31,9 +31,7 @@ from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
-from napari_shadowinv.pipeline import run as run_recipe
-from napari_shadowinv.preprocessing import Crop, PolynomialEstimate, Recipe
-from napari_shadowinv.shot import Shot
+from napari_shadowinv.preprocessing import PolynomialEstimate
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
@@ -338,21 +336,6 @@ def hump() -> tuple[Array, Array, Array]:
     return synthetic_image(blob.displacement, beam), blob.potential, is_object
 
 
-def test_a_source_mask_hides_the_object_from_the_estimate_alone(
-    hump: tuple[Array, Array, Array],
-) -> None:
-    shot, potential, is_object = hump
-    recipe = Recipe(source=PolynomialEstimate(degree=2), options=InversionOptions(n_sites=1500))
-    inversion = run_recipe(recipe, Shot(shot, source_mask=~is_object))
-    assert inversion.mask.all()
-    assert np.ptp(inversion.potential) == pytest.approx(np.ptp(potential), rel=0.1)
-    cropped = Recipe(steps=(Crop(y=(2, 62), x=(4, 70)),))
-    moved = cropped.move(Shot(shot, source_mask=~is_object)).source_mask
-    np.testing.assert_array_equal(moved, ~is_object[2:62, 4:70])
-    with pytest.raises(InputError, match="source mask has shape"):
-        run_recipe(recipe, Shot(shot, source_mask=is_object[1:]))
-
-
 def the_masks(tool: Any) -> Any:
     """Return the object with the masks of a run."""
     job = tool.request()
@@ -428,17 +411,6 @@ def test_a_mask_over_the_object_is_refused(
 
 
 # What is said of a run
-
-
-@pytest.fixture
-def run(qtbot: Any) -> Any:
-    def pressed(tool: Any) -> None:
-        before = getattr(tool, "results", None)
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda: getattr(tool, "results", None) is not before, timeout=PATIENCE)
-        qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-
-    return pressed
 
 
 def test_a_result_says_where_everything_came_from(

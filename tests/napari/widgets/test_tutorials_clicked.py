@@ -156,6 +156,7 @@ def wait_for_layers(tool: Any, qtbot: Any) -> None:
 
 
 def layer_of(window: Any, role: str) -> Any:
+    """Return the topmost layer with a role."""
     return [layer for layer in window.layers if role_of(layer) == role][-1]
 
 

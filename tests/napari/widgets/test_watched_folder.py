@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from helpers.layers import layer_of
 from helpers.reports import texts_of
 from napari_shadowinv._napari.form import PROBLEM_STYLE
 from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
@@ -44,11 +45,6 @@ def tool(open_widget: Any, folder: Path, out: Path) -> Any:
     tool.store.watch.restore({"pattern": "*.npy"})
     tool.store.folder.edit.setText(str(out))
     return tool
-
-
-def layer_of(viewer: Any, role: str) -> Any:
-    (match,) = [layer for layer in viewer.layers if role_of(layer) == role]
-    return match
 
 
 def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
