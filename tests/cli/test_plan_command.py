@@ -115,7 +115,7 @@ def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):
         (("plan", "torroid"), "did you mean 'toroid'"),
         (("plan", "torroid:peak=1.5"), "did you mean 'toroid'"),
         (("plan", "toroid"), "particles"),
-        (("plan", "blob", "--energies", "3,15"), "--energies: it needs --setup"),
+        (("plan", "blob", "--energies", "3,15"), "--energies is '3,15': it needs a setup"),
         (("plan", "toroid", "--setup", "setup.toml", "--energies", "3;15"), "separated by commas"),
         (("plan", "blob", "--size", "200"), "expected height and width"),
         (("plan", "blob", "--sweep", "counts"), "expected NAME=VALUES"),

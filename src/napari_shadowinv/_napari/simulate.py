@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -33,11 +33,11 @@ from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors
 from napari_shadowinv._system.validation import CheckedModel, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
-from napari_shadowinv.physics.beam import number_in_unit
+from napari_shadowinv.physics.beam import numbers_in_unit
 from napari_shadowinv.physics.phantom_models import PHANTOMS
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.pipeline.experiment import SWEPT
-from napari_shadowinv.pipeline.experiment_object import shape_of_text
+from napari_shadowinv.pipeline.experiment_object import setups_of_text, shape_of_text
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.plotting import draw_errors
 
@@ -182,18 +182,20 @@ class Simulate(panels.ToolPanel):
         if self.task.kind == _IMAGE:
             return self._image_job(target, setup, shape or ForwardJob.shape)
         key, sweep = self.quantity.kind, self.quantity.model()
-        values = "" if sweep is None else sweep.values  # type: ignore[attr-defined]
-        unit = SWEPT[key].unit if values else ""
+        values: list[float] = []
+        if sweep is not None:
+            text = sweep.values  # type: ignore[attr-defined]
+            values = numbers_in_unit(text, SWEPT[key].unit, "Values")
         instrument = validate(Instrument, self.instrument.state(), "instrument")
         options: Any = self.options.model()
         return PlanJob(
             object=target,
-            setups=self._setups(setup),
+            setups=tuple(setups_of_text(setup, self.energies.text(), "the energies") or ()),
             shape=shape,
             instrument=instrument,
             options=options,
             quantity=key,
-            values=tuple(_numbers("the values", values, unit)),
+            values=tuple(values),
         )
 
     def _object(self, setup: Setup | None) -> SimulatedObject:
@@ -228,18 +230,6 @@ class Simulate(panels.ToolPanel):
             unit=about.unit_of(beam or {}),
             setup_origin=self.setup.origin,
             subject=target.title if layer is None else layer,
-        )
-
-    def _setups(self, setup: Setup | None) -> tuple[Setup, ...]:
-        text = self.energies.text().strip()
-        if not text:
-            return () if setup is None else (setup,)
-        if setup is None:
-            raise InputError("received energies without a setup: choose the setup of all images")
-        quantity = setup.beam_quantity()
-        return tuple(
-            validate(type(setup), {**setup.model_dump(), quantity.name: value}, quantity.plural)
-            for value in _numbers(quantity.plural, text, quantity.unit)
         )
 
     def _image_to_save(self) -> Savable:
@@ -323,13 +313,3 @@ def _values_of(key: str) -> tuple[str, type[CheckedModel]]:
     tip = f"Values of the quantity, separated by commas{unit}."
     field: Any = Field(title="Values", description=tip)
     return swept.title, create_model(key, __base__=CheckedModel, values=(str, field))
-
-
-def _numbers(name: str, text: str, unit: str = "") -> Sequence[float]:
-    parts = [part for part in text.split(",") if part.strip()]
-    try:
-        return [number_in_unit(part, unit) for part in parts]
-    except ValueError:
-        raise InputError(
-            f"{name}: received '{text}', expected numbers separated by commas"
-        ) from None

@@ -12,7 +12,6 @@ from typer import Option
 from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._inputs import read_setup
 from napari_shadowinv.cli._outputs import Outputs
-from napari_shadowinv.cli._settings import numbers_of
 from napari_shadowinv.cli._summary import Rows, fact_rows, two_columns
 from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
@@ -78,6 +77,7 @@ def analyse(
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
     from napari_shadowinv.io.store import is_stack
     from napari_shadowinv.io.store_shots import open_shots
+    from napari_shadowinv.physics.beam import numbers_in_unit
 
     chosen, outputs = _products(product or [], flags.products), Outputs(overwrite, quiet)
     outputs.check(
@@ -105,7 +105,8 @@ def analyse(
         if "shot" in dataset.dims:
             seconds = None
             if flags.times is not None:
-                numbers, shots = numbers_of("--times", flags.times), dataset["index"].values
+                numbers = numbers_in_unit(flags.times, "s", "--times")
+                shots = dataset["index"].values
                 seconds = shot_times(numbers, shots.tolist(), f"--times is {flags.times!r}")
             results = analyse_shots(dataset, chosen, seconds, **common)
         else:

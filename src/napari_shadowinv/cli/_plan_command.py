@@ -11,16 +11,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Exit, Option
 
 from napari_shadowinv._system.tables import write_cells
-from napari_shadowinv._system.validation import validate
 from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._inputs import read_setup
 from napari_shadowinv.cli._outputs import Outputs, figure_beside
-from napari_shadowinv.cli._settings import Sections, Settings, numbers_of, settings_of
+from napari_shadowinv.cli._settings import Sections, Settings, settings_of
 from napari_shadowinv.cli._summary import fact_rows, headline_row
 from napari_shadowinv.cli._terminal import EXIT_NOT_CONVERGED, notify_errors, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import split_address
 from napari_shadowinv.options import Instrument
+from napari_shadowinv.physics.beam import numbers_in_unit
 from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 
@@ -80,7 +80,7 @@ def plan(
     from napari_shadowinv.io.files import replacing
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES
     from napari_shadowinv.pipeline.experiment import plan_experiment, sweep_experiment
-    from napari_shadowinv.pipeline.experiment_object import shape_of_text
+    from napari_shadowinv.pipeline.experiment_object import setups_of_text, shape_of_text
     from napari_shadowinv.plotting import plan_figure, sweep_figure
 
     page, outputs = figure or figure_beside(out), Outputs(overwrite, quiet)
@@ -92,7 +92,7 @@ def plan(
     stated = settings_of(settings or (), SECTIONS, keys)
     options = stated.change("plan", ExperimentOptions())
     instrument = stated.change("instrument", Instrument())
-    setups = _setups(read_setup(flags.setup), flags.energies)
+    setups = setups_of_text(read_setup(flags.setup), flags.energies or "", "--energies")
     shape = None if flags.size is None else shape_of_text(flags.size, "--size")
     target: Any = _object(object, flags, setups, stated)
     choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
@@ -167,19 +167,8 @@ def _object(
     )
 
 
-def _setups(setup: Setup | None, energies: str | None) -> list[Setup] | None:
-    if energies is None:
-        return None if setup is None else [setup]
-    if setup is None:
-        raise InputError("received --energies: it needs --setup, the geometry of all images")
-    return [
-        validate(type(setup), {**setup.model_dump(), setup.beam_field: value}, "--energies")
-        for value in numbers_of("--energies", energies)
-    ]
-
-
 def _sweep(text: str) -> dict[str, list[float]]:
     name, equals, values = text.partition("=")
     if not equals:
         raise InputError(f"--sweep is '{text}': expected NAME=VALUES, such as counts=100,300,1000")
-    return {name.strip().replace("-", "_"): numbers_of("--sweep", values)}
+    return {name.strip().replace("-", "_"): numbers_in_unit(values, "", "--sweep")}

@@ -193,14 +193,6 @@ def source_from(text: str, before: Estimate | None) -> Estimate:
     return source
 
 
-def numbers_of(flag: str, text: str) -> list[float]:
-    """Return the numbers of a flag, separated by commas."""
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(f"{flag} is '{text}': expected numbers separated by commas") from None
-
-
 def _parse_choice(flag: str, text: str, choices: Mapping[str, Any]) -> tuple[Any, dict[str, str]]:
     """Return the choice that a text names, and its parameters; quotes keep a space in one."""
     if len(text) > 10_000:

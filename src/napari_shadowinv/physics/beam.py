@@ -31,6 +31,7 @@ from napari_shadowinv._system.arrays import check_plane, plain_array, refuse_mas
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.errors import InputError
 
 _QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[eE]([+-]?\d+))?\s*(.*)")
 _UNIT_IN_TITLE = re.compile(r"\(([^()]+)\)$")
@@ -79,6 +80,14 @@ def number_in_unit(text: str, unit: str) -> float:
             raise ValueError(f"the unit '{name}' cannot be converted to {unit}; {expected}")
         power += ratio
     return float(f"{digits}e{power}")
+
+
+def numbers_in_unit(text: str, unit: str, name: str) -> list[float]:
+    """Read numbers separated by commas, as `number_in_unit`; `name` is what the text states."""
+    try:
+        return [number_in_unit(part, unit) for part in text.split(",")]
+    except ValueError as error:
+        raise InputError(f"{name} is '{text}': {error}, separated by commas") from None
 
 
 def text_in_unit(value: float, unit: str) -> str:

@@ -1,7 +1,7 @@
 """Objects of a planned experiment: `PlannedObject`.
 
 - a phantom, by its model: `object_of_phantom`; by a text: `phantom_of_text`; the size of an image
-  by a text: `shape_of_text`
+  by a text: `shape_of_text`; setups at several energies: `setups_of_text`
 - a 3-D field, through which particles are traced: `object_of_field`
 - a field that was retrieved or computed before: `object_of_result`, `object_of_displacement`
 
@@ -21,6 +21,7 @@ from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.beam import numbers_in_unit
 from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.forward import checked_displacement, synthetic_image
 from napari_shadowinv.physics.particle_flight import check_particles
@@ -297,6 +298,18 @@ def shape_of_text(text: str, name: str) -> tuple[int, int]:
     if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
         raise InputError(f"{name} is '{text}': expected height and width in px, such as 200x200")
     return int(parts[0]), int(parts[1])
+
+
+def setups_of_text(setup: Setup | None, text: str, name: str) -> list[Setup] | None:
+    """Return a setup at the energies or wavelengths of a text, or alone without any."""
+    if not text.strip():
+        return None if setup is None else [setup]
+    if setup is None:
+        raise InputError(f"{name} is '{text}': it needs a setup, the geometry of all images")
+    quantity = setup.beam_quantity()
+    values = numbers_in_unit(text, quantity.unit, name)
+    changes = [{**setup.model_dump(), quantity.name: value} for value in values]
+    return [validate(type(setup), each, name) for each in changes]
 
 
 _DEFLECTORS = {"proton": "magnetic field", "optical": "plasma"}

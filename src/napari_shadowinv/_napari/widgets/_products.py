@@ -43,7 +43,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES
 from napari_shadowinv.io.store_shots import open_shots
-from napari_shadowinv.physics.beam import number_in_unit
+from napari_shadowinv.physics.beam import numbers_in_unit
 from napari_shadowinv.physics.units import prefix_for
 from napari_shadowinv.plotting import draw_curves, products_figure, save_figure
 
@@ -341,14 +341,7 @@ def _seconds(times: str, shots: list[int]) -> list[float] | None:
     """Return the time of each shot in s; None if shots are numbered."""
     if not times:
         return None
-    received = f"Times is '{times}'"
-    try:
-        numbers = [number_in_unit(part, "s") for part in times.split(",")]
-    except ValueError:
-        raise InputError(
-            f"{received}, expected times separated by commas, such as 1 ns or 0, 1 ns, 3 ns"
-        ) from None
-    return shot_times(numbers, shots, received)
+    return shot_times(numbers_in_unit(times, "s", "Times"), shots, f"Times is '{times}'")
 
 
 def export_csv(parent: QtWidgets.QWidget, stem: str, text: str) -> None:
