@@ -380,10 +380,11 @@ def test_arrows_follow_the_shot_in_view(
 
 
 def test_arrows_of_a_store_follow_in_a_window(
-    make_napari_viewer: Any, store: Path, solved: Inversion
+    make_napari_viewer: Any, store: Path, solved: Inversion, qtbot: Any
 ) -> None:
     window = make_napari_viewer()
     layers = {role_of(layer): layer for layer in window.open(store, plugin=PLUGIN)}
+    qtbot.waitUntil(lambda: window.layers.selection.active is layers["field"])
     window.dims.set_point(0, 2)
     np.testing.assert_allclose(layers["arrows"].data[:, :, 1:], rays(solved, 0.5))
 

@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from napari_shadowinv._napari.layer_metadata import main_layers, result_of
+from napari_shadowinv._napari.layer_metadata import main_layers, metadata_of, result_of, role_of
 from napari_shadowinv._napari.viewer_sync import (
     connect_viewer,
     notify_errors,
-    select_once_added,
+    once_added,
     show_caution,
+    show_scale_bar,
 )
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
@@ -59,10 +60,9 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
         return stack_layers([Path(item) for item in path])
     file, variable = split_address(path)
     if file.name.endswith(STORE.suffix):
-        from napari_shadowinv._napari.stores import follow_once_added, store_layers
+        from napari_shadowinv._napari.stores import store_layers
 
         layers = main_layers(store_layers(file))
-        follow_once_added(layers)
         _show_in_window(layers)
         return layers
     if variable is None and is_pattern(file):
@@ -120,10 +120,23 @@ def _read_content(path: Path, array: str) -> list[Any]:
 
 
 def _show_in_window(layers: Sequence[Any]) -> None:
-    """Show colour bar and scale bar of an opened result in a window, and select its field."""
-    from napari_shadowinv._napari.stores import viewer_in_window
+    """In a window, show an opened result with its bars, and select its field."""
+    from napari_shadowinv._napari.stores import follow_shots, viewer_in_window
 
     viewer = viewer_in_window()
-    if viewer is not None:
-        connect_viewer(viewer)
-        select_once_added(viewer, layers)
+    if viewer is None:
+        return
+
+    def show(added: list[Any]) -> None:
+        show_scale_bar(viewer)
+        present = [layer for layer in added if layer in viewer.layers]
+        fields = [layer for layer in present if role_of(layer) == "field"]
+        for layer in present:
+            if role_of(layer) == "arrows" and "store" in metadata_of(layer):
+                follow_shots(viewer, layer)
+        if fields:
+            shown = [layer for layer in fields if layer.visible]
+            viewer.layers.selection.active = (shown or fields)[-1]
+
+    connect_viewer(viewer)
+    once_added(viewer, len(layers), show)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari.events import connect
-from napari_shadowinv._napari.layer_metadata import frame_for, main_layers, metadata_of, role_of
+from napari_shadowinv._napari.layer_metadata import frame_for, main_layers, metadata_of
 from napari_shadowinv._napari.layers import (
     FullLayerData,
     LayerData,
@@ -193,19 +193,3 @@ def viewer_in_window() -> Any | None:
     from napari import current_viewer
 
     return current_viewer()
-
-
-def follow_once_added(layer_data: Sequence[FullLayerData]) -> None:
-    """Make the arrows follow the shot in view once they are in the window."""
-    viewer = viewer_in_window()
-    arrows = [keywords for _, keywords, _ in layer_data if role_of(keywords) == "arrows"]
-    stores = {metadata_of(keywords).get("store") for keywords in arrows}
-    if viewer is None or not stores:
-        return
-
-    def begin(layer: Any) -> None:
-        if role_of(layer) == "arrows" and metadata_of(layer).get("store") in stores:
-            disconnect()
-            follow_shots(viewer, layer)
-
-    disconnect = connect(viewer.layers, "inserted", begin)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import sys
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -102,25 +102,18 @@ def show_scale_bar(viewer: Any) -> None:
     overlays.scale_bar.visible = True
 
 
-def select_once_added(viewer: Any, layer_data: Sequence[Any]) -> None:
-    """Select a result's field and show the scale bar once napari has added its last layer."""
+def once_added(viewer: Any, count: int, show: Callable[[list[Any]], Any]) -> None:
+    """Call a function with the next layers once napari has added and selected all of them."""
     from qtpy.QtCore import QTimer
 
     added: list[Any] = []
 
-    def select() -> None:
-        show_scale_bar(viewer)
-        fields = [layer for layer in added if role_of(layer) == "field" and layer in viewer.layers]
-        fields = [layer for layer in fields if layer.visible] or fields
-        if fields:
-            viewer.layers.selection.active = fields[-1]
-
     def collect(layer: Any) -> None:
         added.append(layer)
-        if len(added) == len(layer_data):
+        if len(added) == count:
             disconnect()
             # napari selects a layer after the event of its insertion.
-            QTimer.singleShot(0, select)
+            QTimer.singleShot(0, lambda: show(added))
 
     disconnect = connect(viewer.layers, "inserted", collect)
 
