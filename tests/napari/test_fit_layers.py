@@ -88,7 +88,7 @@ def opened(viewer: ViewerModel, path: Path) -> dict[str, Any]:
 
 def shown(viewer: ViewerModel, content: Fit, **place: Any) -> dict[str, Any]:
     """The layers of a fit as the widget adds them."""
-    result = Result(content, content.setups[0], {"mask_origin": "painted"})
+    result = Result(content, content.setups[0], {"Mask": "painted"})
     layers = add_layers(viewer, fit_layers(result, Frame(**place), "pack fit"))
     return {layer_key(layer): layer for layer in layers}
 
@@ -175,7 +175,7 @@ def test_any_layer_stands_for_the_fit_when_it_is_saved(
         assert reopened["field E"].colormap.name == "viridis"
         assert tuple(reopened["field"].translate) == (3, 4)
         np.testing.assert_array_equal(reopened["field"].rotate, turned["rotate"])
-        assert result_of(reopened["field"]).attributes["mask_origin"] == "painted"
+        assert result_of(reopened["field"]).origins["Mask"] == "painted"
         viewer.layers.clear()
         layers = shown(viewer, two_fields, **turned)
         layers["field E"].colormap = "viridis"

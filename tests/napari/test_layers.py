@@ -189,11 +189,11 @@ def test_many_sites_are_thinned_and_the_name_says_so(
 def test_each_layer_knows_the_whole_result(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup
 ) -> None:
-    for layer in add_to_viewer(viewer, solved, proton_setup, attributes={"setup_origin": "typed"}):
+    for layer in add_to_viewer(viewer, solved, proton_setup, origins={"Setup": "typed"}):
         result = result_of(layer)
         assert result is not None
         assert result.content is solved
-        assert result.attributes == {"setup_origin": "typed"}
+        assert result.origins == {"Setup": "typed"}
 
 
 def test_an_uneven_source_has_its_layer(viewer: ViewerModel, solved: Inversion) -> None:

@@ -89,7 +89,7 @@ def test_all_layers_come_back_as_they_were(
 def test_nothing_of_the_result_is_lost(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
 ) -> None:
-    add_to_viewer(viewer, solved, proton_setup, attributes={"setup_origin": "typed"})
+    add_to_viewer(viewer, solved, proton_setup, origins={"Setup": "typed"})
     viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
     dataset = read(tmp_path / "a.shadowinv")
     (*_, layer) = viewer.open(tmp_path / "a.shadowinv", plugin=PLUGIN)
@@ -98,7 +98,7 @@ def test_nothing_of_the_result_is_lost(
         np.testing.assert_array_equal(dataset[name], expected[name])
     assert dataset.attrs["options"] == expected.attrs["options"]
     assert dataset.attrs["setup"] == expected.attrs["setup"]
-    assert metadata_of(layer)["made_from"] == {"setup_origin": "typed"}
+    assert result_of(layer).origins == {"Setup": "typed"}  # type: ignore[union-attr]
 
 
 def test_one_saved_layer_stands_for_the_main_ones(

@@ -75,14 +75,14 @@ def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> results.La
     """Invert the selected image against a uniform source, with the default options."""
     from napari_shadowinv._napari.jobs import InversionJob
 
-    attributes = {"source_origin": "uniform"}
+    origins = {"Source": "uniform"}
     if selection.setup_origin:
-        attributes["setup_origin"] = selection.setup_origin
+        origins["Setup"] = selection.setup_origin
     job = InversionJob(
         recipe=preprocessing.Recipe(source=preprocessing.UniformEstimate(), setup=selection.setup),
         name=selection.name,
         frame=selection.frame,
-        attributes=attributes,
+        origins=origins,
         shot=selection.shot,
     )
     return main_layers(job.work(lambda _: None, should_stop).layer_data)

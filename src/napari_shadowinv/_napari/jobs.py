@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -247,8 +247,7 @@ class ImageJob(Job):
     recipe: Recipe
     name: str  # of the result
     frame: Frame
-    inputs: Sequence[tuple[str, str]] = ()  # rows of the report
-    attributes: Mapping[str, str] = field(default_factory=dict)  # origins that are saved
+    origins: Mapping[str, str] = field(default_factory=dict)  # of its inputs, saved and reported
     image: Any = None  # the layer
     companions: tuple[Any, ...] = ()  # layers that lie on the image
 
@@ -280,7 +279,7 @@ class InversionJob(ImageJob):
     def layers(self, content: Inversion) -> LayerData:
         """Describe the layers of the inversion; of a preview only the field and its caustics."""
         name = f"{self.name} preview" if self.preview else self.name
-        result = Result(content, content.setup, dict(self.attributes))
+        result = Result(content, content.setup, self.origins)
         layer_data = result_layers(result, self.frame, name)
         mask = self.shot.source_mask
         for _, keywords, _ in layer_data:
@@ -371,7 +370,7 @@ class FitJob(ImageJob):
         return fit
 
     def layers(self, content: Fit) -> LayerData:
-        result = Result(content, content.setup, dict(self.attributes))
+        result = Result(content, content.setup, self.origins)
         return fit_layers(result, self.frame, self.name)
 
     def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
@@ -425,8 +424,7 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
         names=(name,),
         name=f"{name} refined",
         frame=frame_of(layer),
-        inputs=[("Start", start), ("Point spread", f"σ {psf:g} px" if psf else "none")],
-        attributes={"start_origin": start},
+        origins={"Start": start, "Point spread": f"σ {psf:g} px" if psf else "none"},
         image=image,
         inversion=inversion,
         setup=setup,

@@ -255,7 +255,7 @@ class Result(Generic[Content]):
 
     content: Content
     setup: Setup | None = None
-    attributes: Mapping[str, str] = field(default_factory=dict)  # its origins, in words
+    origins: Mapping[str, str] = field(default_factory=dict)  # rows of its report: title, text
 
 
 def metadata_for(

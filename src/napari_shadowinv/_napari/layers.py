@@ -57,13 +57,13 @@ def inversion_layers(
     setup: Setup | None = None,
     *,
     name: str = "",
-    attributes: Mapping[str, str] | None = None,
+    origins: Mapping[str, str] | None = None,
     **placement: Any,
 ) -> LayerData:
     """Describe the layers of a result, with the keywords of `add_to_viewer`."""
     setup = inversion.setup if setup is None else setup
     frame = frame_for(inversion.potential.shape, setup, **placement)
-    return result_layers(Result(inversion, setup, dict(attributes or {})), frame, name)
+    return result_layers(Result(inversion, setup, dict(origins or {})), frame, name)
 
 
 def add_to_viewer(
@@ -95,7 +95,7 @@ def add_to_viewer(
     **keywords
         ``scale``, ``translate``, ``units`` (in axis order y, x): placement of the image in the
         world instead of the setup's, such as the placement of the layer it was cropped from.
-        ``attributes`` (mapping of str to str): origins in words, saved with the result.
+        ``origins`` (mapping of str to str): where its inputs come from, rows of its report.
 
     Returns
     -------
@@ -160,7 +160,7 @@ def significance_variables(
 
 def shared_metadata(result: Result[AnyResult], name: str) -> dict[str, Any]:
     """Return the metadata that all layers of a result share."""
-    return {"result": result, "made_from": dict(result.attributes), "name": name}
+    return {"result": result, "name": name}
 
 
 def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> LayerData:

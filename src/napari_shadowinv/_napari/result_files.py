@@ -131,7 +131,7 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]
     """Return the dataset of a result with its layers' appearance and painted caustics."""
     content: Any = result.content
     looks = {about.layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
-    state = {"looks": looks, "origins": dict(result.attributes)}
+    state = {"looks": looks, "origins": dict(result.origins)}
     for data, keywords, _ in layers:
         if (name := about.metadata_of(keywords).get("name")) is not None:
             state["name"] = name

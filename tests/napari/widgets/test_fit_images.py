@@ -97,7 +97,7 @@ def show(qtbot: Any) -> Callable[[Any, Fit], None]:
 
     def shown(tool: Any, found: Fit) -> None:
         job = tool.request()
-        result = Result(found, found.setups[0], job.attributes)
+        result = Result(found, found.setups[0], job.origins)
         layer_data = fit_layers(result, job.frame, job.name)
         tool.show_result(Finished(found, layer_data), job)
         qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
@@ -336,7 +336,7 @@ def test_doubts_of_the_reader_are_told(window: Any, tool: Any) -> None:
     window.layers[1].metadata = metadata_for(
         "shot", "", SETUPS[1], warnings=[Caution("film-scan", "it may be film")]
     )
-    assert ("Warning", "'6.0 MeV': it may be film") in tool.request().inputs
+    assert tool.request().origins["Warning"] == "'6.0 MeV': it may be film"
 
 
 def test_images_that_do_not_fit_are_refused(
@@ -473,7 +473,7 @@ def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
 ) -> None:
     # As if it had been removed: drawing right after a removal crashes Mesa at times.
     job = replace(tool.request(), image=object(), companions=tuple(window.layers))
-    result = Result(fitted, SETUPS[0], job.attributes)
+    result = Result(fitted, SETUPS[0], job.origins)
     tool.show_result(Finished(result.content, fit_layers(result, job.frame, job.name)), job)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     assert messages == ["'14.7 MeV' was deleted during its fit; the result is shown anyway"]

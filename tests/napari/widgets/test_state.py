@@ -16,7 +16,6 @@ from napari_shadowinv import InputError, ProtonSetup
 from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
-    metadata_of,
     result_of,
     role_of,
     setup_of,
@@ -298,7 +297,7 @@ def test_one_click_takes_the_setup_of_the_layer_and_says_so(
     ):
         for _, keywords, _ in commands.invert_uniform(layer):
             assert setup_of(keywords) == setup
-            assert metadata_of(keywords)["made_from"].get("setup_origin") == origin
+            assert result_of(keywords).origins.get("Setup") == origin  # type: ignore[union-attr]
 
 
 def test_a_source_can_be_filtered_and_stays_one(viewer: ViewerModel, opened: Any) -> None:
@@ -429,11 +428,8 @@ def test_a_result_says_where_everything_came_from(
     assert "Mask" not in rows
     assert rows["Setup"] == "particles (protons, …), came with experiment.h5"
     field = next(layer for layer in viewer.layers if role_of(layer) == "field")
-    origins = metadata_of(field)["made_from"]
-    assert origins["setup_origin"] == "came with experiment.h5"
-    assert origins["source_origin"] == rows["Source"]
-    assert origins["source_mask_origin"] == rows["Source mask"]
-    assert dict(result_of(field).attributes) == origins  # type: ignore[union-attr]
+    origins = result_of(field).origins  # type: ignore[union-attr]
+    assert {title: rows[title] for title in origins} == origins
     provenance = result_of(field).content.provenance  # type: ignore[union-attr]
     assert provenance.recipe.source == PolynomialEstimate()
     assert provenance.masks[provenance.image.source_mask].mask() is not None

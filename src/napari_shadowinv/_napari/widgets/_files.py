@@ -93,7 +93,7 @@ class _Repetition(Job):
     def show(self, viewer: Any) -> None:
         """Add the layers of the repeated result, and report the difference."""
         assert self.again is not None
-        repeated = about.Result(self.again.content, self.result.setup, self.result.attributes)
+        repeated = about.Result(self.again.content, self.result.setup, self.result.origins)
         add_layers(viewer, about.main_layers(layers_of_result(repeated, self.frame, self.name)))
         changes = "; ".join(self.again.changes) or "nothing"
         show_info(f"Difference: {self.again.difference}. Changed: {changes}")

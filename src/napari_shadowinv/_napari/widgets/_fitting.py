@@ -98,7 +98,7 @@ class ResultView(QWidget):
         self, result: Result[Any], job: ImageJob, facts: Sequence[Fact] | None = None
     ) -> None:
         """Show the verdict and report of a job's result; notify if it is doubtful."""
-        headline = self._show(result, facts, job.inputs)
+        headline = self._show(result, facts)
         self._recipe = None if isinstance(job, Refinement) else job.recipe
         if not headline.level.is_success:
             show_caution(str(headline))
@@ -124,19 +124,17 @@ class ResultView(QWidget):
             self._show(result)
             self._tool.reveal(self.verdict)
 
-    def _show(
-        self, result: Result[Any], facts: Sequence[Fact] | None = None, inputs: panels.Rows = ()
-    ) -> Headline:
-        self._result, content = result, result.content
+    def _show(self, result: Result[Any], facts: Sequence[Fact] | None = None) -> Headline:
+        self._result, content, origins = result, result.content, result.origins.items()
         if isinstance(content, Inversion):
             content = content.in_units(result.setup)
         facts, said = facts or content.facts, self._said()
         self.verdict.show_headline(content.headline)
         warnings = [
-            row for row in panels.warning_rows(facts) if row not in inputs and row[1] not in said
+            row for row in panels.warning_rows(facts) if row not in origins and row[1] not in said
         ]
         rows, details = (panels.fact_rows(facts, details=flag) for flag in (False, True))
-        self.report.show_rows([*warnings, *inputs, *rows], details)
+        self.report.show_rows([*warnings, *origins, *rows], details)
         return content.headline
 
     def _list_solutions(self, fit: Fit) -> None:

@@ -656,7 +656,7 @@ class ImagePanel(ToolPanel):
         `on_image` are its companions besides the source, or None; further `rows` of the report are
         ``name`` of the image, ``source_mask`` and the ``steps`` of a fit.
         """
-        texts = {
+        origins = {
             "Image": rows.get("name", ""),
             "Source": self.source.summary,
             "Source mask": rows.get("source_mask", ""),
@@ -664,18 +664,10 @@ class ImagePanel(ToolPanel):
             "Setup": self.setup.summary,
             "Steps": rows.get("steps", ""),
         }
-        saved = {
-            "source_origin": texts["Source"],
-            "mask_origin": texts["Mask"],
-            "source_mask_origin": texts["Source mask"],
-            "setup_origin": self.setup.origin,
-            "steps": texts["Steps"],
-        }
         companions = (*on_image, self.source.layers.layer)
         return {
             "recipe": recipe,
-            "inputs": [(title, text) for title, text in texts.items() if text],
-            "attributes": {key: text for key, text in saved.items() if text},
+            "origins": {title: text for title, text in origins.items() if text},
             "image": image,
             "companions": tuple(c for c in companions if c is not None and c is not image),
         }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -65,8 +65,7 @@ class StackJob(Job):
     image: Any = None  # the layer of the shots
     companions: tuple[Any, ...] = ()  # layers that lie on the image
     placement: Mapping[str, Any] = field(default_factory=dict)  # keywords of the layers
-    inputs: Sequence[tuple[str, str]] = ()  # rows of the report
-    attributes: Mapping[str, str] = field(default_factory=dict)  # origins that are saved
+    origins: Mapping[str, str] = field(default_factory=dict)  # of its inputs, rows of the report
     limits: Limits = field(default_factory=dict)  # by role, over all shots in the store so far
     status: RunStatus = field(default_factory=_empty_status)
     layer_data: LayerData = field(default_factory=list)  # empty until a shot is finished
@@ -163,12 +162,9 @@ class StackJob(Job):
     def _described(self, shot: int | None = None) -> LayerData:
         """Describe the layers of the store; none if that has to wait for the next shot."""
         try:
-            layers = store_layers(self.out, shot=shot)
+            return store_layers(self.out, shot=shot)
         except (InputError, OSError):
             return []
-        for _, keywords, _kind in layers:
-            keywords["metadata"][KEY]["made_from"] = dict(self.attributes)
-        return layers
 
 
 class StackView(QWidget):
@@ -308,7 +304,7 @@ class StackView(QWidget):
         job, shot = self.job, self.shot_in_view
         if job is None or self.isHidden():
             return
-        rows = list(job.inputs)
+        rows = list(job.origins.items())
         with suppress(FileFormatError):  # a damaged shot
             rows += [] if shot is None else shot_rows(job.out, shot)
         self._report.show_rows(rows)

@@ -498,7 +498,7 @@ class FilmPack(panels.ToolPanel):
         if path := qt.ask_file(self, "Save the result", "pack", qt.RESULT_FILES):
             result: Any = about.result_of(layer)
             doses = packs.copy_edits(doses, self._scratch, path)
-            saved = about.Result(doses, result.setup, result.attributes)
+            saved = about.Result(doses, result.setup, result.origins)
             layers = about.layers_of(self.viewer, layer)
             dataset = dataset_of_layers([each.as_layer_data_tuple() for each in layers], saved)
             show_info(f"Wrote {write(path, dataset, overwrite=True)}")

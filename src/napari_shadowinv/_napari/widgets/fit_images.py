@@ -32,20 +32,15 @@ from napari_shadowinv.preprocessing import FIT_STEPS, MeasuredSource, Recipe, Un
 from napari_shadowinv.shot import Shot
 
 
-def _beam_summary(shot: Shot) -> str:
-    if shot.setup is not None:
-        return shot.setup.probe
-    return f"displaced by {', '.join(f'{each:g}' for each in shot.strength or (1.0,))}"
-
-
-def _warnings_of(rows: list[ImageRow]) -> list[tuple[str, str]]:
-    """Return the warnings of the images' readers as rows of the report."""
+def _warnings_of(rows: list[ImageRow]) -> dict[str, str]:
+    """Return the warnings of the images' readers as a row of the report."""
     unique = {id(row.layer): row.layer for row in rows}.values()
-    return [
-        ("Warning", f"'{layer.name}': {caution.text}")
+    texts = [
+        f"'{layer.name}': {caution.text}"
         for layer in unique
         for caution in layers.warnings_of(layer)
     ]
+    return {"Warning": "; ".join(texts)} if texts else {}
 
 
 class FitImages(inputs.ImagePanel):
@@ -222,14 +217,10 @@ class FitImages(inputs.ImagePanel):
         first = rows[0]
         recipe = self.recipe()
         shots = self._shots(rows, recipe.setup)
-        images = [
-            f"{row.name}: {_beam_summary(shot)}" for row, shot in zip(rows, shots, strict=True)
-        ]
         steps = "; ".join(step.summary for step in recipe.steps)
         used_layers = (*(row.layer for row in rows), self.masks.layer)
         described = self.describe(first.layer, recipe, used_layers, steps=steps)
-        described["inputs"] += _warnings_of(rows)
-        described["attributes"] = {"images": "; ".join(images), **described["attributes"]}
+        described["origins"] |= _warnings_of(rows)
         return FitJob(
             shots=shots,
             names=tuple(row.name for row in rows),
