@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from helpers.polygons import clipped, rectangle, shoelace
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry import triangulation as module
 from napari_shadowinv.geometry.triangle_mesh import LIMIT
@@ -63,34 +64,12 @@ def cross(a: Array, b: Array) -> Array:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def clipped(polygon: Array, normal: Array, offset: float) -> Array:
-    """Part of a convex polygon where normal · x <= offset."""
-    side = polygon @ normal - offset
-    if side.max() <= 0:
-        return polygon
-    following, side_following = np.roll(polygon, -1, axis=0), np.roll(side, -1)
-    corners = []
-    for p, q, s, t in zip(polygon, following, side, side_following, strict=True):
-        if s <= 0:
-            corners.append(p)
-        if (s < 0 < t) or (t < 0 < s):
-            corners.append(p + (q - p) * (s / (s - t)))
-    return np.array(corners).reshape(-1, 2)
-
-
-def area(polygon: Array) -> float:
-    if len(polygon) < 3:
-        return 0.0
-    corners = polygon - polygon[0]
-    return float(cross(corners, np.roll(corners, -1, axis=0)).sum() / 2)
-
-
 def clipped_cell(i: int, triangulation: RegularTriangulation, bonus: float) -> Array:
     """Power cell of site i with a bonus to its weight, by half-planes, relative to the site."""
     points, weights = triangulation.points, triangulation.weights
     distance = float(np.abs(points[-1] - points[0]).max())
     reach = 8 * (distance + np.abs(weights).max() / distance)
-    polygon = reach * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    polygon = rectangle((-reach, -reach), (reach, reach))
     for j in np.argsort(((points - points[i]) ** 2).sum(1)):
         between = points[j] - points[i]
         gain = weights[j] - weights[i]
@@ -188,7 +167,7 @@ def assert_hides_empty_cells(triangulation: RegularTriangulation) -> None:
     touch = 1e-9 * extent**2 / len(triangulation.sites) + rounding
     for i, hidden in enumerate(triangulation.hidden):
         cell = clipped_cell(i, triangulation, -touch if hidden else touch)
-        assert (area(cell) == 0) == hidden
+        assert (shoelace(cell)[0] == 0) == hidden
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -215,7 +194,7 @@ def test_power_centres_span_the_cells(seed: int, spread: float) -> None:
     triangulation = RegularTriangulation(sites, spread * rng.random(40))
     areas = dual_areas(triangulation)
     for i in np.flatnonzero(np.isfinite(areas) & ~triangulation.hidden):
-        expected = area(clipped_cell(i, triangulation, 0.0))
+        expected = shoelace(clipped_cell(i, triangulation, 0.0))[0]
         assert areas[i] == pytest.approx(expected, abs=1e-9 / 80)
 
 

@@ -15,15 +15,18 @@ def power_diagram(sites, density, weights=None) -> PowerDiagram:
 
 def clipped(polygon: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
     """Sutherland and Hodgman: the part of a convex polygon where normal · r ≤ offset."""
-    part = []
     distances = polygon @ normal - offset
-    for k in range(len(polygon)):
-        start, end = polygon[k], polygon[(k + 1) % len(polygon)]
-        d_start, d_end = distances[k], distances[(k + 1) % len(polygon)]
-        if d_start <= 0:
-            part.append(start)
-        if d_start * d_end < 0:
-            part.append(start + (end - start) * d_start / (d_start - d_end))
+    if distances.max() <= 0:
+        return polygon
+    corners, sides = polygon.tolist(), distances.tolist()
+    part = []
+    for k, ((y, x), side) in enumerate(zip(corners, sides, strict=True)):
+        (y_before, x_before), before = corners[k - 1], sides[k - 1]
+        if side * before < 0:
+            share = before / (before - side)
+            part.append((y_before + (y - y_before) * share, x_before + (x - x_before) * share))
+        if side <= 0:
+            part.append((y, x))
     return np.array(part).reshape(-1, 2)
 
 
@@ -32,15 +35,20 @@ def rectangle(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray
     return np.array([[y0, x0], [y1, x0], [y1, x1], [y0, x1]], dtype=float)
 
 
+def clipped_along(axis: int, polygon: np.ndarray, low: float, high: float) -> np.ndarray:
+    normal = np.eye(2)[axis]
+    if len(polygon):
+        polygon = clipped(polygon, normal, high)
+    if len(polygon):
+        polygon = clipped(polygon, -normal, -low)
+    return polygon
+
+
 def clipped_to_rectangle(
     polygon: np.ndarray, low: tuple[float, float], high: tuple[float, float]
 ) -> np.ndarray:
     for axis in (0, 1):
-        normal = np.eye(2)[axis]
-        if len(polygon):
-            polygon = clipped(polygon, normal, high[axis])
-        if len(polygon):
-            polygon = clipped(polygon, -normal, -low[axis])
+        polygon = clipped_along(axis, polygon, low[axis], high[axis])
     return polygon
 
 
@@ -64,8 +72,9 @@ def over_pixels(polygon: np.ndarray, image: np.ndarray) -> tuple[float, np.ndarr
     first = np.maximum(np.floor(polygon.min(axis=0) + 0.5).astype(int), 0)
     last = np.minimum(np.floor(polygon.max(axis=0) + 0.5).astype(int), np.array(image.shape) - 1)
     for i in range(first[0], last[0] + 1):
+        row = clipped_along(0, polygon, i - 0.5, i + 0.5)
         for j in range(first[1], last[1] + 1):
-            piece = clipped_to_rectangle(polygon, (i - 0.5, j - 0.5), (i + 0.5, j + 0.5))
+            piece = clipped_along(1, row, j - 0.5, j + 0.5)
             area, of_piece, inertia_of_piece = shoelace(piece)
             mass += image[i, j] * area
             moments += image[i, j] * of_piece
