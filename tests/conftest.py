@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import gc
 import os
-import re
 import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import settings
 
+from helpers.pages import run_python, text_of
 from helpers.public_data import public_file, public_names
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
@@ -294,14 +293,7 @@ def burner() -> list[Path]:
 @pytest.fixture
 def xray_setup(monkeypatch: pytest.MonkeyPatch) -> type[BeamSetup]:
     """The kind of setup of CONTRIBUTING.md, added to those of the package."""
-    text = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    (block,) = (
-        block
-        for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-        if "class XRaySetup" in block
-    )
-    names: dict[str, Any] = {"__name__": "contributing"}
-    exec(compile(block, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
-    kind: type[BeamSetup] = names["XRaySetup"]
+    text = text_of("CONTRIBUTING.md").partition("### a kind of setup")[2].partition("\n### ")[0]
+    kind: type[BeamSetup] = run_python(text)["XRaySetup"]
     monkeypatch.setitem(SETUPS, "x-ray", kind)
     return kind

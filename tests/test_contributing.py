@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import re
 from importlib import import_module
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +14,7 @@ import typer
 from typer.testing import CliRunner
 
 from helpers.command_line import flat
+from helpers.pages import ROOT, run_python, text_of
 from napari_shadowinv import Inversion, cli, invert, synthetic_image, write
 from napari_shadowinv.analysis import PRODUCTS, analyse
 from napari_shadowinv.analysis._derivatives import finer_field
@@ -27,9 +27,8 @@ from napari_shadowinv.preprocessing import STEPS
 from napari_shadowinv.preprocessing.steps import Step, choices_of
 from napari_shadowinv.shot import Shot
 
-ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "napari_shadowinv"
-TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+TEXT = text_of("CONTRIBUTING.md")
 
 
 # Their blocks change a table, or need a window.
@@ -43,20 +42,12 @@ def section(title: str) -> str:
     return match[0]
 
 
-def run_blocks(text: str) -> dict[str, Any]:
-    """Execute the Python of a text, and return its names."""
-    names: dict[str, Any] = {"__name__": "contributing"}
-    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
-        exec(compile(block, "CONTRIBUTING.md", "exec", dont_inherit=True), names)
-    return names
-
-
 @pytest.fixture(scope="module")
 def names() -> dict[str, Any]:
     text = TEXT
     for title in SEPARATE_SECTIONS:
         text = text.replace(section(title), "")
-    return run_blocks(text)
+    return run_python(text)
 
 
 def test_the_filter_is_a_step(names):
@@ -90,7 +81,7 @@ def test_the_option_is_one_field(names):
 
 def test_the_quantity_is_the_effect_of_a_nonlinear_detector(monkeypatch):
     budget_table = dict(FLUX_ERRORS)
-    names = run_blocks(section("a quantity of the error budget"))
+    names = run_python(section("a quantity of the error budget"))
     nonlinear_detector = FLUX_ERRORS.pop("nonlinear detector")
     assert budget_table == FLUX_ERRORS
     assert nonlinear_detector is names["nonlinear_detector"]
@@ -163,7 +154,7 @@ def command():
     """Run the command, on an app of its registration alone."""
     text = section("a command")
     app = typer.Typer()
-    module = SimpleNamespace(**run_blocks(text))
+    module = SimpleNamespace(**run_python(text))
     (registration,) = re.findall(r"^    (app\.command.*)$", text, re.MULTILINE)
     exec(registration, {**vars(cli), "app": app, "_headlines": module})
     runner = CliRunner(env={"COLUMNS": "500"})
@@ -197,7 +188,7 @@ def area_map(qtbot, tmp_path):
 
     QSettings.setPath(QSettings.Format.IniFormat, QSettings.Scope.UserScope, str(tmp_path))
     viewer = ViewerModel()
-    widget = run_blocks(section("a widget"))["AreaMap"](viewer)
+    widget = run_python(section("a widget"))["AreaMap"](viewer)
     qtbot.addWidget(widget)
     return widget, viewer
 
@@ -277,7 +268,7 @@ def test_benchmarks_and_examples_import_what_is_there():
                     exec(ast.unparse(node), {})
 
 
-def test_every_benchmark_is_listed_and_every_link_leads_somewhere():
+def test_every_benchmark_is_listed():
     listed = re.findall(r"benchmarks/(\w+\.py)", TEXT)
     benchmarks = {path.name for path in (ROOT / "benchmarks").glob("*.py")} - {
         "exact_shots.py",
@@ -285,5 +276,3 @@ def test_every_benchmark_is_listed_and_every_link_leads_somewhere():
         "simulated_pack.py",
     }
     assert set(listed) == benchmarks
-    for target in re.findall(r"\]\(([^)#]+)\)", TEXT):
-        assert (ROOT / target).exists(), target

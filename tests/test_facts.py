@@ -50,6 +50,31 @@ def inversion(image):
     return invert(image, options=InversionOptions(n_sites=400))
 
 
+@pytest.fixture(scope="module")
+def hasty(image):
+    """A fit of one image that has hardly begun."""
+    options = FitOptions(samples=0, max_iterations=2, spacing=0.25)
+    return fit(shots_of([image], noise=0.01), options=options)
+
+
+@pytest.fixture(scope="module")
+def fitted(image):
+    """A fit of two images, with samples."""
+    options = FitOptions(samples=3, max_iterations=20, spacing=0.25)
+    return fit(shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01), options=options)
+
+
+@pytest.fixture(scope="module")
+def results(image, inversion, hasty):
+    """One of each kind; the second has many cautions with characters that mean something."""
+    doubtful = inversion.with_cautions(
+        Caution("other", f"doubt {number} of <script> & co, {'very ' * 60}long")
+        for number in range(9)
+    )
+    radiograph = Shot(image, path=Path("<b>.tif"), mask=image > 0)
+    return [inversion, doubtful, hasty, radiograph, *analyse(inversion, ["contrast"])]
+
+
 @pytest.mark.parametrize(
     ("value", "error", "written"),
     [
@@ -93,25 +118,8 @@ def test_errors_without_a_displacement_have_their_length():
     assert "%" not in texts["errors"] + texts["error_limited_by"].partition("(5 %")[0]
 
 
-def results_of(image, inversion):
-    hasty = FitOptions(samples=0, max_iterations=2, spacing=0.25)
-    doubtful = inversion.with_cautions(
-        Caution("other", f"doubt {number} of <script> & co, {'very ' * 60}long")
-        for number in range(9)
-    )
-    radiograph = Shot(image, path=Path("<b>.tif"), mask=image > 0)
-    products = analyse(inversion, ["contrast"])
-    return [
-        inversion,
-        doubtful,
-        fit(shots_of([image], noise=0.01), options=hasty),
-        radiograph,
-        *products,
-    ]
-
-
-def test_a_result_prints_a_few_lines_and_no_array(image, inversion):
-    for result in results_of(image, inversion):
+def test_a_result_prints_a_few_lines_and_no_array(results):
+    for result in results:
         lines = repr(result).splitlines()
         assert lines[0].startswith(type(result).__name__)
         assert len(lines) <= 6
@@ -119,12 +127,12 @@ def test_a_result_prints_a_few_lines_and_no_array(image, inversion):
         assert "array" not in repr(result)
         if hasattr(result, "headline"):
             assert lines[1] == textwrap.shorten(str(result.headline), 160, placeholder=" …")
-    assert "9 more" not in repr(inversion)
-    assert repr(results_of(image, inversion)[1]).endswith("and 6 more")
+    assert "more" not in repr(results[0])
+    assert repr(results[1]).endswith("and 6 more")
 
 
-def test_a_notebook_shows_the_picture_of_a_result(image, inversion):
-    for result in results_of(image, inversion):
+def test_a_notebook_shows_the_picture_of_a_result(image, results):
+    for result in results:
         shown = result._repr_html_()
         assert "<script>" not in shown
         assert "<b>.tif" not in shown
@@ -194,16 +202,16 @@ def test_every_face_shows_the_same_texts(inversion):
     assert {name.lower(): text for name, text in window} == table
 
 
-def test_facts_of_a_fit_name_images_fields_and_the_verdict(image):
-    options = FitOptions(samples=0, max_iterations=20, spacing=0.25)
-    result = fit(shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01), options=options)
-    facts = result.facts_with_names(["first.tif", "second.tif"])
+def test_facts_of_a_fit_name_images_fields_and_the_verdict(fitted):
+    facts = fitted.facts_with_names(["first.tif", "second.tif"])
     texts = texts_by_key(facts)
     assert texts["image_2"].startswith("second.tif, χ² ")
     assert "strength 0.8" in texts["image_2"]
-    largest = np.hypot(*result.fields[0].displacement).max()
-    assert f"{largest:.3g} px" in texts["field_B"]
-    assert texts["verdict"] == result.verdict
+    errors = fitted.fields[0].errors
+    assert errors.peak == np.hypot(*fitted.fields[0].displacement).max()
+    peak = with_error(errors.peak, errors.total.at_peak)
+    assert texts["field_B"].startswith(f"peak |d| {peak} px")
+    assert texts["verdict"] == fitted.verdict
     assert {fact.level for fact in facts if fact.key == "verdict"} == {Level.DOUBTFUL}
 
 
@@ -222,15 +230,13 @@ def test_the_title_of_a_headline_is_one_word_for_trust():
     assert str(doubted) == "Determined, with warnings: 9 T"
 
 
-def test_the_headline_of_a_fit_begins_with_its_peaks(image):
-    options = FitOptions(samples=0, max_iterations=2, spacing=0.25)
-    result = fit(shots_of([image], noise=0.01), options=options)
-    (shown,) = shown_fields([result.fields[0].displacement], None, mask=result.used)
-    assert result.headline.text.startswith(f"peak |d| {shown.largest:.3g} px; ")
-    assert result.assessment.short in result.headline.text
+def test_the_headline_of_a_fit_begins_with_its_peaks(hasty):
+    (shown,) = shown_fields([hasty.fields[0].displacement], None, mask=hasty.used)
+    assert hasty.headline.text.startswith(f"peak |d| {shown.largest:.3g} px; ")
+    assert hasty.assessment.short in hasty.headline.text
 
 
-def test_a_headline_and_a_report_are_short_and_a_report_repeats_nothing(image, inversion):
+def test_a_headline_and_a_report_are_short_and_a_report_repeats_nothing(inversion, fitted):
     words = ("peak |∫B×dz| 9.734 ± 0.077 mT·m", "peak |∫E dz| (1.34 ± 0.12) × 10⁻⁴ MV")
     long = Assessment(Verdict.UNCERTAIN, "a reason of six words, say", "advice " * 9)
     doubts = [Caution(code, "a sentence") for code in CAUTION_CODES]
@@ -239,8 +245,6 @@ def test_a_headline_and_a_report_are_short_and_a_report_repeats_nothing(image, i
             headline = Headline.of(peaks, assessment, doubts)
             assert len(headline.text.split()) <= Headline.MOST_WORDS
             assert headline.text.startswith(f"{'; '.join(peaks)}; {assessment.reason}")
-    options = FitOptions(samples=3, max_iterations=20, spacing=0.25)
-    fitted = fit(shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01), options=options)
     for facts in (inversion.facts, inversion.in_units(paper_setup()).facts, fitted.facts):
         rows = table_rows(facts)
         assert 4 <= len(rows) <= 6, "and the setup"
@@ -248,15 +252,13 @@ def test_a_headline_and_a_report_are_short_and_a_report_repeats_nothing(image, i
         assert not [text for text in texts if sum(text in other for other in texts) > 1]
 
 
-def test_each_fitted_field_has_its_significance(image):
-    options = FitOptions(samples=3, max_iterations=20, spacing=0.25)
-    result = fit(shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01), options=options)
-    (fact,) = [fact for fact in result.facts if fact.key == "significance_B"]
-    structures = result.structures(result.fields[0])
+def test_each_fitted_field_has_its_significance(fitted):
+    (fact,) = [fact for fact in fitted.facts if fact.key == "significance_B"]
+    structures = fitted.structures(fitted.fields[0])
     assert fact.text.startswith(f"{len(structures.peaks)} structure")
     causes = "beam assumed, 5 %; noise; assumed background, 5 %; assumed gamma, 0.05"
     assert f"up to {structures.peaks[0]:.3g} σ (σ by {causes})" in fact.text
-    assert dict(table_rows(result.facts, details=True))["significance B"] == fact.text
-    assert dict(window_rows(result.facts, details=True))["Significance B"] == fact.text
-    field = dataclasses.replace(result.fields[0], errors=None)
-    assert "significance_B" not in texts_by_key(dataclasses.replace(result, fields=(field,)).facts)
+    assert dict(table_rows(fitted.facts, details=True))["significance B"] == fact.text
+    assert dict(window_rows(fitted.facts, details=True))["Significance B"] == fact.text
+    field = dataclasses.replace(fitted.fields[0], errors=None)
+    assert "significance_B" not in texts_by_key(dataclasses.replace(fitted, fields=(field,)).facts)

@@ -14,19 +14,16 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
+from helpers.pages import PAGES, ROOT, WRITTEN_PAGES
 from napari_shadowinv.film.pack import Pack
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
 from napari_shadowinv.physics.setup import SETUPS
 from napari_shadowinv.preprocessing import Recipe
 
-ROOT = Path(__file__).parents[1]
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
 FACES = {"cli", "_napari"}
-BELOW_THE_FACES = [path for path in SOURCES if not FACES & set(path.parts)]
 FILES = [*SOURCES, *sorted((ROOT / "tests").rglob("*.py"))]
 TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
-PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "paper").glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-WRITTEN_PAGES = [page for page in PAGES if page.parent.name != "reference"]  # others are generated
 
 VAGUE_WORDS = """
 one own other others found known told given kept made left whole rest asked held seen here there
@@ -62,30 +59,37 @@ def assigned_names(node: ast.AST) -> Iterator[str]:
             targets.append(target.value)
 
 
-def docstrings(paths: list[Path]) -> Iterator[tuple[str, str]]:
-    """Each docstring with the place of its function, class or module."""
-    documented = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
-    for path in paths:
-        for node in ast.walk(TREES[path]):
-            if isinstance(node, documented) and (text := ast.get_docstring(node)):
-                line = getattr(node, "lineno", 1)
-                yield f"{path.relative_to(ROOT)}:{line}", text
+DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef
 
 
-def messages(path: Path) -> Iterator[tuple[int, str]]:
-    """The texts of a module that people read: sentences, not docstrings, keys or patterns."""
-    tree = TREES[path]
-    skipped = {
-        id(node.body[0].value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
-        and node.body
-        and isinstance(node.body[0], ast.Expr)
+@pytest.fixture(scope="module")
+def docstrings() -> dict[str, str]:
+    """Each docstring by the place of its function, class or module."""
+    return {
+        f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}": text
+        for path in SOURCES
+        for node in ast.walk(TREES[path])
+        if isinstance(node, DOCUMENTED) and (text := ast.get_docstring(node))
     }
-    for node in ast.walk(tree):
-        is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
-        if is_text and id(node) not in skipped and " " in node.value:
-            yield node.lineno, node.value
+
+
+@pytest.fixture(scope="module")
+def messages() -> list[tuple[Path, int, str]]:
+    """The sentences that people read, not docstrings, keys or patterns, with module and line."""
+    texts = []
+    for path in SOURCES:
+        skipped = {
+            id(node.body[0].value)
+            for node in ast.walk(TREES[path])
+            if isinstance(node, DOCUMENTED) and node.body and isinstance(node.body[0], ast.Expr)
+        }
+        texts += [
+            (path, node.lineno, node.value)
+            for node in ast.walk(TREES[path])
+            if isinstance(node, ast.Constant) and isinstance(node.value, str)
+            if id(node) not in skipped and " " in node.value
+        ]
+    return texts
 
 
 def test_variables_are_named_by_what_they_hold():
@@ -101,33 +105,28 @@ def test_variables_are_named_by_what_they_hold():
     assert share < MAX_VAGUE_SHARE, f"{share:.2%}, most in {vague.most_common(8)}"
 
 
-def test_docstrings_begin_with_a_verb_or_a_noun():
-    wrong = [place for place, text in docstrings(SOURCES) if re.match(r"(?:What|Tell)\b", text)]
+def test_docstrings_begin_with_a_verb_or_a_noun(docstrings):
+    wrong = [place for place, text in docstrings.items() if re.match(r"(?:What|Tell)\b", text)]
     assert not wrong
 
 
 @pytest.mark.parametrize("idiom", IDIOMS)
-def test_docstrings_use_no_idiom(idiom):
-    wrong = [place for place, text in docstrings(SOURCES) if re.search(idiom, text)]
+def test_docstrings_use_no_idiom(docstrings, idiom):
+    wrong = [place for place, text in docstrings.items() if re.search(idiom, text)]
     assert not wrong, f"write {IDIOMS[idiom]}"
 
 
 @pytest.mark.parametrize("words", MAX_RATES)
-def test_docstrings_name_things_by_nouns(words):
-    texts = {place: text.lower() for place, text in docstrings(SOURCES)}
+def test_docstrings_name_things_by_nouns(docstrings, words):
+    texts = {place: text.lower() for place, text in docstrings.items()}
     counts = Counter({place: len(re.findall(words, text)) for place, text in texts.items()})
     total = sum(len(re.findall(r"[a-z]+", text)) for text in texts.values())
     assert 1000 * counts.total() / total < MAX_RATES[words], counts.most_common(8)
 
 
 @pytest.mark.parametrize("idiom", IDIOMS)
-def test_messages_help_and_windows_use_no_idiom(idiom):
-    wrong = [
-        f"{path.relative_to(ROOT)}:{line}"
-        for path in SOURCES
-        for line, text in messages(path)
-        if re.search(idiom, text)
-    ]
+def test_messages_help_and_windows_use_no_idiom(messages, idiom):
+    wrong = [f"{path.name}:{line}" for path, line, text in messages if re.search(idiom, text)]
     assert not wrong, f"write {IDIOMS[idiom]}"
 
 
@@ -138,15 +137,15 @@ def model_keys() -> set[str]:
     return {key for model in models for key in model.model_fields if "_" in key}
 
 
-def test_messages_below_the_faces_suit_each_of_them():
+def test_messages_below_the_faces_suit_each_of_them(messages):
     """A window has no flags, a command no keywords; words such as a free boundary suit both."""
     keys = "|".join(model_keys() | {"max_shots", "other_folders"})
     options = "|".join([*InversionOptions.model_fields, *FitOptions.model_fields])
     of_one_face = re.compile(rf"--[a-z]{{2}}|\b(?:{keys})\b|\b(?:{options})='")
     assert not [
-        f"{path.relative_to(ROOT)}:{line}"
-        for path in BELOW_THE_FACES
-        for line, text in messages(path)
+        f"{path.name}:{line}"
+        for path, line, text in messages
+        if not FACES & set(path.parts)
         # Each face has a name for a key in braces.
         if of_one_face.search(re.sub(r"\{\w+\}", "", text))
         and not re.fullmatch(r"[\s\w]+", text)  # nor a list of keys

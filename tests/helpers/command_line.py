@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import textwrap
 import time
@@ -24,6 +25,13 @@ typer.testing._get_command = cache(get_command)  # type: ignore[attr-defined]
 def shadowinv(*arguments: object) -> Result:
     """Run the command in this process."""
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def run_line(line: str, *more: str, columns: int = 300) -> Result:
+    """Run the command as a page shows it; it must succeed."""
+    result = CliRunner().invoke(app, [*shlex.split(line), *more], env={"COLUMNS": str(columns)})
+    assert result.exit_code == 0, f"{line}: {result.output}"
+    return result
 
 
 def undrawn(*arguments: object) -> Result:

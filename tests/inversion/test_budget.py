@@ -42,20 +42,20 @@ from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import invert_stack, run_stack
 from napari_shadowinv.transport.solvers import Target, solve
 
-SIDE = 96
+SIDE = 72
 
 
 def focusing():
-    return phantoms.gaussian_blob((SIDE, SIDE), -60.0, (9.0, 13.0), (40.0, 55.0), 0.4)
+    return phantoms.gaussian_blob((SIDE, SIDE), -34.0, (6.75, 9.75), (30.0, 41.0), 0.4)
 
 
 def strong():
     """Close to caustics: 0.9 of the strength at which they begin."""
-    return phantoms.gaussian_blob((SIDE, SIDE), 180.0, 9.5, (50.0, 45.0))
+    return phantoms.gaussian_blob((SIDE, SIDE), 101.0, 7.1, (37.5, 34.0))
 
 
 def pair():
-    return phantoms.ellipse_pair((80, 120))
+    return phantoms.ellipse_pair((60, 90))
 
 
 PHANTOMS = {phantom.__name__: phantom for phantom in (focusing, strong, pair)}
@@ -96,7 +96,7 @@ EVERY_IMAGE = [*PHANTOMS, *STRUCTURES, "coaxial_line"]
 
 @pytest.fixture(scope="module", params=EVERY_IMAGE)
 def every_image(request):
-    name, shape, setup = request.param, (SIDE, SIDE), phantoms.paper_setup()
+    name, shape, setup = request.param, (96, 96), phantoms.paper_setup()
     if name in PHANTOMS:
         phantom = PHANTOMS[name]()
     elif name in STRUCTURES:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 import threading
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from helpers.pages import run_python, text_of
 from napari_shadowinv import (
     InputError,
     InversionOptions,
@@ -375,17 +375,11 @@ def test_a_damaged_standard_deviation_is_refused(sampled):
 
 
 def test_the_page_about_error_bars_works_as_it_stands_there(tmp_path: Path, monkeypatch):
-    page = Path(__file__).parents[2] / "docs" / "uncertainty.md"
-    text = page.read_text(encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {}
-    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
-        exec(compile(block, page.name, "exec"), names)
+    names = run_python(text_of("docs/uncertainty.md"))
     assert (tmp_path / "shot.shadowinv").exists()
-    middle = names["samples"].potential_std[24:40, 24:40]  # type: ignore[attr-defined]
-    assert 0.3 * middle.mean() < names["error_bar"] < 1.5 * middle.mean()  # type: ignore[operator]
-    for target in re.findall(r"\]\((?!https:)([^)#]+)\)", text):
-        assert (page.parent / target).exists(), target
+    middle = names["samples"].potential_std[24:40, 24:40]
+    assert 0.3 * middle.mean() < names["error_bar"] < 1.5 * middle.mean()
 
 
 def test_quantities_may_depend_on_the_first_samples() -> None:
