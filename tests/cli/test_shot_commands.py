@@ -34,14 +34,13 @@ from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.inversion import Inversion, invert, machine_code
 from napari_shadowinv.inversion.machine_code import code_folder
 from napari_shadowinv.inversion.variables import setup_from_dataset
-from napari_shadowinv.io import read, write
+from napari_shadowinv.io import read, read_shot, write
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.pipeline import collect_inputs, read_recipe
-from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
     Bin,
@@ -419,6 +418,10 @@ def test_variables_of_matlab_and_hdf5(folder: Path, refused: Callable[..., None]
         result = shadowinv("invert", *arguments, "--overwrite")
         assert result.exit_code == 0, result.output
         np.testing.assert_array_equal(dataset("shots.shadowinv")["displacement"], expected)
+    Path("beam.toml").write_text('[source]\nmethod = "measured"\nvariable = "day/beam"\n')
+    result = shadowinv("invert", "shots.h5::day/shot", "--recipe", "beam.toml", "--overwrite")
+    assert result.exit_code == 0, result.output
+    np.testing.assert_array_equal(dataset("shots.shadowinv")["displacement"], expected)
     refused("invert", "shots.shadowinv", "--out", "again.shadowinv", names="is the result")
     from_mat = shadowinv("forward", "shots.mat::phi", "--out", "a.npy")
     from_h5 = shadowinv("forward", "shots.h5::day/d", "--out", "b.npy")
@@ -451,14 +454,14 @@ def test_geometry_in_a_text_image_is_used_and_shown(folder: Path) -> None:
     # What the file leaves out comes from the setup, with and without a kind.
     for entries in ("energy = 14.7\n", 'kind = "proton"\nenergy = 14.7\n'):
         (folder / "energy.toml").write_text(entries)
-        half = read_part(Path("half.txt"), None, None)
+        half = read_shot("half.txt")
         setup = setup_for(Path("energy.toml"), half, Recipe())
         assert isinstance(setup, ProtonSetup)
         assert (setup.energy, setup.object_image_distance) == (14.7, 0.3)
         assert setup.object_pixel_size == pytest.approx(1e-5)
     light = "wavelength = 5e-7\nsource_object_distance = inf\n"
     (folder / "light.toml").write_text(light)
-    setup = setup_for(Path("light.toml"), read_part(Path("all.txt"), None, None), Recipe())
+    setup = setup_for(Path("light.toml"), read_shot("all.txt"), Recipe())
     assert isinstance(setup, OpticalSetup)
     assert (setup.object_image_distance, setup.magnification) == (0.3, 1)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,7 +28,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import ResultKind, percent
 from napari_shadowinv.io.formats import PNG, RESULT
 from napari_shadowinv.physics.beam import displacement_from_potential
-from napari_shadowinv.preprocessing import MeasuredSource
 from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
@@ -76,8 +74,8 @@ def invert(
 
     Writes a result with all options, and a figure next to it.
     """
+    from napari_shadowinv.io import read_shot
     from napari_shadowinv.pipeline import run, write_recipe
-    from napari_shadowinv.pipeline.files import read_part
 
     outputs = Outputs(overwrite, quiet)
     result, figure = result_and_figure(image, out, figure)
@@ -87,14 +85,9 @@ def invert(
         flags, settings_of(settings or (), INVERSION_SECTIONS, flags.by_key, FILE_KEYS)
     )
     outputs.protect_files_of(recipe)
-    shot = read_part(image, flags.channel)
+    shot = read_shot(image, channel=flags.channel)
     recipe = recipe.model_copy(update={"setup": setup_for(flags.setup, shot, recipe)})
     check_setup(result, recipe.setup)
-    measured = recipe.source
-    if isinstance(measured, MeasuredSource) and measured != MeasuredSource():
-        # In its own file or in the image's; the channel is that of both.
-        beam = read_part(measured.file or image, flags.channel, measured.variable)
-        shot = replace(shot, source=beam)
     outputs.warn_of_setups([(recipe.setup, shot.shape)])
     with work_callbacks(quiet) as callbacks:
         inversion = run(recipe, shot, **callbacks)

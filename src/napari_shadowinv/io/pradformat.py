@@ -25,9 +25,9 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
 from napari_shadowinv.io.hdf5 import hdf5_in_memory, load_dataset, member, open_hdf5, plain_value
-from napari_shadowinv.io.read_write import require
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.setup import Setup, Species, setup_from_dict
+from napari_shadowinv.physics.units import refuse_missing
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
     Of a fit's other parts, only the verdict is kept, in the description.
     """
     check_pradformat_fields(json.loads(dataset.attrs.get("fields", "[]")))
-    require(dataset, ("displacement", "potential"))
+    refuse_missing(dataset, "result of an inversion", ("displacement", "potential"))
     setup = check_pradformat_setup(setup_from_dataset(dataset))
     angle = setup.deflection_angle(dataset["displacement"].values)
     potential = -setup.potential(dataset["potential"].values)

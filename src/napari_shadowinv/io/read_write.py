@@ -38,6 +38,7 @@ from napari_shadowinv.io.hdf5 import (
 )
 from napari_shadowinv.io.images import film_warnings, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
+from napari_shadowinv.physics.units import refuse_missing
 from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
@@ -145,7 +146,7 @@ def _read_file(
         raise FileFormatError(
             f"{path} holds no finite pixel: expected an image; check how the file was saved"
         )
-    if array.ndim == 3 and channel is not None:
+    if channel is not None:
         facts["channel"] = channel
     source, mask = facts.pop("source", None), facts.pop("mask", None)
     if source is not None:
@@ -272,18 +273,9 @@ def read_result(path: Path) -> xarray.Dataset:
 def write_sites(path: Path, dataset: xarray.Dataset) -> None:
     """Write the sites of a result as comma-separated values, one in each row."""
     names = ("sites", "weights", "site_mass", "site_flux", "site_displacement")
-    require(dataset, names)
+    refuse_missing(dataset, "result of an inversion", names)
     columns = np.column_stack([dataset[name].values for name in names])
     np.savetxt(path, columns, delimiter=",", header=_SITE_COLUMNS, comments="", fmt="%.17g")
-
-
-def require(dataset: xarray.Dataset, names: tuple[str, ...]) -> None:
-    """Refuse a dataset without some variables."""
-    missing = [name for name in names if name not in dataset.variables]
-    if missing:
-        raise InputError(
-            f"dataset has no {', '.join(map(repr, missing))}: expected the result of an inversion"
-        )
 
 
 def write(

@@ -2,24 +2,21 @@
 
 - recipes as TOML files: `read_recipe`, `write_recipe`
 - the setup from a TOML file, completed from an image's file: `setup_from`
-- an image and the part of its file that it comes from: `read_part`
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv._system.validation import map_paths, validate
-from napari_shadowinv.io import read_shot, read_toml
+from napari_shadowinv.io import read_toml
 from napari_shadowinv.io.files import write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.shot import Shot
 
 _PIXEL_SIZES = {"pixel_size", "detector_pixel_size"}
 
@@ -54,14 +51,6 @@ def recipe_entries(recipe: Recipe) -> dict[str, Any]:
     if recipe.fit is not None:  # an empty section still requests a fit
         content["fit"] = recipe.fit.model_dump(exclude_defaults=True)
     return {name: _to_toml(value) for name, value in content.items() if value != ()}
-
-
-def read_part(path: Path, channel: str | None = None, variable: str | None = None) -> Shot:
-    """Read an image, and record the part of its file that it comes from."""
-    shot = read_shot(path, channel=channel, variable=variable)
-    parts = (("channel", channel), ("variable", variable))
-    part = {name: choice for name, choice in parts if choice}
-    return replace(shot, metadata={**shot.metadata, **part})
 
 
 def setup_from(

@@ -33,12 +33,13 @@ from napari_shadowinv.fitting.shots import (
 )
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.normalise import mask_unlit
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.io.files import name_of, sha256, text_of
 from napari_shadowinv.options import BeamPrior, FitChoices, FitOptions, Instrument
 from napari_shadowinv.physics.beam import setup_warnings
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import Setup, beam_quantities, deflector_titles, setup_from_dict
-from napari_shadowinv.pipeline.files import read_part, setup_from
+from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.pipeline.inversion_run import AnyShot, Inputs, collect_inputs, load_shot
 from napari_shadowinv.pipeline.shot_table import ShotRow, fiducials_from
 from napari_shadowinv.preprocessing import FIT_STEPS, Recipe, UniformEstimate, estimate_source
@@ -476,10 +477,10 @@ def read_row_images(
     """
     images = []
     for row in rows:
-        recorded = read_part(row.file, channel)
+        recorded = read_shot(row.file, channel=channel)
         source: Any = row.source
         if isinstance(source, Path):
-            source = read_part(source, channel)
+            source = read_shot(source, channel=channel)
         numbers = {name: getattr(row, name) for name in NUMBERS}
         described = Shot(row.file, row_setup(row, recorded, recipe), source, row.mask, **numbers)
         images.append(described.completed_by(recorded))

@@ -414,7 +414,8 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     # A mask's file precedes the recipe's; of arrays, both hold.
     is_file = isinstance(loaded.mask, (str, Path))
     usable = _mask([loaded.mask, None if is_file else recipe.mask], "mask", loaded.shape)
-    is_array = not isinstance(entered.source, Shot | str | Path)
+    given = entered.given("source")
+    is_array = given is not None and not isinstance(given, Shot | str | Path)
     lit = beam.mask if is_array and beam is not None else None  # of a masked array
     usable = _without_gaps(usable, lit, loaded, beam)
     bare = _mask((loaded.source_mask, recipe.source_mask), "source mask", loaded.shape)
@@ -474,7 +475,9 @@ def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
     if shot.source is not None and not shot.has_own_source:
         return load_shot(shot.source, "the source")
     if isinstance(kind, MeasuredSource) and (file := _source_file(kind, shot)) is not None:
-        return read_shot(file, variable=kind.variable)
+        # The channel is that of both.
+        channel = shot.metadata.get("channel")
+        return read_shot(file, channel=channel, variable=kind.variable)
     if shot.source is not None and recipe.estimate is None:
         return replace(shot, image=shot.source, source=None, mask=None)
     return None

@@ -24,10 +24,9 @@ from napari_shadowinv.facts import ResultKind, to_figures
 from napari_shadowinv.fitting import Fit, LeaveOneOut
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
-from napari_shadowinv.io import read_dataset
+from napari_shadowinv.io import read_dataset, read_shot
 from napari_shadowinv.io.files import join_address, split_address
 from napari_shadowinv.pipeline._film import run_film
-from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_leave_one_out, run_refinement
 from napari_shadowinv.pipeline.inversion_run import AnyShot, load_shot, run
 from napari_shadowinv.preprocessing import MeasuredSource, Recipe
@@ -385,7 +384,7 @@ class _Reader:
         path, variable = split_address(argument)
         self.files.append(path)
         channel = None if origin.channel is None else str(origin.channel)
-        return read_part(path, channel, variable or origin.variable)
+        return read_shot(path, channel=channel, variable=variable or origin.variable)
 
     def _shot(self, provenance: Provenance, k: int, image: Shot, source_name: str) -> Shot:
         origin, source = provenance.images[k], None

@@ -35,9 +35,8 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import name_of, sha256, split_address, text_of
 from napari_shadowinv.io.formats import HDF5, PRADFORMAT, TEXT, format_of
 from napari_shadowinv.io.frames import FileFrame, find_frames
-from napari_shadowinv.io.read_write import read_frame
+from napari_shadowinv.io.read_write import read_frame, read_shot
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
-from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import read_row_images, row_setup
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert
 from napari_shadowinv.preprocessing import Recipe
@@ -197,7 +196,7 @@ class RowsExposure(Exposure):
         return (replace(image, setup=self.setup),), metadata
 
     def shape(self) -> tuple[int, ...]:
-        return read_part(self.rows[0].file, self.channel).shape
+        return read_shot(self.rows[0].file, channel=self.channel).shape
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare the rows, and existing files by size and time or checksum."""
@@ -577,7 +576,7 @@ def _read_geometry(row: ShotRow, channel: str | None) -> Shot:
     """Read an image if its file may contain a geometry; return an empty one otherwise."""
     try:
         if format_of(row.file) in (PRADFORMAT, HDF5, TEXT):
-            return read_part(row.file, channel)
+            return read_shot(row.file, channel=channel)
     except (OSError, ValueError):
         pass  # its shot fails, by name
     return Shot(np.zeros((1, 1)))

@@ -24,9 +24,9 @@ from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, point_spread
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
-from napari_shadowinv.pipeline.files import read_part
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.preprocessing import FIT_STEPS, MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.shot import Shot
@@ -153,7 +153,7 @@ class FitImages(inputs.ImagePanel):
         self.check_choices(choices, recipe.setup, path)
         beam = None
         if isinstance(recipe.source, MeasuredSource) and recipe.source.file is not None:
-            beam = read_part(recipe.source.file, variable=recipe.source.variable)
+            beam = read_shot(recipe.source.file, variable=recipe.source.variable)
         self.show_inputs(recipe, path)
         self.show_choices(choices)
         if beam is not None:
