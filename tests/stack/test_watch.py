@@ -125,11 +125,13 @@ def test_moved_and_linked_files_count_and_other_files_do_not(folder, out, tmp_pa
     assert list(watch.result.name.values) == [f"shot_{i}.npy" for i in (0, 1, 4)]
 
 
-def test_pattern_may_name_an_array_in_each_file(folder, out):
+def test_pattern_may_name_an_array_in_each_file_but_the_source(folder, out, tmp_path):
     for index in (0, 1):
         with h5py.File(folder / f"shot_{index}.h5", "w") as file:
             file["entry/data"], file["entry/dark"] = IMAGES[index], 0 * IMAGES[index]
-    stored = watched_once(folder, out, pattern="*.h5::entry/data")
+    np.save(tmp_path / "beam.npy", SOURCE)
+    beam = str(tmp_path / "beam.npy")
+    stored = watched_once(folder, out, pattern="*.h5::entry/data", source=beam)
     assert list(stored.status.values) == [DONE, DONE]
 
 

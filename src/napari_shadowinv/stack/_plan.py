@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._system.arrays import (
-    check_mask,
     check_shape,
     check_spacing,
     checksum,
@@ -204,8 +203,10 @@ def _describe_inputs(
     shots = common.image
     measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
     source = measured.file if common.source is None else common.source
-    has_name = measured.variable is not None
-    source_reader = partial(reader, variable=measured.variable) if has_name else reader
+    source_reader = reader
+    if measured.variable is not None or "variable" in getattr(reader, "keywords", {}):
+        # That of the reader is the array of the shots.
+        source_reader = partial(reader, variable=measured.variable)
     lit = None
     if getattr(source, "ndim", None) == 2:
         source, lit = unpack_array(source, "source")
@@ -217,7 +218,6 @@ def _describe_inputs(
             "the recipe asks for a measured source, but names no file: name one, or give a source"
         )
     mask = unpack_mask(common.mask)
-    source_mask = unpack_mask(common.source_mask, "source mask")
     # With a source, no shot needs to be read for its shape.
     shape = (() if mask is None else np.shape(mask)) if sources is None else sources.shape
     image_shape = (shape[0], shape[1]) if len(shape) == 2 else None
@@ -230,8 +230,6 @@ def _describe_inputs(
     if sources is not None:
         check_shape("source", sources.shape, stack_shots.shape, "shots")
     mask = join_masks(mask, stack_shots.mask, lit)
-    usable = None if mask is None else check_mask(mask, stack_shots.shape)
-    bare = None if source_mask is None else check_mask(source_mask, stack_shots.shape)
     if recipe.setup is not None:
         check_spacing(shots, "shots", recipe.setup.pixel_sizes)
     if recipe.fit is None and not recipe.steps:
@@ -242,8 +240,8 @@ def _describe_inputs(
         Shot(
             blank,
             source=None if sources is None else _checked_beam(sources, blank),
-            mask=usable,
-            source_mask=bare,
+            mask=mask,
+            source_mask=common.source_mask,
         ),
     )
     inputs.recipe.check(inputs.shot)
