@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from helpers.command_line import content, flat, shadowinv
+from helpers.command_line import flat, shadowinv
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
 SETUP = """
@@ -23,10 +23,9 @@ QUICK = ("--size", "64x64", "--set=plan.draws=2")
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "setup.toml").write_text(SETUP)
-    return tmp_path
+def folder(folder: Path) -> Path:
+    (folder / "setup.toml").write_text(SETUP)
+    return folder
 
 
 def test_a_plan_writes_a_row_for_each_draw_and_a_figure(folder):
@@ -63,7 +62,7 @@ def test_a_sweep_has_a_row_for_each_value(folder):
     assert float(few["error"]) > 2 * float(many["error"])
 
 
-def test_particles_are_traced_through_a_field_on_a_grid(folder):
+def test_particles_are_traced_through_a_field_on_a_grid(folder, refused):
     places = np.linspace(-6e-5, 6e-5, 33)
     z, y, x = np.meshgrid(places, places, places, indexing="ij")
     bell = 8e6 * np.exp(-(x**2 + y**2 + z**2) / (2 * 1.2e-5**2))
@@ -86,10 +85,7 @@ def test_particles_are_traced_through_a_field_on_a_grid(folder):
         ),
         (("toroid", *view), "received view.beam, view.right, which does not apply to toroid"),
     ):
-        refused = shadowinv("plan", *arguments, "--out", "other.csv")
-        assert refused.exit_code == 2
-        assert message in flat(refused.output)
-    assert not (folder / "other.csv").exists()
+        refused("plan", *arguments, "--out", "other.csv", names=message)
 
 
 def test_the_object_of_a_file_is_a_displacement(folder):
@@ -127,10 +123,5 @@ def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):
         (("plan", "blob", "--out", "plan.txt"), "plan.txt cannot be written"),
     ],
 )
-def test_wrong_input_is_one_sentence_and_writes_nothing(folder, arguments, message):
-    before = content(folder)
-    answer = shadowinv(*arguments)
-    assert answer.exit_code == 2, answer.output
-    assert message in flat(answer.output)
-    assert "Traceback" not in answer.output
-    assert content(folder) == before
+def test_wrong_input_is_one_sentence_and_writes_nothing(refused, arguments, message):
+    refused(*arguments, names=message)

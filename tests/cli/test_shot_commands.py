@@ -66,34 +66,11 @@ pixel_size = 1e-5
 pytestmark = pytest.mark.usefixtures("blank_pages")
 
 
-@pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
 @pytest.fixture
 def shot(folder: Path) -> Path:
     path = folder / "shot.npy"
     np.save(path, 100 * synthetic_image(BLOB.displacement))
     return path
-
-
-@pytest.fixture
-def refused(folder: Path) -> Callable[..., None]:
-    """Run a command that must fail with one sentence and write nothing."""
-
-    def run(*arguments: object, names: str | tuple[str, ...]) -> None:
-        before = content(folder)
-        result = shadowinv(*arguments)
-        assert result.exit_code == 2, result.output
-        (line,) = result.stderr.splitlines()
-        for name in (names,) if isinstance(names, str) else names:
-            assert name in line
-        assert "Traceback" not in result.output
-        assert content(folder) == before
-
-    return run
 
 
 def prepared(
