@@ -465,17 +465,16 @@ def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
         from pathlib import Path
         from napari_shadowinv.io import store_writing as store
 
-        create = store._create_array
+        write = store._write_template
         pool = ThreadPoolExecutor(1)
 
-        def create_slowly(group, name, *arguments):
-            create(group, name, *arguments)
-            if name == "status":
-                print("now")
-                time.sleep(0.3)
-                Path(group.store.root, "late").mkdir(parents=True)
+        def write_slowly(path, *arguments):
+            write(path, *arguments)
+            print("now")
+            time.sleep(0.3)
+            Path(path, "late").mkdir(parents=True)
 
-        store._create_array = lambda *arguments: pool.submit(create_slowly, *arguments).result()
+        store._write_template = lambda *arguments: pool.submit(write_slowly, *arguments).result()
     """
     before = sorted(folder.rglob("*"))
     code, output = interrupted(folder, behind_our_back, [*BATCH, "--scheduler", "threads"], 0.1)

@@ -80,11 +80,13 @@ class _Chunks:
     def __init__(self, path: Path, variable: xarray.Variable) -> None:
         self.path, self.variable = path, variable
         self.shape, self.dtype, self.ndim = variable.shape, variable.dtype, variable.ndim
+        # xarray before 2026 reads texts at once.
+        self.chunks = variable.encoding.get("chunks", variable.shape)
 
     def __getitem__(self, key: tuple[Any, ...]) -> AnyArray:
         first = next(iter(key), 0)
         number = (first.start or 0) if isinstance(first, slice) else first
-        chunk = number // next(iter(self.variable.encoding["chunks"]), 1)
+        chunk = number // next(iter(self.chunks), 1)
         return read_values(self.path / "c" / str(chunk), self.variable, key)
 
 
@@ -93,10 +95,9 @@ def as_dask(path: Path, variable: xarray.Variable) -> xarray.Variable:
     da: Any = import_module("dask.array")
     # Without a name by content: a store that has grown is another one.
     meta = np.empty((0,) * variable.ndim, variable.dtype)
-    chunks = variable.encoding["chunks"]
     values = _Chunks(path, variable)
     return variable.copy(
-        data=da.from_array(values, chunks=chunks, name=False, fancy=False, meta=meta)
+        data=da.from_array(values, chunks=values.chunks, name=False, fancy=False, meta=meta)
     )
 
 

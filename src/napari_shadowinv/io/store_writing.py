@@ -1,6 +1,6 @@
 """Writing a store of many shots: create it, add shots to it, write each.
 
-- create a store with all shots pending: `create_store`, from its `Contents`
+- create a store with all shots pending: `create_store`
 - make room for more shots: `grow_store`
 - write a shot, or why it failed, also in a worker: `ShotWriter`
 
@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import zarr
@@ -41,7 +41,11 @@ from napari_shadowinv.io.store import (
 )
 from napari_shadowinv.io.store_damage import chunk_file, fields_of, is_along_shots
 
-_TOGETHER = 1024  # values of a coordinate along shots that are one file
+if TYPE_CHECKING:
+    import xarray
+
+OF_SHOTS = ("shot", "name")  # coordinates of the shots
+_TOGETHER = 1024  # of their values are one file
 
 
 @contextmanager
@@ -127,34 +131,20 @@ def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
     return arrays
 
 
-@dataclass(frozen=True)
-class StoreArray:
-    """Array of a store to create."""
-
-    dims: tuple[str, ...]
-    dtype: Any
-    attributes: Mapping[str, Any]  # its units and long name
-    values: AnyArray | None = None  # written at once; without, it is written shot by shot
-
-    @property
-    def along_shots(self) -> bool:
-        return self.dims[:1] == ("shot",)
-
-
-@dataclass(frozen=True)
-class Contents:
-    """Content of a store to create: arrays, lengths of dimensions, attributes of all shots."""
-
-    sizes: Mapping[str, int]
-    variables: Mapping[str, StoreArray]
-    coordinates: Mapping[str, StoreArray]
-    attributes: Mapping[str, Any]
-
-
-def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> StackStore:
+def create_store(
+    path: Path, empty: xarray.Dataset, shots: Mapping[str, AnyArray], *, overwrite: bool = False
+) -> StackStore:
     """Create a store with all its shots pending; it appears completely or not at all.
 
     The run must hold the store's lock.
+
+    Parameters
+    ----------
+    path : Path
+    empty : xarray.Dataset
+        The store without shots.
+    shots : mapping of str to ndarray
+        Coordinates of the shots, `OF_SHOTS`.
     """
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
@@ -165,7 +155,8 @@ def create_store(path: Path, contents: Contents, *, overwrite: bool = False) -> 
         with _as_store_errors(path):
             # Zarr writes in a thread of its own, which would go on behind our back.
             with defer_interrupts():
-                _write_template(new, contents)
+                _write_template(new, empty)
+                _lengthen(new, shots, {})
             if path.exists():
                 os.replace(path, old)
             os.replace(new, path)
@@ -187,24 +178,29 @@ def remove_unfinished(path: Path) -> None:
                 Path(folder, name).unlink(missing_ok=True)
 
 
-def grow_store(path: Path, values: Mapping[str, AnyArray], attributes: Mapping[str, Any]) -> None:
+def grow_store(path: Path, shots: Mapping[str, AnyArray], attributes: Mapping[str, Any]) -> None:
     """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged.
 
-    The coordinates, `values`, are of the new shots.
+    `shots` are the coordinates of the new shots, as of `create_store`.
     """
+    with _as_store_errors(path):
+        _lengthen(path, shots, attributes)
+
+
+def _lengthen(path: Path, shots: Mapping[str, AnyArray], attributes: Mapping[str, Any]) -> None:
     # The store is longer once its description is replaced.
-    with _as_store_errors(path), _changing_description(path) as metadata:
+    with _changing_description(path) as metadata:
         arrays = _open_to_write(path)
         longer = [name for name, array in arrays.items() if is_along_shots(array)]
         before = metadata["consolidated_metadata"]["metadata"]["status"]["shape"][0]
-        length = before + len(values["shot"])
+        length = before + len(shots["shot"])
         for name in longer:
             array = arrays[name]
             # Beyond the end stated in the folder's own copy: nobody sees it yet.
             if array.shape[0] < length:
                 array.resize((length, *array.shape[1:]))
-            if name in values:
-                array[before:length] = values[name]
+            if name in shots:
+                array[before:length] = shots[name]
         metadata["attributes"].update(attributes)
         for name in longer:
             metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
@@ -220,20 +216,7 @@ def _changing_description(path: Path) -> Iterator[dict[str, Any]]:
         draft.write_text(json.dumps(document), encoding="utf-8")
 
 
-def _write_template(path: Path, contents: Contents) -> None:
-    extra = " ".join(name for name in contents.coordinates if name not in contents.sizes)
-    identity = {"format": FORMAT, "store_id": secrets.token_hex(8), "coordinates": extra}
-    group = zarr.create_group(path, zarr_format=3, attributes={**contents.attributes, **identity})
-    arrays = {**contents.coordinates, **contents.variables, **_record()}
-    for name, variable in arrays.items():
-        _create_array(group, name, variable, contents.sizes)
-    with warnings.catch_warnings():
-        # The warning is that other programs may not know this: they read the arrays' own metadata.
-        warnings.simplefilter("ignore")
-        zarr.consolidate_metadata(path)
-
-
-def _record() -> dict[str, StoreArray]:
+def _write_template(path: Path, empty: xarray.Dataset) -> None:
     status = {
         "units": "1",
         "long_name": "Status of the shot",
@@ -241,37 +224,33 @@ def _record() -> dict[str, StoreArray]:
         "flag_meanings": " ".join(STATUS_NAMES),
     }
     report = {"units": "1", "long_name": "Report, or reason for failure (JSON)"}
-    return {
-        "status": StoreArray(("shot",), np.dtype("int8"), status),
-        "report": StoreArray(("shot",), str, report),
+    record = {
+        "status": ("shot", np.empty(0, np.int8), status),
+        "report": ("shot", np.empty(0, np.dtypes.StringDType()), report),
     }
+    identity = {"format": FORMAT, "store_id": secrets.token_hex(8)}
+    template = empty.assign(record).assign_attrs(identity)
+    encoding = {name: _encoding(str(name), each) for name, each in template.variables.items()}
+    with warnings.catch_warnings():
+        # The warning is that other programs may not know this: they read the arrays' own metadata.
+        warnings.simplefilter("ignore")
+        template.to_zarr(path, zarr_format=3, consolidated=True, encoding=encoding)
 
 
-def _create_array(
-    group: Any, name: str, variable: StoreArray, sizes: Mapping[str, int], small: int = 64
-) -> None:
-    """Create an array of a store; `small` chunks are not worth compressing."""
-    shape = tuple(sizes[dim] for dim in variable.dims)
-    # A chunk is one file. Values of the start are in few files, with room for new shots; others in
-    # a file for each shot.
-    together = 1 if variable.values is None else _TOGETHER
-    along_shots = (together, *shape[1:])
-    chunks = along_shots if variable.along_shots else tuple(max(1, length) for length in shape)
-    is_text = variable.dtype is str
-    is_float = not is_text and np.dtype(variable.dtype).kind == "f"
+def _encoding(name: str, variable: xarray.Variable, small: int = 64) -> dict[str, Any]:
+    """Return how an array is stored; `small` chunks are not worth compressing."""
+    # A chunk is one file. Names and numbers of the shots are in few files, with room for new ones;
+    # other values along the shots in a file for each.
+    first = [_TOGETHER if name in OF_SHOTS else 1] if variable.dims[:1] == ("shot",) else []
+    chunks = (*first, *(max(1, length) for length in variable.shape[len(first) :]))
+    is_plain = variable.dtype.kind == "T" or np.prod(chunks) <= small
     # Fields compress well once their slowly changing bytes are next to each other.
     fields = BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")
-    is_plain = is_text or np.prod(chunks) <= small
-    array = group.create_array(
-        name,
-        shape=shape,
-        chunks=chunks,
-        dtype=variable.dtype,
-        fill_value="" if is_text else np.nan if is_float else 0,
-        compressors=[Crc32cCodec()] if is_plain else [fields, Crc32cCodec()],
-        dimension_names=variable.dims,
-        attributes=dict(variable.attributes),
-        config={"write_empty_chunks": True},
-    )
-    if variable.values is not None:
-        array[...] = variable.values
+    return {
+        "chunks": chunks,
+        "compressors": [Crc32cCodec()] if is_plain else [fields, Crc32cCodec()],
+        "write_empty_chunks": True,
+        "_FillValue": None,
+        **({"fill_value": np.nan} if variable.dtype.kind == "f" else {}),
+        **({"dtype": bool} if variable.dtype.kind == "b" else {}),
+    }

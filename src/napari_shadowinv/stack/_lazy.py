@@ -9,6 +9,7 @@ from collections.abc import Collection
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+from uuid import uuid4
 
 import numpy as np
 
@@ -22,8 +23,7 @@ from napari_shadowinv.physics.setup import SETUPS
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._plan import (
     Stack,
-    attributes_of,
-    coordinates_of,
+    describe_results,
     describe_stack,
     dtype_of,
 )
@@ -193,21 +193,12 @@ def _pick(record: dict[str, Any], name: str) -> AnyArray:
 
 def _lazy_records(stack: Stack) -> tuple[Any, str]:
     """Return an array of each shot's variables as a dictionary, a task for each, and its token."""
-    from dask.base import tokenize
     from dask.delayed import delayed
     from dask.highlevelgraph import HighLevelGraph
 
     da: Any = import_module("dask.array")
     shots = stack.shots
-    token = tokenize(
-        shots.items,
-        [shot.source for shot in shots.items],
-        stack.source_text(None),
-        stack.task.inputs.shot.mask,
-        stack.task.inputs.shot.source_mask,
-        stack.task.requested.model_dump_json(),
-        stack.task.variables,
-    )
+    token = uuid4().hex  # not by content: of a changed file, dask must not reuse the result
     name = f"invert-shot-{token}"
     task = delayed(stack.task, name=f"task-{token}", traverse=False)
     lazy = [item for item in shots.items if isinstance(item, ArrayExposure) and item.is_lazy]
@@ -226,33 +217,28 @@ def _lazy_records(stack: Stack) -> tuple[Any, str]:
 
 def _lazy_dataset(stack: Stack) -> xarray.Dataset:
     """Return the dataset of a stack, with a task for each variable of each shot."""
-    import xarray as xr
-
     da: Any = import_module("dask.array")
     records, token = _lazy_records(stack)
 
-    def of_each_shot(name: str, dims: tuple[str, ...], dtype: Any) -> Any:
+    def of_each_shot(name: str, shape: tuple[int, ...], dtype: Any = None) -> Any:
         return records.map_blocks(
             partial(_pick, name=name),
             name=f"{name}-{token}",
-            chunks=(*records.chunks, *((stack.sizes[dim],) for dim in dims)),
-            new_axis=list(range(1, 1 + len(dims))),
-            meta=np.empty((0,) * (1 + len(dims)), dtype),
+            chunks=(*records.chunks, *((length,) for length in shape[1:])),
+            new_axis=list(range(1, len(shape))),
+            meta=np.empty((0,) * len(shape), dtype or dtype_of(name)),
         )
 
+    dataset = describe_results(stack, of_each_shot)
     variables: dict[str, Any] = {}
-    for name, (dims, labels) in stack.task.labels.items():
-        if name not in stack.task.variables:
-            continue
-        variables[name] = (("shot", *dims), of_each_shot(name, dims, dtype_of(name)), labels)
     setups = stack.setups
     if setups is not None:
         variables["setup"] = (("shot",), da.from_array(np.array(setups, "O"), 1), SETUPS_LABEL)
     for column in columns_of(INVERSIONS):
         if column.value is not None:
-            values = of_each_shot(column.key, (), column.kind)
+            values = of_each_shot(column.key, (len(stack.shots),), column.kind)
             variables[column.key] = (("shot",), values, column.labels)
     if not stack.task.by_row:
         variables |= stack.task.masks
-    dataset = xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes_of(stack))
+    dataset = dataset.assign(variables)
     return dataset if setups is None else with_places(dataset)

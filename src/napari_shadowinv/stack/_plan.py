@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,18 +21,17 @@ from napari_shadowinv._system.arrays import (
 )
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import map_paths
-from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
-from napari_shadowinv.io.files import sha256, split_address, text_of
+from napari_shadowinv.io.files import sha256, split_address
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
 from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, UniformEstimate
-from napari_shadowinv.provenance import Origin, index_masks
+from napari_shadowinv.provenance import index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
     Exposure,
@@ -52,6 +51,9 @@ from napari_shadowinv.stack._worker import (
     FitTask,
     InvertTask,
 )
+
+if TYPE_CHECKING:
+    import xarray
 
 # Variables that are stored of an inversion, and of a fit, by default.
 STORED = ("potential", "displacement", "caustic", "mask")
@@ -168,7 +170,7 @@ def _plan_inversion(
     rows = [row for shot in shots.items for row in shot.rows]
     own_masks = any(row.mask is not None for row in rows)
     chosen = _checked_variables(variables, inputs.recipe, own_masks=own_masks)
-    if rows:  # the common masks are among those of each shot
+    if rows:  # each shot has the common masks, too
         unmasked = index_masks(inputs.provenance.images, [(None, None)])
         inputs = replace(inputs, provenance=inputs.provenance.model_copy(update=unmasked))
     return InvertTask(inputs=inputs, variables=chosen, requested=recipe, by_row=bool(rows))
@@ -235,36 +237,24 @@ def _describe_inputs(
     if recipe.fit is None and not recipe.steps:
         check_memory(stack_shots.shape, bytes_per_pixel(recipe.options), "an inversion")
     blank = np.ones(stack_shots.shape)
+    beam = None
+    if sources is not None:  # where each shot has its own, one that is not flat, as they may be
+        beam = Shot(blank.cumsum(axis=0) if isinstance(sources, Shots) else sources)
+        if isinstance(source, (str, Path)):
+            path, variable = split_address(source, measured.variable)
+            digest = sha256(path) if path.is_file() else ""  # else a pattern of several files
+            beam = replace(beam, path=path, metadata={"sha256": digest, "variable": variable})
     inputs = collect_inputs(
         recipe.model_copy(update={"source": recipe.estimate}),
-        Shot(
-            blank,
-            source=None if sources is None else _checked_beam(sources, blank),
-            mask=mask,
-            source_mask=common.source_mask,
-        ),
+        Shot(blank, source=beam, mask=mask, source_mask=common.source_mask),
     )
     inputs.recipe.check(inputs.shot)
     if inputs.recipe.estimate is not None:
         # It refuses a wrong setup.
         inputs.recipe.estimate.adapt_to(inputs.recipe.setup, stack_shots.shape)
-    if isinstance(source, (str, Path)):
-        path, variable = split_address(source, measured.variable)
-        origin = Origin(
-            file=text_of(path.name),
-            sha256=sha256(path) if path.is_file() else "",  # else a pattern of several files
-            variable=variable,
-            shape=stack_shots.shape,
-        )
-        inputs = replace(inputs, provenance=inputs.provenance.with_image(source=origin))
     if isinstance(sources, Shots):
         return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
     return stack_shots, inputs, None
-
-
-def _checked_beam(sources: Any, blank: AnyArray) -> AnyArray:
-    """Return a common source; for one of each shot a beam that is not flat, as they may be."""
-    return sources if getattr(sources, "ndim", None) == 2 else blank.cumsum(axis=0)
 
 
 def _find_table(shots: Any) -> Path | Sequence[ShotRow] | None:
@@ -328,9 +318,19 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
     return coords
 
 
-def attributes_of(stack: Stack) -> dict[str, str]:
+def describe_results(stack: Stack, values: Callable[[str, tuple[int, ...]], Any]) -> xarray.Dataset:
+    """Return the dataset of a stack; `values` makes a variable from its name and shape."""
+    import xarray as xr
+
+    variables = {}
+    for name, (of_one, labels) in stack.task.labels.items():
+        if name in stack.task.variables:
+            dims = ("shot", *of_one)
+            shape = tuple(stack.sizes[dim] for dim in dims)
+            variables[name] = dims, values(name, shape), labels
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.task.setup).attrs
-    return {"format": FORMAT, **attributes, **stack.task.attributes}
+    attributes = {"format": FORMAT, **attributes, **stack.task.attributes}
+    return xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes)
 
 
 def dtype_of(name: str) -> Any:

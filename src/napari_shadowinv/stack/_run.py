@@ -2,7 +2,7 @@
 
 - the run: `run_stack`; its status: `RunStatus`
 - a store that is filled, also by a watch: `StoreRun`
-- the content of a new store: `contents_of`
+- a new store: `create`
 - checks and order of a store to be continued: `resume`, `match_store`, `append_shots`
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -42,9 +42,8 @@ from napari_shadowinv.io.store import (
     check_store_path,
 )
 from napari_shadowinv.io.store_writing import (
-    Contents,
+    OF_SHOTS,
     ShotWriter,
-    StoreArray,
     create_store,
     grow_store,
     remove_unfinished,
@@ -54,8 +53,8 @@ from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._plan import (
     STORED,
     Stack,
-    attributes_of,
     coordinates_of,
+    describe_results,
     describe_stack,
     dtype_of,
 )
@@ -230,10 +229,10 @@ def run_stack(
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
         with _resumable(), scheduler_for(scheduler, run.workers) as chosen:
             if filled is None:
-                new = create_store(path, contents_of(stack), overwrite=run.overwrite)
-                filled = StoreRun(new)
+                filled = StoreRun(create(path, stack, overwrite=run.overwrite))
             else:
-                filled.append_from(stack)
+                new = {name: each[len(filled.names) :] for name, each in _of_shots(stack).items()}
+                filled.append(new, source_image=stack.source_text(None))
 
             def report(outcome: ShotOutcome | None = None, _: Any = None) -> None:
                 name = "" if outcome is None else stack.shots.items[outcome.index].name
@@ -337,21 +336,15 @@ class StoreRun:
             name for name, each in zip(self.names, self.statuses, strict=True) if each == status
         )
 
-    def append(self, names: Sequence[str], numbers: AnyArray, **attributes: str) -> None:
-        """Append pending shots; `numbers` are their values of the coordinate ``shot``."""
+    def append(self, shots: Mapping[str, AnyArray], **attributes: str) -> None:
+        """Append pending shots, described by their coordinates in a store."""
+        names = list(map(str, shots["name"]))
         if not names:
             return
-        values = {"shot": numbers, "name": np.array(names, dtype=object)}
-        grow_store(self._path, values, attributes)
+        grow_store(self._path, shots, attributes)
         self.numbers |= {name: index for index, name in enumerate(names, len(self.names))}
         self.names += names
         self.statuses.extend([PENDING] * len(names))
-
-    def append_from(self, stack: Stack) -> None:
-        """Append the shots of a stack that arrived since the last run."""
-        count, numbers = len(self.names), np.asarray(_coordinates(stack)["shot"].values)
-        text = stack.source_text(None)
-        self.append(stack.shots.names[count:], numbers[count:], source_image=text)
 
     def reopen(self, index: int) -> None:
         """Mark a shot as pending, and forget its report and fields."""
@@ -386,41 +379,41 @@ class StoreRun:
                     on_end(outcome, None if results is None else results.pop(outcome.index))
 
 
-def contents_of(stack: Stack) -> Contents:
+def create(path: Path, stack: Stack, *, overwrite: bool) -> StackStore:
+    """Create the store of a stack, with all shots pending."""
+    empty = replace(stack, shots=stack.shots.reordered([]))
+
+    def values(name: str, shape: tuple[int, ...]) -> AnyArray:
+        is_rounded = dtype_of(name).kind == "f" and "site" not in stack.task.labels[name][0]
+        return np.empty(shape, stack.dtype if is_rounded else dtype_of(name))
+
+    dataset = describe_results(empty, values)
+    for name, (dims, pixels, labels) in stack.task.masks.items():
+        none = np.empty([empty.sizes[dim] for dim in dims], bool)
+        dataset[name] = dims, none if pixels is None else pixels, labels
+    coordinates = {name: _as_stored(each.variable) for name, each in dataset.coords.items()}
     identity = {name: value for name, value in _identity(stack).items() if value}
-    attributes = {**attributes_of(stack), **identity}
-    return Contents(stack.sizes, _variables(stack), _coordinates(stack), attributes)
+    dataset = dataset.assign_coords(coordinates).assign_attrs(identity)
+    return create_store(path, dataset, _of_shots(stack), overwrite=overwrite)
 
 
-def _coordinates(stack: Stack) -> dict[str, StoreArray]:
+def _of_shots(stack: Stack) -> dict[str, AnyArray]:
+    """Return the coordinates of the shots as a store has them."""
     import xarray as xr
 
-    coordinates = {}
-    for name, coordinate in coordinates_of(stack).items():
-        labelled = xr.as_variable(coordinate)
-        values, attributes = labelled.values, dict(labelled.attrs)
-        if values.dtype.kind in "mM":
-            # As numbers, because Zarr has no times; the units say which.
-            attributes["units"] = "ns since 1970-01-01"
-            values = values.astype("datetime64[ns]").astype("int64")
-        is_text = values.dtype.kind in "UO"
-        values = values.astype(object) if is_text else values
-        dims, dtype = tuple(map(str, labelled.dims)), str if is_text else values.dtype
-        coordinates[name] = StoreArray(dims, dtype, attributes, values)
-    return coordinates
+    coordinates = coordinates_of(stack)
+    return {name: _as_stored(xr.as_variable(coordinates[name])).values for name in OF_SHOTS}
 
 
-def _variables(stack: Stack) -> dict[str, StoreArray]:
-    variables: dict[str, StoreArray] = {}
-    for name, (dims, labels) in stack.task.labels.items():
-        if name not in stack.task.variables:
-            continue
-        exact = dtype_of(name).kind != "f" or "site" in dims
-        stored = dtype_of(name) if exact else np.dtype(stack.dtype)
-        variables[name] = StoreArray(("shot", *dims), stored, labels)
-    for name, (dims, pixels, labels) in stack.task.masks.items():
-        variables[name] = StoreArray(dims, np.dtype(bool), labels, pixels)
-    return variables
+def _as_stored(coordinate: xarray.Variable) -> xarray.Variable:
+    """Return a coordinate with values that Zarr has: texts of any length, times as numbers."""
+    values = coordinate.to_base_variable()
+    if values.dtype.kind in "mM":
+        values = values.astype("datetime64[ns]").astype("int64")
+        values.attrs = {**values.attrs, "units": "ns since 1970-01-01"}
+    is_text = values.dtype.kind in "UO"
+    stored: xarray.Variable = values.astype(np.dtypes.StringDType()) if is_text else values
+    return stored
 
 
 def _identity(stack: Stack, shots: int | None = None) -> dict[str, str]:

@@ -24,13 +24,10 @@ from napari_shadowinv._system.validation import as_model
 from napari_shadowinv.errors import FileFormatError, InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
-from napari_shadowinv.io.files import sha256, text_of
+from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.frames import counts_text
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
-from napari_shadowinv.io.store_writing import (
-    create_store,
-    remove_unfinished,
-)
+from napari_shadowinv.io.store_writing import remove_unfinished
 from napari_shadowinv.pipeline.run_options import WatchOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot
@@ -44,7 +41,7 @@ from napari_shadowinv.stack._run import (
     OnStatus,
     RunStatus,
     StoreRun,
-    contents_of,
+    create,
     match_store,
     stored_variables,
 )
@@ -61,8 +58,6 @@ from napari_shadowinv.stack._worker import ShotOutcome
 
 if TYPE_CHECKING:
     import xarray
-
-_CLOCK_RESOLUTION_S = 2.0  # of file times, on any file system
 
 
 class Watch:
@@ -232,20 +227,16 @@ class Watch:
         """Return whether a file is new, or another than the one that was inverted."""
         name, shot = text_of(file), self._shot(file)
         try:
-            age_s = time.time() - shot.path.stat().st_mtime
+            shot.path.stat()
             if self.filled is None or self._status_of(name) not in (DONE, FAILED):
                 return True
-            report = self.filled.report(self.filled.numbers[name])
-            # Within the resolution of file times it may have changed at the same time.
-            if age_s < _CLOCK_RESOLUTION_S and "sha256" in report:
-                return bool(sha256(shot.path) != report["sha256"])
-            return not shot.unchanged(report)
+            return not shot.unchanged(self.filled.report(self.filled.numbers[name]))
         except OSError:
             self._arrivals.check()
             return False  # removed before its turn
 
     def _invert(self, files: list[str], scheduler: Scheduler) -> None:
-        """Run some shots like those of any stack, and note their outcomes."""
+        """Run some shots as any stack does, and note their outcomes."""
         assert self._stack is not None
         shots = {text_of(file): self._shot(file) for file in files}
         again = {name for name in shots if self._status_of(name) in (DONE, FAILED)}
@@ -253,12 +244,12 @@ class Watch:
         with defer_interrupts():
             if self.filled is None:
                 first = replace(self._stack.shots, items=list(shots.values()))
-                contents = contents_of(replace(self._stack, shots=first))
-                overwrite = self._options.overwrite
-                self.filled = StoreRun(create_store(self._path, contents, overwrite=overwrite))
+                stack = replace(self._stack, shots=first)
+                self.filled = StoreRun(create(self._path, stack, overwrite=self._options.overwrite))
             filled = self.filled
             new = [name for name in shots if name not in filled.numbers]
-            filled.append(new, len(filled.names) + np.arange(len(new)))
+            numbers = len(filled.names) + np.arange(len(new))
+            filled.append({"shot": numbers, "name": np.array(new, np.dtypes.StringDType())})
             for name in shots:
                 filled.reopen(filled.numbers[name])
         self._running = {filled.numbers[text_of(file)]: file for file in files}
