@@ -81,6 +81,16 @@ def test_frames_appended_to_a_file_are_inverted_later(any_night, run_file, out):
         any_night.run(out, shots=address)
 
 
+def test_another_array_of_the_same_files_is_another_shot(any_night, out, tmp_path):
+    for index in (0, 1):
+        with h5py.File(tmp_path / f"{index}.h5", "w") as file:
+            file["a"], file["b"] = any_night.images[index], any_night.images[2]
+    any_night.run(out, shots=f"{tmp_path}/*.h5::a")
+    any_night.run(out, shots=f"{tmp_path}/*.h5::a")
+    with pytest.raises(InputError, match=r"shot 0 \(0.h5\) has changed since"):
+        any_night.run(out, shots=f"{tmp_path}/*.h5::b")
+
+
 def test_frame_that_is_missing_fails_alone(any_night, run_file, out):
     with h5py.File(run_file, "r+") as file:
         file["entry/data/data"].resize(8, axis=0)

@@ -77,7 +77,6 @@ KINDS = {
     "numpy": lambda images, _: images,
     "dask of one shot": lambda images, _: da.from_array(images, chunks=(1, -1, -1)),
     "dask of many shots": lambda images, _: da.from_array(images, chunks=(3, 20, -1)),
-    "list of arrays": lambda images, _: list(images),
     "xarray": lambda images, _: xr.DataArray(images, dims=("shot", "y", "x")),
     "xarray of dask": lambda images, _: xr.DataArray(images, dims=("shot", "y", "x")).chunk(),
     "dataset": lambda images, _: xr.Dataset({"image": (("shot", "y", "x"), images)}),

@@ -2,7 +2,7 @@
 
 - values in the order of the axes, and the mask: `unpack_array`
 - the same where a mask has no meaning: `plain_array`; in any order: `refuse_masked`
-- image, source and mask of one shot: `unpack_shot`; several planes: `unpack_planes`
+- image, source and mask of one shot: `unpack_shot`
 - numbers as floats: `as_numbers`; a plane of them: `check_plane`; a mask: `check_mask`
 - two masks together: `join_masks`; enough usable pixels: `check_usable`
 - size of a pixel by the coordinates: `coordinate_spacing`
@@ -112,20 +112,6 @@ def unpack_shot(image: Any, source: Any, mask: Any) -> tuple[Any, Any, Any]:
         source, lit = unpack_array(source, "source")
         usable = join_masks(usable, lit)
     return image, source, join_masks(unpack_mask(mask), usable)
-
-
-def unpack_planes(values: Any, name: str) -> tuple[Any, BoolArray | None]:
-    """Return one plane, an array of planes or a list of them without masks, and the mask."""
-    if not isinstance(values, (list, tuple)):
-        dims = ("image", *PLANE) if np.ndim(values) == 3 else PLANE
-        return unpack_array(values, name, dims)
-    planes = [unpack_array(plane, f"{name}[{k}]") for k, plane in enumerate(values)]
-    arrays = [array for array, _ in planes]
-    if all(usable is None for _, usable in planes):
-        return arrays, None
-    masks = [np.ones(np.shape(array), bool) if use is None else use for array, use in planes]
-    # Planes of several shapes are refused by name later.
-    return arrays, np.array(masks) if len({mask.shape for mask in masks}) == 1 else None
 
 
 def check_plane(values: Any, name: str, least: int = 1) -> AnyArray:

@@ -1,7 +1,7 @@
 """Shots of a stack, each read on demand: `Exposure`, and where they come from.
 
 - in an array, in a file, in rows of a table: `ArrayExposure`, `FileExposure`, `RowsExposure`
-- all shots of an array, of files or of a list: `find_shots`; of a table: `table_shots`
+- all shots of an array or of files: `find_shots`; of a table: `table_shots`
 - their sources: `find_source`
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,6 @@ from napari_shadowinv._system.arrays import (
     checksum,
     join_masks,
     unpack_array,
-    unpack_planes,
 )
 from napari_shadowinv._system.validation import map_paths
 from napari_shadowinv._typing import AnyArray, BoolArray
@@ -114,9 +112,6 @@ class ArrayExposure(Exposure):
         plane = np.ascontiguousarray(plane)
         return (Shot(plane),), {"sha256": checksum(plane)}
 
-    def __dask_tokenize__(self) -> Any:
-        return (self.array.name, self.index) if self.is_lazy else checksum(self.array[self.index])
-
     def __reduce__(self) -> tuple[Any, ...]:
         # Otherwise all images, or their tasks, would be sent with it.
         return functools.partial(ArrayExposure, source=self.source), (self.name, self.block)
@@ -131,17 +126,9 @@ class FileExposure(Exposure):
     page: int | None = None  # the reader takes it as a keyword
     variable: str | None = None  # the same, of an array in an HDF5 file
 
-    def __dask_tokenize__(self) -> tuple[Any, ...]:
-        # A changed file is another input, so dask must not reuse its result.
-        from dask.base import normalize_token
-
-        file_stamp = stamp(self.path) if self.path.exists() else {}
-        part = (self.page, self.variable)
-        return (str(self.path), normalize_token(self.reader), *part, *file_stamp.values())
-
     def stamp(self) -> dict[str, Any]:
         # Before the image: it may be written to while it is read.
-        return stamp(self.path) if self.page is None else {}
+        return {"variable": self.variable, **stamp(self.path)} if self.page is None else {}
 
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         parts = {"page": self.page, "variable": self.variable}
@@ -159,7 +146,9 @@ class FileExposure(Exposure):
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare a file as in a table's rows, and a page by its checksum."""
-        return super().unchanged(origin) if self.page is not None else _agrees(self.path, origin)
+        if self.page is not None:
+            return super().unchanged(origin)
+        return self.variable == origin.get("variable") and _agrees(self.path, origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,14 +158,6 @@ class RowsExposure(Exposure):
     recipe: Recipe
     channel: str | None = None
     setup: Setup | None = None  # of the image to invert as recorded
-
-    def __dask_tokenize__(self) -> tuple[Any, ...]:
-        # A changed file is another input, so dask must not reuse its result.
-        files = {name: text_of(path) for name, path in self._files().items()}
-        stamps = [stamp(path) for path in self._files().values() if path.exists()]
-        setup = None if self.setup is None else self.setup.model_dump_json()
-        content = json.dumps([self._summaries(), files, setup, stamps])
-        return content, str(self.channel)
 
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         """Return the images, and the files of their rows."""
@@ -349,7 +330,7 @@ class Shots:
 def find_shots(
     shots: Any, *, reader: Reader = read_pixels, shape: tuple[int, int] | None = None
 ) -> Shots:
-    """Return references to the shots of an array, of files or of a list."""
+    """Return references to the shots of an array or of files."""
     if isinstance(shots, Shots):
         return replace(shots, shape=shape or usual_shape(shots.items))
     if isinstance(shots, (str, Path)):
@@ -360,21 +341,11 @@ def find_shots(
     if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
         items = _shots_of_files(shots, reader)
         return Shots(items, shape or usual_shape(items))
-    if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
-        shapes = {np.shape(item) for item in shots}
-        if len(shapes) > 1:
-            raise InputError(
-                f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected the same "
-                "shape for all"
-            )
-        planes, usable = unpack_planes(list(shots), "shots")
-        shots = np.stack([np.asarray(values) for values in planes])
-        if usable is not None:
-            shots = np.ma.MaskedArray(shots, ~usable)
     if not hasattr(shots, "ndim"):
         raise InputError(
-            f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
-            "object, paths, a glob such as 'shots/*.tif', or a file with many frames"
+            f"shots are a {type(shots).__name__}: expected an array (shot, y, x), such as "
+            "numpy.stack(images), an xarray object, paths, a glob such as 'shots/*.tif', or a file "
+            "with many frames"
         )
     return _from_array(shots)
 
