@@ -31,9 +31,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.results import AnyResult
 
-_STATE = (
-    "napari"  # attribute with the name of a result, its origins in words, and its layers' looks
-)
+_STATE = "napari"  # attribute with a result's name, its origins in words, its layers' looks
 _MAX_NAMES = 3  # in a message
 
 _PLACEMENT = ("scale", "translate", "units")
