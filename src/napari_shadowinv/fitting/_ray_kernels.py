@@ -553,7 +553,8 @@ def merge(
                 if c < 4 * has_beam:
                     number = first_of_beam + (KNOT * row + c // 2) * beam + KNOT * column + c % 2
                 value = of_instrument[line, c]
-                entry = _add_entry(number, value, first, entry, places, columns, values)
+                if value != 0:  # no ray of most pixels of the beam lands here
+                    entry = _add_entry(number, value, first, entry, places, columns, values)
         rows[pixel + 1] = entry
     rows[0] = 0
 
