@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv import io
-from napari_shadowinv._napari.layer_metadata import CAME_WITH, SOURCE
 from napari_shadowinv._napari.layers import LayerData
-from napari_shadowinv._napari.shots import layers_of_shot, lazy_stack, shot_layer
+from napari_shadowinv._napari.shots import layers_of_shot, lazy_stack
 from napari_shadowinv._napari.viewer_sync import notify_errors
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.io.public_images import fetch_burner
@@ -79,14 +78,8 @@ def wakefield_run() -> LayerData:
     """Twenty optical shots of a plasma wave that moves, grows and fades, computed when shown."""
     stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
     limits = intensity_limits(_wakefield_shot(_RUN_LENGTH // 2))
-    origin = f"{CAME_WITH} the sample 'wakefield run'"
-    setup = phantoms.wakefield_setup()
-    beam = _wakefield_beam()
-    name = "wakefield run"
-    facts: dict[str, Any] = {"setup_origin": origin}
-    source, keywords, kind = shot_layer(beam, f"{name} source", setup, limits, SOURCE, **facts)
-    shots = shot_layer(stack, name, setup, limits, source=beam, **facts)
-    return [(source, {**keywords, "visible": False}, kind), shots]
+    shots = Shot(stack, setup=phantoms.wakefield_setup(), source=_wakefield_beam())
+    return layers_of_shot(shots, "wakefield run", limits)
 
 
 # For an image without channels napari adds no layer; it refuses an empty list.

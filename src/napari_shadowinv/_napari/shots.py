@@ -14,7 +14,7 @@ import numpy as np
 from napari_shadowinv import io
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, frame_for, metadata_for, metadata_of
-from napari_shadowinv._napari.layers import FullLayerData, LayerData
+from napari_shadowinv._napari.layers import FullLayerData, LayerData, Limits
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 
-def layers_of_shot(shot: Shot, name: str = "") -> LayerData:
-    """Describe an image, above its undisturbed beam and its mask of unusable pixels."""
+def layers_of_shot(shot: Shot, name: str = "", limits: Limits | None = None) -> LayerData:
+    """Describe an image or a stack, above its undisturbed beam and mask of unusable pixels."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
-    limits = intensity_limits(shot.image)
+    limits = limits or intensity_limits(shot.image)
     frame = _frame(shot)
     layers: LayerData = []
     facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)
