@@ -360,7 +360,7 @@ class Plot(QWidget):
         if axes.get_legend() is not None:
             axes.get_legend().remove()
         _, names = axes.get_legend_handles_labels()
-        if len(names) == 1:
+        if len(names) == 1 and not axes.patches:  # bars are there without a name
             axes.set_title(names[0], loc="left", color=self.ink, fontsize=7)
         elif names:
             columns = max(1, _LEGEND_CHARACTERS // (max(map(len, names)) + _HANDLE_CHARACTERS))
