@@ -443,20 +443,32 @@ class ModelPicker(QtWidgets.QWidget):
 
     def __init__(self, label: str, kinds: Kinds, tip: str = "") -> None:
         super().__init__()
-        self._kinds = dict(kinds)
         self._rows = {kind: row for kind, (_, row) in kinds.items() if isinstance(row, QWidget)}
         self._forms: dict[str, ModelForm] = {}
-        self.choice = SteadyComboBox({key: title for key, (title, _) in kinds.items()}, tip)
+        self._wanted: str | None = None  # perhaps not offered at present
+        self.choice = SteadyComboBox(tip=tip)
         qt.column(self, labelled(label, self.choice), *self._rows.values())
+        self.offer(kinds)
         self.choice.currentIndexChanged.connect(self._on_choice)
+        self.choice.activated.connect(self._on_activation)
         self._on_choice()
 
     @property
     def kind(self) -> str:
         return str(self.choice.currentData())
 
+    def offer(self, kinds: Kinds) -> None:
+        """Replace the kinds; the chosen one stays, or comes back once it is offered again."""
+        self._kinds = dict(kinds)
+        with QSignalBlocker(self.choice):
+            self.choice.clear()
+            for key, (title, _) in kinds.items():
+                self.choice.addItem(title, key)
+            self.choice.setCurrentIndex(max(self.choice.findData(self._wanted), 0))
+
     def set_kind(self, kind: str) -> None:
-        """Select a kind; ignore an unknown one."""
+        """Select a kind, now or once it is offered."""
+        self._wanted = kind
         index = self.choice.findData(kind)
         if index >= 0:
             self.choice.setCurrentIndex(index)
@@ -480,6 +492,9 @@ class ModelPicker(QtWidgets.QWidget):
                 form.restore(values)
         self.set_kind(str(state.get("kind", self.kind)))
 
+    def _on_activation(self) -> None:
+        self._wanted = self.kind
+
     def _on_choice(self) -> None:
         self._form_of(self.kind)
         for kind, widget in (*self._rows.items(), *self._forms.items()):
@@ -487,7 +502,7 @@ class ModelPicker(QtWidgets.QWidget):
         self.changed.emit()
 
     def _form_of(self, kind: str) -> ModelForm | None:
-        _, model_class = self._kinds[kind]
+        _, model_class = self._kinds.get(kind, ("", None))
         if isinstance(model_class, type) and kind not in self._forms:
             form = ModelForm(model_class)
             form.layout().setContentsMargins(INDENT, 0, 0, 0)

@@ -156,7 +156,7 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     type_in(tool, 1, BEAM, "7 MeV")
     type_in(tool, 1, GAIN, "1.2")
     type_in(tool, 1, PSF, "0.8 px")
-    tool.noise.restore("poisson")
+    tool.noise.set_kind("poisson")
     inputs = inputs_of(tool)
     assert [setup.energy for setup in inputs.setups] == [14.7, 7.0]
     assert of_each(inputs.shots, "brightness") == [1.0, 1.2]
@@ -168,7 +168,7 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     assert setup_of(window.layers["6.0 MeV"]) == SETUPS[1]
     window.add_image(np.ones((20, 30)))
     assert texts(tool, BEAM)[:2] == ["14.7", "7"]
-    tool.brightness.restore("free")
+    tool.brightness.set_kind("free")
     assert of_each(inputs_of(tool).shots, "brightness") == ["free", "free"]
     assert texts(tool, GAIN)[:2] == ["free", "free"]
     # The energy of the first image is that of the setup below, whichever is edited.
@@ -278,9 +278,9 @@ def test_light_has_wavelengths_and_its_own_fields(window: Any, open_widget: Any)
         window.add_image(np.ones(SHAPE), name=setup.probe, metadata=metadata_for("shot", "", setup))
     tool = open_widget("Fit several images")
     assert texts(tool, BEAM) == ["532 nm", "810 nm"]
-    keys = [tool.fields.itemData(index) for index in range(tool.fields.count())]
+    keys = [tool.fields.choice.itemData(k) for k in range(tool.fields.choice.count())]
     assert keys == ["plasma", "phase", "plasma and phase"]
-    tool.fields.restore("plasma and phase")
+    tool.fields.set_kind("plasma and phase")
     inputs = inputs_of(tool)
     assert inputs.choices.fields == ("plasma", "phase")
     assert inputs.setups == (green, red)
@@ -634,13 +634,13 @@ def test_the_menu_refines_an_inversion_of_a_file(
 
 
 def test_choices_are_kept_between_sessions(window: Any, tool: Any, open_widget: Any) -> None:
-    tool.fields.restore("B and E")
-    tool.brightness.restore("free")
-    tool.noise.restore("poisson")
+    tool.fields.set_kind("B and E")
+    tool.brightness.set_kind("free")
+    tool.noise.set_kind("poisson")
     state = json.loads(json.dumps(tool.state()))
-    tool.fields.restore("B")
-    tool.brightness.restore("known")
-    tool.noise.restore("")
+    tool.fields.set_kind("B")
+    tool.brightness.set_kind("known")
+    tool.noise.set_kind("")
     del state["setup"]  # a matter of the image
     tool.restore(state)
     choices = tool.request().choices
@@ -878,8 +878,8 @@ def test_a_recipe_is_the_same_for_window_and_command(
     tool = opened(window, open_widget, files)
     for row in (0, 1):
         type_in(tool, row, PSF, "0.6")
-    tool.brightness.restore("free")
-    tool.noise.restore("poisson")
+    tool.brightness.set_kind("free")
+    tool.noise.set_kind("poisson")
     tool.steps.add("crop", {"y": (0, 48), "x": (4, 64)})
     painted = np.zeros(SHAPE, np.uint8)
     painted[:4, :6] = 1
@@ -894,8 +894,8 @@ def test_a_recipe_is_the_same_for_window_and_command(
     tool.source.set_kind("unknown")
     for row in (0, 1):
         type_in(tool, row, PSF, "0")
-    tool.brightness.restore("known")
-    tool.noise.restore("")
+    tool.brightness.set_kind("known")
+    tool.noise.set_kind("")
     tool.steps.show_steps([])
     tool.masks.layer = None
     window.layers.remove("beam")
@@ -917,7 +917,7 @@ def test_a_recipe_tells_noise_and_point_spread(
     path.write_text(f"[[steps]]\nstep = 'bin'\nfactor = 2\n{choices}")
     tool.recipes.load(path)
     assert of_each(inputs_of(tool).shots, "noise") == [3.5, 3.5]
-    assert tool.fields.state() == "B and E"
+    assert tool.fields.kind == "B and E"
     by_command = collect_fit_inputs(
         read_recipe(path), [Shot(np.ones(SHAPE), setup) for setup in SETUPS]
     )

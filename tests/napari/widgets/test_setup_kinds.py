@@ -21,7 +21,7 @@ def test_form_reads_a_new_kind(xray_setup: Any, qtbot: Any) -> None:
 
 
 def test_fields_to_fit_are_those_of_a_new_kind(xray_setup: Any) -> None:
-    assert fields_of("x-ray") == {"electrons": "electron density (phase ∝ λ²)"}
+    assert fields_of("x-ray") == {"electrons": ("electron density (phase ∝ λ²)", None)}
     assert beam_column("x-ray").heading == "Energy (keV)"
 
 

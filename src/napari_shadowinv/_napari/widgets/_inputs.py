@@ -674,50 +674,25 @@ class ImagePanel(ToolPanel):
 
 
 BOTH = " and "
-NOISES = {
-    "": "estimated from each image",
-    "poisson": "Poisson counts",
-    "proportional": "proportional to each pixel (film)",
+BRIGHTNESSES: forms.Kinds = {
+    "known": ("known (in the table)", None),
+    "free": ("unknown (fit it)", None),
+}
+NOISES: forms.Kinds = {
+    "": ("estimated from each image", None),
+    "poisson": ("Poisson counts", None),
+    "proportional": ("proportional to each pixel (film)", None),
 }
 
 
-class ChoiceBox(forms.SteadyComboBox):
-    """A choice that is saved between sessions."""
-
-    def __init__(self, choices: dict[str, str], tip: str) -> None:
-        super().__init__(choices, tip)
-        self._selected: Any = None
-        self.activated.connect(self._on_choice)
-
-    def offer(self, choices: dict[str, str]) -> None:
-        """Replace the choices, titles by key; the selected key stays if it is offered."""
-        with QSignalBlocker(self):
-            self.clear()
-            for key, title in choices.items():
-                self.addItem(title, key)
-            self.setCurrentIndex(max(self.findData(self._selected), 0))
-
-    def state(self) -> str:
-        return str(self.currentData())
-
-    def restore(self, state: Any) -> None:
-        """Select a key, now or once it is offered."""
-        self._selected = state
-        index = self.findData(state)
-        if index >= 0:
-            self.setCurrentIndex(index)
-
-    def _on_choice(self) -> None:
-        self._selected = self.currentData()
-
-
-def fields_of(kind: str) -> dict[str, str]:
-    """Return the fields that can deflect in a kind of setup, titles by key."""
+def fields_of(kind: str) -> forms.Kinds:
+    """Return the fields that can deflect in a kind of setup, by key."""
     if kind not in SETUPS:
-        return {"B": "one field, in pixels"}
-    choices = {deflector.key: deflector.label for deflector in SETUPS[kind].deflectors}
-    keys = list(choices)
-    return choices | ({BOTH.join(keys): BOTH.join(keys)} if len(keys) > 1 else {})
+        return {"B": ("one field, in pixels", None)}
+    choices: forms.Kinds = {each.key: (each.label, None) for each in SETUPS[kind].deflectors}
+    together = BOTH.join(choices)
+    choices.setdefault(together, (together, None))
+    return choices
 
 
 def field_key(fields: Sequence[str]) -> str:

@@ -71,15 +71,17 @@ class FitImages(inputs.ImagePanel):
         self.images = ImageTable(
             self.viewer, lambda layer: about.may_be_shot(layer) and layer is not self.source.layer
         )
-        self.fields = inputs.ChoiceBox(
-            {}, "Field that deflects the beam. Two fields require images at two energies."
+        self.fields = forms.ModelPicker(
+            "Fields", {}, "Field that deflects the beam. Two fields require images at two energies."
         )
-        self.brightness = inputs.ChoiceBox(
-            {"known": "known (in the table)", "free": "unknown (fit it)"},
+        self.brightness = forms.ModelPicker(
+            "Brightness",
+            inputs.BRIGHTNESSES,
             "Brightness of each image relative to the source: known, or fitted. With an unknown "
             "source, it is always fitted.",
         )
-        self.noise = inputs.ChoiceBox(
+        self.noise = forms.ModelPicker(
+            "Noise",
             inputs.NOISES,
             "Noise model for χ² and error bars. Poisson counts: the images are numbers of "
             "particles or photons.",
@@ -94,8 +96,7 @@ class FitImages(inputs.ImagePanel):
         )
         buttons = side_by_side((self.save_result, 1), (self.more_layers, 1))
         self.view = ResultView(self, self._last, Fit, buttons)
-        self.add(self.images, forms.labelled("Fields", self.fields), self.source, self.masks)
-        self.add(forms.labelled("Brightness", self.brightness), forms.labelled("Noise", self.noise))
+        self.add(self.images, self.fields, self.source, self.masks, self.brightness, self.noise)
         self.add(self.setup_section, *self.settings)
         self.add(side_by_side((self.keep_earlier, 1), (self.recipes, 0)), self.cost, self.panel)
         self.add(self.view)
@@ -106,13 +107,10 @@ class FitImages(inputs.ImagePanel):
         self.images.changed.connect(self._show_beams)
         self.source.changed.connect(self.images.fill)
         self.setup.changed.connect(self._on_setup)
-        self.brightness.currentIndexChanged.connect(self._show_beams)
-        choices = (self.fields, self.brightness, self.noise)
-        changes = [choice.currentIndexChanged for choice in choices]
-        changes += [part.changed for part in self.parts().values() if part not in choices]
-        for signal in changes:
-            signal.connect(lambda *_: self.keep())
-            signal.connect(lambda *_: self._show_cost())
+        self.brightness.changed.connect(self._show_beams)
+        for part in self.parts().values():
+            part.changed.connect(lambda *_: self.keep())
+            part.changed.connect(lambda *_: self._show_cost())
         for signal in (self.images.changed, self.images.reference_changed):
             signal.connect(self._show_cost)
 
@@ -122,12 +120,12 @@ class FitImages(inputs.ImagePanel):
 
     def recipe(self) -> Recipe:
         """Return the recipe of the controls, without table and layers; or raise an `InputError`."""
-        fields = tuple(self.fields.state().split(inputs.BOTH))
+        fields = tuple(self.fields.kind.split(inputs.BOTH))
         choices = FitChoices(
             fields=fields,
             beam="unknown" if self.source.kind == inputs.UNKNOWN else "known",
-            brightness=self.brightness.state(),
-            noise=self.noise.state() or None,
+            brightness=self.brightness.kind,
+            noise=self.noise.kind or None,
             options=self.options.model(),
         )
         return self.input_recipe(steps=self.steps.steps(), fit=choices)
@@ -189,13 +187,12 @@ class FitImages(inputs.ImagePanel):
     def show_choices(self, choices: FitChoices) -> None:
         """Show the choices of a recipe."""
         if choices.fields is not None:
-            self.fields.restore(inputs.field_key(choices.fields))
-        self.brightness.restore(choices.brightness)
+            self.fields.set_kind(inputs.field_key(choices.fields))
+        self.brightness.set_kind(choices.brightness)
         noise = "" if choices.noise is None else str(choices.noise)
-        self.noise.offer(
-            inputs.NOISES | {noise: inputs.NOISES.get(noise, f"σ = {noise} in each pixel")}
-        )
-        self.noise.restore(noise)
+        level = f"σ = {noise} in each pixel", None
+        self.noise.offer(inputs.NOISES | {noise: inputs.NOISES.get(noise, level)})
+        self.noise.set_kind(noise)
         self.options.restore(choices.options.model_dump())
         for row in self.images.used:
             width = self._spread(choices, row)
@@ -261,7 +258,7 @@ class FitImages(inputs.ImagePanel):
             self.cost.setVisible(False)  # Run reports the problem
             return
         is_unknown = self.source.kind == inputs.UNKNOWN
-        fields = len(self.fields.state().split(inputs.BOTH))
+        fields = len(self.fields.kind.split(inputs.BOTH))
         estimate = TimeEstimate(shape, len(rows), fields, is_unknown, options)  # type: ignore[arg-type]
         self.cost.show_text(estimate.text(FitJob.pace))
 
@@ -283,7 +280,7 @@ class FitImages(inputs.ImagePanel):
 
     def _known_brightness(self, rows: list[ImageRow]) -> list[float] | list[None]:
         """Return the brightness of each image, or None for each if it is fitted or 1 for all."""
-        if self.brightness.state() == "free":
+        if self.brightness.kind == "free":
             return [None] * len(rows)
         factors = [self.images.brightness(row) for row in rows]
         return [None] * len(rows) if factors == [1.0] * len(rows) else factors
@@ -356,4 +353,4 @@ class FitImages(inputs.ImagePanel):
     def _show_beams(self) -> None:
         form = self.setup.picker.form
         beam = None if form is None else form.state().get(self.images.beam.name)
-        self.images.show_beams(self.setup.picker.kind, beam, self.brightness.state() == "known")
+        self.images.show_beams(self.setup.picker.kind, beam, self.brightness.kind == "known")
