@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ from napari_shadowinv import (
     fit,
     invert,
 )
-from napari_shadowinv._napari import commands
+from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
     is_estimate,
@@ -28,6 +30,7 @@ from napari_shadowinv._napari.layer_metadata import (
     usable_of,
 )
 from napari_shadowinv._napari.shots import shot_layer
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
 from napari_shadowinv.preprocessing import measure_shift, move
@@ -289,6 +292,27 @@ def test_the_cross_of_the_progress_bar_ends_an_inversion(
     bar.cancel()
     qtbot.waitUntil(lambda: bar not in progress._all_instances, timeout=30_000)
     assert len(window.layers) == 1
+    assert messages == []
+
+
+def test_closing_the_window_ends_a_command(
+    make_napari_viewer: Any, shot: np.ndarray, in_loop: Any, qtbot: Any, messages: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    stopped = threading.Event()
+
+    def wait_for_stop(*_: Any, should_stop: Any, **__: Any) -> None:
+        while not should_stop():
+            time.sleep(0.01)
+        stopped.set()
+        raise InversionCancelled
+
+    monkeypatch.setattr(jobs, "run", wait_for_stop)
+    window = make_napari_viewer()
+    add_shot(window, shot)
+    in_loop(registered("invert_uniform"))
+    window.close()
+    qtbot.waitUntil(stopped.is_set, timeout=30_000)
     assert messages == []
 
 

@@ -270,7 +270,8 @@ def run_in_background(task: str, work: Work, done: Callable[[Any], Any]) -> None
     app: Any = QtWidgets.QApplication
     windows = [each for each in app.topLevelWidgets() if isinstance(each, QtWidgets.QMainWindow)]
     run = Run(task, "", "")
-    run.setParent(app.activeWindow() or next(iter(windows), None))
+    active = app.activeWindow()  # perhaps a dialog
+    run.setParent(max(windows, key=lambda each: (each is active, each.isVisible()), default=None))
 
     def end(outcome: Outcome) -> None:
         run.deleteLater()
