@@ -4,7 +4,7 @@ A form holds what the user stated, and the model reads it; grey text shows the d
 
 - the entry of a field: `Entry`; the entries of a model: `ModelForm`
 - one of several models: `ModelPicker`; a list of them: `StepsSection`
-- files: `PathEdit`, `TomlButtons`
+- the path of a file: `PathEdit`
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Union, get_args, get_origin
 
-import tomli_w
 from magicgui import widgets as magic
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -30,7 +29,6 @@ from superqt import QCollapsible
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import read_toml
 from napari_shadowinv.physics.beam import number_in_unit, text_in_unit, unit_in_title
 from napari_shadowinv.preprocessing import STEPS, Step
 
@@ -511,40 +509,6 @@ class ModelPicker(QtWidgets.QWidget):
             self._forms[kind] = form
             self.layout().addWidget(form)
         return self._forms.get(kind)
-
-
-class TomlButtons(QtWidgets.QWidget):
-    """Buttons for TOML files; `load` gets entries and path, `values` returns entries to save."""
-
-    def __init__(
-        self,
-        subject: str,
-        values: Callable[[], dict[str, object]],
-        load: Callable[[dict[str, object], str], None],
-    ) -> None:
-        super().__init__()
-        self._subject, self._values, self._load_values = subject, values, load
-        tip = f"Write {subject} to a TOML file, for use here or on the command line."
-        self.load_button = qt.push_button(
-            f"Load {subject}…", f"Read {subject} from a TOML file.", self._load
-        )
-        self.save_button = qt.push_button("Save…", tip, self._save)
-        qt.side_by_side((self.load_button, 0), (self.save_button, 0), (QWidget(), 1), holder=self)
-
-    @qt.notify_errors
-    def _load(self) -> None:
-        path, _ = QtWidgets.QFileDialog.getOpenFileName(self, f"Load {self._subject}", "", TOML)
-        if path:
-            self._load_values(read_toml(path), path)
-
-    @qt.notify_errors
-    def _save(self) -> None:
-        values = self._values()
-        if not values:
-            raise InputError(f"there is no {self._subject} to save: select one first")
-        title, proposal = f"Save {self._subject}", f"{self._subject}.toml"
-        if path := qt.ask_file(self, title, proposal, TOML):
-            qt.write_text(path, tomli_w.dumps(values))
 
 
 class StepForm(QWidget):

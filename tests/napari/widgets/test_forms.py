@@ -173,17 +173,17 @@ def test_buttons_save_and_load_what_the_command_reads(
     qtbot.addWidget(picker)
     path = tmp_path / "setup.toml"
     choose(path)
-    picker.files.save_button.click()
+    picker.save_button.click()
     assert len(messages) == 1
     assert "no setup to save" in messages[0]
     picker.show_setup(setup.model_dump())
-    picker.files.save_button.click()
+    picker.save_button.click()
     assert setup_from(path) == setup
     picker.picker.set_kind("none")
-    picker.files.load_button.click()
+    picker.load_button.click()
     assert picker.setup() == setup
     path.write_text("kind = 'proton'\nenergie = 3")
-    picker.files.load_button.click()
+    picker.load_button.click()
     assert len(messages) == 2
     assert "energie" in messages[1]
     assert picker.setup() == setup

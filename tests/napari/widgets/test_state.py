@@ -13,7 +13,7 @@ from napari.components import ViewerModel
 from helpers.forms import enter
 from helpers.reports import texts_of
 from napari_shadowinv import InputError, ProtonSetup
-from napari_shadowinv._napari import commands, jobs
+from napari_shadowinv._napari import commands
 from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
     result_of,
@@ -170,7 +170,7 @@ def test_a_setup_from_a_toml_file_says_so(
     path.write_text(text)
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: (str(path), ""))
     tool = opened(Invert)
-    tool.setup.files.load_button.click()
+    tool.setup.load_button.click()
     assert tool.setup.setup() == proton_setup
     assert tool.setup.note.text() == "Loaded from tcc.toml."
     assert setup_of(plain) is None
@@ -470,20 +470,6 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
     assert "o source file" in tool.panel.status.text()
     tool.image.layer = of_a_file
     assert tool.panel.status.text() == ""
-
-
-def test_what_the_core_refuses_stays_in_the_widget(
-    opened: Any, plain: Any, qtbot: Any, messages: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(*_: Any, **__: Any) -> None:
-        raise InputError("both masks hide the object")
-
-    monkeypatch.setattr(jobs, "run", refuse)
-    tool = opened(Invert)
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
-    assert messages == ["Both masks hide the object"]
-    assert tool.panel.status.text() == messages[0]
 
 
 # The forward model

@@ -8,9 +8,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import tomli_w
 from pydantic import BaseModel
 from qtpy.QtCore import QSignalBlocker, Signal
-from qtpy.QtWidgets import QWidget
+from qtpy.QtWidgets import QFileDialog, QWidget
 
 from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import form as forms
@@ -27,7 +28,7 @@ from napari_shadowinv._napari.widgets._results import place_together
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import read_shot
+from napari_shadowinv.io import read_shot, read_toml
 from napari_shadowinv.options import (
     ASSUMED_BEAM,
     BEAM_SOURCES,
@@ -98,15 +99,21 @@ class SetupPicker(QWidget):
         self.geometry_label = forms.WrappingLabel()
         self.warning_label = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.note = forms.WrappingLabel()
-        self.files = forms.TomlButtons("setup", self._to_save, self.load)
+        self.load_button = qt.push_button(
+            "Load setup…", "Read setup from a TOML file.", self._ask_and_load
+        )
+        self.save_button = qt.push_button(
+            "Save…", "Write setup to a TOML file, for use here or on the command line.", self._save
+        )
         self.scale_button = qt.push_button(
             "Show at scale",
             "Store the setup with the image, and show the image at its scale, without a run.",
             self.show_at_scale,
         )
         self.scale_button.setVisible(self._until_run)
-        self.files.layout().insertWidget(2, self.scale_button)
-        qt.column(self, self.picker, self.geometry_label, self.warning_label, self.note, self.files)
+        buttons = (self.load_button, 0), (self.save_button, 0), (self.scale_button, 0)
+        files = qt.side_by_side(*buttons, (QWidget(), 1))
+        qt.column(self, self.picker, self.geometry_label, self.warning_label, self.note, files)
         self._state = self.picker.state()
         self.picker.changed.connect(self._on_edit)
 
@@ -297,9 +304,19 @@ class SetupPicker(QWidget):
             form.restore(form.state() | values)
         return bool(values)
 
-    def _to_save(self) -> dict[str, object]:
+    @qt.notify_errors
+    def _save(self) -> None:
         setup = self.setup()
-        return {} if setup is None else setup.model_dump()
+        if setup is None:
+            raise InputError("there is no setup to save: select one first")
+        if path := qt.ask_file(self, "Save setup", "setup.toml", forms.TOML):
+            qt.write_text(path, tomli_w.dumps(setup.model_dump()))
+
+    @qt.notify_errors
+    def _ask_and_load(self) -> None:
+        path, _ = QFileDialog.getOpenFileName(self, "Load setup", "", forms.TOML)
+        if path:
+            self.load(read_toml(path), path)
 
     def load(self, entries: dict[str, Any], path: str) -> None:
         values = complete_setup(entries, self._file_geometry(), path).model_dump()
