@@ -22,7 +22,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     unit_of,
 )
-from napari_shadowinv._napari.layers import add_layers, outline
+from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Assessment, Verdict
@@ -193,21 +193,3 @@ def test_a_beam_is_shown_once_unless_images_have_different_ones(doubtful: Fit) -
     np.testing.assert_array_equal(beam(replace(doubtful, source=proportional)), uneven)
     different = np.stack([uneven, uneven[:, ::-1]])
     np.testing.assert_array_equal(beam(replace(doubtful, source=different)), different)
-
-
-def test_significance_and_structures_are_among_the_other_layers(
-    viewer: ViewerModel, two_fields: Fit, tmp_path: Path
-) -> None:
-    layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
-    assert not {"significance", "structures"} & set(layers)
-    layers = more(viewer, layers)
-    for part, fitted_field in zip(("", " E"), two_fields.fields, strict=True):
-        length = np.hypot(*fitted_field.displacement)
-        std = fitted_field.errors.per_pixel
-        along = np.hypot(*(fitted_field.displacement * std)) / length
-        np.testing.assert_allclose(layers[f"significance{part}"].data, length / along)
-        structures = two_fields.structures(fitted_field)
-        assert structures is not None
-        np.testing.assert_array_equal(layers[f"structures{part}"].data, outline(structures.labels))
-        assert structures.labels.any()
-    assert layers["significance"].name.startswith("? |d|/σ – pack")

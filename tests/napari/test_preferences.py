@@ -13,7 +13,7 @@ from napari_shadowinv import ProtonSetup, add_to_viewer
 from napari_shadowinv._napari import preferences as about
 from napari_shadowinv._napari.layer_metadata import frame_for, role_of
 from napari_shadowinv._napari.samples import toroid
-from napari_shadowinv._system.machine import available_threads, set_default_threads
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv.inversion import Inversion
 
 
@@ -74,20 +74,6 @@ def test_a_unit_that_napari_must_know(
     (field, *_) = add_to_viewer(viewer, solved, proton_setup)
     assert {str(unit) for unit in field.units} == {"millimeter"}
     assert field.scale == pytest.approx([1.5e-3, 1.5e-3])
-
-
-def test_threads_are_limited_where_none_are_requested(preferences: Any) -> None:
-    cores = available_threads(None)
-    try:
-        preferences.widgets.threads = cores + 3
-        about.use_preferred_threads()
-        assert available_threads(None) == cores + 3
-        assert available_threads(1) == 1
-        preferences.widgets.threads = 0
-        about.use_preferred_threads()
-        assert available_threads(None) == cores
-    finally:
-        set_default_threads(None)
 
 
 def test_an_older_napari_has_the_defaults(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -171,13 +171,13 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
 
 
 def test_runs_have_the_preferred_number_of_threads(preferences: Any, qtbot: Any) -> None:
-    preferences.widgets.threads = 7
-    threads: list[int] = []
+    cores, threads = available_threads(None), []
     panel = Run("Some work", "Run", "")
     qtbot.addWidget(panel)
     try:
-        panel.start(lambda on_progress, should_stop: threads.append(available_threads(None)))
-        qtbot.waitUntil(lambda: not panel.running, timeout=PATIENCE)
+        for preferences.widgets.threads in (7, 0):  # 0: all of them
+            panel.start(lambda on_progress, should_stop: threads.append(available_threads(None)))
+            qtbot.waitUntil(lambda: not panel.running, timeout=PATIENCE)
     finally:
         set_default_threads(None)
-    assert threads == [7]
+    assert threads == [7, cores]

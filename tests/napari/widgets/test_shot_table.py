@@ -13,7 +13,7 @@ from qtpy.QtCore import Qt
 from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read
-from napari_shadowinv.io.store import DONE, FAILED, StackStore
+from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.setup import ProtonSetup
@@ -112,23 +112,6 @@ def test_a_table_is_shown_changed_and_inverted(
     np.testing.assert_allclose(second / second.max(), in_si / in_si.max(), atol=1e-6)
     # The file is as it was.
     assert table_rows(pack)[0].beam == {"energy": 9}
-
-
-def test_a_changed_row_is_noticed_when_the_run_goes_on(
-    tool: Any, qtbot: Any, messages: Any
-) -> None:
-    run(tool, qtbot)
-    write(tool, 0, ENERGY, "6")
-    run(tool, qtbot)
-    assert "row of shot 0 (film0.npy) (energy: 9.0 there, 6.0 now) has changed" in messages[0]
-
-
-def test_the_mask_of_one_row_is_wrong(tool: Any, qtbot: Any, pack: Path) -> None:
-    np.save(pack.with_name("small.npy"), np.ones((4, 4)))
-    write(tool, 1, MASK, "small.npy")
-    store = run(tool, qtbot)
-    assert store.statuses().tolist() == [DONE, FAILED, DONE]
-    assert "mask has shape (4, 4), image (48, 48)" in tool.stack_view.failures.rows[0][1]
 
 
 def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str]) -> None:

@@ -371,23 +371,15 @@ def test_file_and_view_are_remembered(traced: Any, cube: Path) -> None:
 def test_wrong_file_is_a_sentence(
     traced: Any, qtbot: Any, messages: list[str], tmp_path: Path
 ) -> None:
-    np.save(tmp_path / "plane.npy", np.ones((4, 4)))
-    xr.Dataset({"rho": ("x", np.ones(3))}).to_netcdf(tmp_path / "rho.nc", engine="h5netcdf")
-    for text, message in (
-        ("", "'File' is missing"),
-        (str(tmp_path / "none.h5"), "none.h5"),
-        (str(tmp_path / "plane.npy"), "is no HDF5 file: expected an openPMD file or a NetCDF 4"),
-        (str(tmp_path / "rho.nc"), "rho.nc"),
-    ):
+    for text, message in (("", "'File' is missing"), (str(tmp_path / "none.h5"), "none.h5")):
         enter(traced.object.form.entries["file"], text)
         finished(traced, qtbot)
         assert message in traced.panel.status.text()
         assert message in messages[-1]
-    assert len(messages) == 4
     file = str(tmp_path / "cube.nc")
     traced.object.form.restore({"file": file, "beam": "x", "right": "x"})
     finished(traced, qtbot)
-    assert len(messages) == 5
+    assert len(messages) == 3
     assert "right" in messages[-1]
     traced.object.form.restore({"file": file, "beam": "x", "right": "y"})
     traced.setup.picker.set_kind("none")
