@@ -272,7 +272,7 @@ class Entry:
         content = f"in {self._unit}" if self._unit else content
         hint = content if self._field.is_required() else f"not set ({content})"
         if tuple in self._kinds:
-            hint = "all, or a range such as 10:200"
+            hint = "all, or 10:200"
         elif self._default is not None:
             hint = _text_of(self._default, self._unit) if is_number else str(self._default)
         elif not content:
@@ -512,46 +512,38 @@ class ModelPicker(QtWidgets.QWidget):
 
 
 class StepForm(QWidget):
-    """A step: a line with its name, which folds its form, and buttons to move or remove it."""
+    """A step: a section with its name and form, and buttons to move or remove it."""
 
     changed = Signal()
 
     def __init__(self, kind: type[Step], move: Callable[..., None]) -> None:
         super().__init__()
-        self.kind = kind
-        self.form = ModelForm(kind)
-        self.form.layout().setContentsMargins(INDENT, 0, 0, 0)
-        self.title = qt.small_button(
-            "", "Show or hide the parameters.", lambda: self.fold(not self.form.isHidden())
-        )
-        self.title.setToolButtonStyle(Qt.ToolButtonStyle.ToolButtonTextBesideIcon)
-        self.title.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+        self.kind, self.form = kind, ModelForm(kind)
+        self.folded = titled_section(self.form)
         self.up = qt.small_button("↑", "Move this step up.", lambda: move(self, -1))
         self.down = qt.small_button("↓", "Move this step down.", lambda: move(self, 1))
         self.remove = qt.small_button("✕", "Remove this step.", lambda: move(self, None))
-        for button in (self.title, self.up, self.down, self.remove):
+        qt.side_by_side(
+            (self.folded, 1), (self.up, 0), (self.down, 0), (self.remove, 0), holder=self
+        )
+        for button in (self.up, self.down, self.remove):
             button.setAutoRaise(True)
-        line = qt.side_by_side((self.title, 1), (self.up, 0), (self.down, 0), (self.remove, 0))
-        line.layout().setSpacing(0)
-        qt.column(self, line, self.form)
+            self.layout().setAlignment(button, Qt.AlignmentFlag.AlignTop)
         self.form.changed.connect(self._show_title)
         self.form.changed.connect(self.changed)
-        self.fold(False)
-
-    def fold(self, folded: bool = True) -> None:
-        self.form.setVisible(not folded)
-        self.title.setArrowType(Qt.ArrowType.RightArrow if folded else Qt.ArrowType.DownArrow)
+        self.folded.toggled.connect(self._show_title)
+        self.folded.expand(animate=False)
         self._show_title()
 
     def _show_title(self) -> None:
         """Show the step's name; with a folded form also its parameters."""
         title = self.kind.title
-        if self.form.isHidden():
+        if not self.folded.isExpanded():
             try:
                 title = self.form.model().summary  # type: ignore[attr-defined]
             except InputError:
-                self.form.setVisible(True)  # it shows the problem
-        self.title.setText(title)
+                self.folded.expand(animate=False)  # it shows the problem
+        self.folded.setText(title)
 
 
 class StepsSection(QWidget):
@@ -611,7 +603,7 @@ class StepsSection(QWidget):
                 self._move(form, None)
             for values in state:
                 if isinstance(values, Mapping) and values.get("step") in self._kinds:
-                    self.add(str(values["step"]), values).fold()
+                    self.add(str(values["step"]), values).folded.collapse(animate=False)
         self._on_change()
 
     def _on_choice(self, index: int) -> None:

@@ -104,9 +104,9 @@ def test_steps_are_added_moved_and_removed(qtbot: Any) -> None:
     assert section.forms == [second, first]
     assert not second.up.isEnabled()
     assert not first.down.isEnabled()
-    second.title.click()
-    assert second.form.isHidden()
-    assert second.title.text() == "bin, factor 3"
+    second.folded.toggleButton().click()
+    assert not second.folded.isExpanded()
+    assert second.folded.text() == "bin, factor 3"
     second.remove.click()
     first.remove.click()
     assert section.folded.text() == "Steps: none"
