@@ -696,9 +696,9 @@ def test_threads_change_neither_the_answer_nor_its_errors(image):
 @pytest.mark.parametrize("width", [0.8, 2.0, 4.0])
 def test_the_error_by_noise_follows_a_stated_correlation(width):
     """The scatter of repeats; over 4 px the correlation is too long to be measured."""
-    blob = phantoms.gaussian_blob((128, 128), 60.0, 14.0)
-    clean, source = synthetic_image(blob.displacement), np.ones((128, 128))
-    options = InversionOptions(n_sites=4000, negative="clip")
+    blob = phantoms.gaussian_blob((96, 96), 34.0, 10.5)
+    clean, source = synthetic_image(blob.displacement), np.ones((96, 96))
+    options = InversionOptions(n_sites=2250, negative="clip")
     plan = plan_sites(source, options)
     rng = np.random.default_rng(8)
 

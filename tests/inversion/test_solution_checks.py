@@ -7,6 +7,7 @@ so that an inversion takes a few tenths of a second.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from helpers.fit_images import Displacement as Field
+from helpers.fit_images import counted, on_pixels
 from helpers.public_data import load_donut, public_file, public_names
 from helpers.toroid import noisy_toroid_image, toroid_image
 from napari_shadowinv._typing import FloatArray
@@ -33,7 +36,6 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.plotting import report_figure
 
 Array = NDArray[np.float64]
-Field = Callable[[Array, Array], tuple[Array, Array]]
 
 SIDE = 100
 RAYS = 12
@@ -43,30 +45,22 @@ ONSET = np.exp(1.5) / 2
 MISFIT, NOTHING, FOLDS, EDGE = "misfit", "no-deflection", "folds", "edge"
 
 
+@cache
 def traced(field: Field, beyond: int = 0) -> Array:
     """Count rays, 144 from each pixel, where they land; they come from beyond the edge, too."""
-    rng = np.random.default_rng(0)
-    total = SIDE + 2 * beyond
-    cells = np.indices((RAYS * total, RAYS * total))
-    y, x = (cells + rng.random(cells.shape)) / RAYS - 0.5
-    dy, dx = field(y - beyond, x - beyond)
-    counts, _, _ = np.histogram2d(
-        (y + dy - beyond).ravel(),
-        (x + dx - beyond).ravel(),
-        bins=SIDE,
-        range=[(-0.5, SIDE - 0.5)] * 2,
-    )
-    return counts / RAYS**2
+    image = counted(field, (SIDE, SIDE), rays=RAYS, margin=beyond)
+    image.flags.writeable = False
+    return image
 
 
 def gaussian(strength: float, height: float = 10.0, width: float = 10.0) -> Field:
     """Outwards, caustics begin at a strength of 1; inwards at -1."""
     slope = strength * (ONSET if strength > 0 else 1.0)
 
-    def field(y: Array, x: Array) -> tuple[Array, Array]:
+    def field(y: Array, x: Array) -> Array:
         v, u = y - 48.0, x - 51.0
         falling = slope * np.exp(-((v / height) ** 2 + (u / width) ** 2) / 2)
-        return falling * v * (width / height) ** 2, falling * u
+        return falling * np.stack([v * (width / height) ** 2, u])
 
     return field
 
@@ -74,23 +68,23 @@ def gaussian(strength: float, height: float = 10.0, width: float = 10.0) -> Fiel
 def long_range(peak: float, core: float, y0: float = 49.5, x0: float = 49.5) -> Field:
     """Falls like 1/r beyond its core."""
 
-    def field(y: Array, x: Array) -> tuple[Array, Array]:
+    def field(y: Array, x: Array) -> Array:
         v, u = y - y0, x - x0
         falling = 2 * peak * core / (v**2 + u**2 + core**2)
-        return falling * v, falling * u
+        return falling * np.stack([v, u])
 
     return field
 
 
-def sheet(y: Array, x: Array) -> tuple[Array, Array]:
+def sheet(y: Array, x: Array) -> Array:
     """Does not fall at all, on two sides."""
-    return 0 * y, 2 * np.tanh((x - 50) / 8)
+    return np.stack([0 * y, 2 * np.tanh((x - 50) / 8)])
 
 
-def jet(y: Array, x: Array) -> tuple[Array, Array]:
+def jet(y: Array, x: Array) -> Array:
     """The same all along y, through two edges."""
     u = x - 50
-    return 0 * y, 3 * u / 6 * np.exp(0.5 - (u / 6) ** 2 / 2)
+    return np.stack([0 * y, 3 * u / 6 * np.exp(0.5 - (u / 6) ** 2 / 2)])
 
 
 def codes_of(inversion):
@@ -260,7 +254,7 @@ def test_caustics_that_have_just_formed_are_right_and_get_no_warning(strength, s
     field = gaussian(strength, *shape)
     image = traced(field)
     inversion = invert(image)
-    true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
+    true = on_pixels(field, (SIDE, SIDE))
     assert inversion.caustic.mean() > 0.01
     assert np.linalg.norm(inversion.displacement - true) < 0.05 * np.linalg.norm(true)
     assert inversion.report.cautions == ()
@@ -280,7 +274,7 @@ def test_caustics_that_have_just_formed_are_right_and_get_no_warning(strength, s
 def test_deep_folds_are_wrong_and_get_a_warning(strength, shape, share):
     field = gaussian(strength, *shape)
     inversion = invert(noisy(traced(field), share), options=InversionOptions(negative="clip"))
-    true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
+    true = on_pixels(field, (SIDE, SIDE))
     assert np.linalg.norm(inversion.displacement - true) > 0.07 * np.linalg.norm(true)
     assert inversion.report.cautions[0].code == FOLDS
 
@@ -294,11 +288,11 @@ def test_hot_pixels_are_no_folds():
 # The field goes on beyond a closed edge
 
 
-def cut_by_an_edge(y: Array, x: Array) -> tuple[Array, Array]:
+def cut_by_an_edge(y: Array, x: Array) -> Array:
     return gaussian(0.5)(y, x + 30)
 
 
-def mirrored_at_an_edge(y: Array, x: Array) -> tuple[Array, Array]:
+def mirrored_at_an_edge(y: Array, x: Array) -> Array:
     return gaussian(0.5)(y, x + 51.5)
 
 
@@ -319,7 +313,7 @@ def test_what_lies_beyond_the_edge_is_in_the_total(name, boundary):
     image = noisy(traced(field, beyond=30), 0.03)
     options = InversionOptions(negative="clip", **boundary)
     inversion = invert(image, source=np.ones(image.shape), options=options)
-    true = np.array(field(*np.indices((SIDE, SIDE)).astype(float)))
+    true = on_pixels(field, (SIDE, SIDE))
     error = float(np.sqrt(((inversion.displacement - true) ** 2).sum(axis=0).mean()))
     assert inversion.verdict in (Verdict.EDGE, Verdict.UNCERTAIN)  # of a jet little
     assert error < 3 * inversion.errors.total.rms

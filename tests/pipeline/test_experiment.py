@@ -132,7 +132,7 @@ def test_a_field_is_planned_and_a_wrong_one_refused():
     light = OpticalSetup(wavelength=5e-7, object_image_distance=0.1, pixel_size=1e-6)
     for wrong, field, message in (
         (light, bubble(2e6), "expected one of charged particles"),
-        (SETUP, bubble(1e12), "expected a weaker field"),
+        (SETUP, bubble(1e11, 1e-5), "expected a weaker field"),
     ):
         with pytest.raises(InputError, match=message):
             object_of_field(field, wrong)
