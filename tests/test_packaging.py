@@ -161,13 +161,10 @@ def test_the_page_of_dependencies_has_all_that_is_declared_and_imported(metadata
 # The citation
 
 
-def test_the_citation_follows_its_format() -> None:
+def test_the_citation_is_of_this_version() -> None:
+    """`make lint` checks its format."""
     citation = loaded(ROOT / "CITATION.cff")
-    assert citation["cff-version"] == "1.2.0"
-    assert {"message", "title", "authors"} <= set(citation)
-    assert citation["type"] == "software"
-    assert citation["title"] == "napari-shadowinv"
-    assert citation["version"] == __version__
+    assert (citation["title"], citation["version"]) == ("napari-shadowinv", __version__)
     assert citation["license"] == "BSD-3-Clause"
     assert citation["authors"] == [{"name": "napari-shadowinv contributors"}]
 
