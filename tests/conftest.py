@@ -95,6 +95,14 @@ def blank_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr("matplotlib.figure.Figure.draw", lambda figure, renderer: None)
 
 
+@pytest.fixture
+def no_causes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seek no causes of a misfit, which takes longer than the fit."""
+    monkeypatch.setattr(
+        "napari_shadowinv.fitting._fit._with_cause", lambda data, minima, pattern, on_step: pattern
+    )
+
+
 def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:
     """Inversion of an off-centre blob, as if it had been solved exactly."""
     height, width = shape

@@ -51,7 +51,6 @@ HEIGHT = {room: height for height, rooms in enumerate(ROOMS) for room in rooms}
 CORE = {room for room in HEIGHT if HEIGHT[room] < HEIGHT["io"]}
 NEVER_IN_CORE = {"dask", "distributed", "matplotlib", "napari", "qtpy", "superqt", "typer"}
 NOT_AT_ONCE_IN_CORE = {"xarray"}
-MOST_LINES = 800
 
 
 def module_of(path: Path) -> str:
@@ -142,11 +141,6 @@ def test_the_core_imports_no_window_no_cluster_no_figure(room):
         assert not anywhere & NEVER_IN_CORE, path
         at_once = {name.split(".")[0] for name in imported(path, outside_functions(tree))}
         assert not at_once & NOT_AT_ONCE_IN_CORE, path
-
-
-def test_no_module_is_too_long_to_be_read_at_once():
-    lengths = {path: len(path.read_text(encoding="utf-8").splitlines()) for path in FILES}
-    assert not {path.name: lines for path, lines in lengths.items() if lines > MOST_LINES}
 
 
 def test_only_one_module_connects_to_events_of_napari():

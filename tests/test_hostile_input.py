@@ -145,11 +145,6 @@ def test_what_is_no_image_is_refused(call: Callable[[Any], Any], image: Any) -> 
         call(image)
 
 
-def test_options_may_be_a_mapping() -> None:
-    assert len(invert(SHOT, options={"n_sites": 60}).cells.weights) == 60
-    assert invert(SHOT, options={}).options == InversionOptions()
-
-
 # An array of any size that takes no memory.
 HUGE = np.broadcast_to(np.float64(1), (300_000, 300_000))
 

@@ -243,23 +243,22 @@ def test_texts_and_tables_describe_the_same_products(exact: RetrievedField):
         np.testing.assert_array_equal(result["magnitude"].value, alone["magnitude"].value)
 
 
-def test_small_numbers_have_a_power_of_ten(exact: RetrievedField):
+@pytest.mark.parametrize(
+    ("value", "spread", "unit", "written"),
+    [
+        (-9.94e-5, 4e-6, "1", "-0.994 × 10⁻⁴ (-1.022 to -0.966; 95 %: -1.033 to -0.955)"),
+        (9.6e-7, 3.3e-4, "1", "0.0 × 10⁻⁴ (-2.3 to 2.3; 95 %: -3.2 to 3.2)"),
+        (9.6e-7, 3.3e-4, "m", "1 µm (-228 to 230; 95 %: -319 to 321)"),
+        (0.3, None, "1", "0.3"),
+        (9.9999e-7, None, "1", "1 × 10⁻⁶"),
+    ],
+)
+def test_a_number_and_its_band_have_one_power_of_ten(
+    exact: RetrievedField, value: float, spread: float | None, unit: str, written: str
+):
     (frame,) = (each.frame for each in sampled_fields(exact, None, None, None))
-    samples = -9.94e-5 + 4e-6 * np.linspace(-1, 1, 101)
-    text = quantity_text(Quantity(np.asarray(-9.94e-5), samples), "1", frame)
-    assert text == "-0.994 × 10⁻⁴ (-1.022 to -0.966; 95 %: -1.033 to -0.955)"
-    assert quantity_text(Quantity(np.asarray(0.3), np.zeros((0,))), "1", frame) == "0.3"
-    rounded = quantity_text(Quantity(np.asarray(9.9999e-7), np.zeros((0,))), "1", frame)
-    assert rounded == "1 × 10⁻⁶"
-
-
-def test_the_power_of_ten_is_that_of_a_band_far_wider_than_its_number(exact: RetrievedField):
-    (frame,) = (each.frame for each in sampled_fields(exact, None, None, None))
-    samples = 9.6e-7 + 3.3e-4 * np.linspace(-1, 1, 101)
-    text = quantity_text(Quantity(np.asarray(9.6e-7), samples), "1", frame)
-    assert text == "0.0 × 10⁻⁴ (-2.3 to 2.3; 95 %: -3.2 to 3.2)"
-    text = quantity_text(Quantity(np.asarray(9.6e-7), samples), "m", frame)
-    assert text == "1 µm (-228 to 230; 95 %: -319 to 321)"
+    samples = np.zeros(0) if spread is None else value + spread * np.linspace(-1, 1, 101)
+    assert quantity_text(Quantity(np.asarray(value), samples), unit, frame) == written
 
 
 @pytest.mark.parametrize("products", [7, [7], [["profile"]], None])

@@ -292,6 +292,7 @@ def test_a_shot_without_the_object_is_one_more_image() -> None:
     assert result.verdict is Verdict.DETERMINED
 
 
+@pytest.mark.usefixtures("no_causes")
 @pytest.mark.parametrize("boundary", ["fading", "free"])
 def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
     """A converged answer that explains both images, and is off by a quarter and more."""
@@ -305,6 +306,7 @@ def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
     assert "larger field of view" in result.explanation
 
 
+@pytest.mark.usefixtures("no_causes")
 @pytest.mark.parametrize("column", [0, 116])
 def test_an_object_cut_by_either_end_of_a_filled_side_is_reported(column: int) -> None:
     """117 px are filled to 120, all on the right."""
@@ -317,6 +319,7 @@ def test_an_object_cut_by_either_end_of_a_filled_side_is_reported(column: int) -
     assert "larger field of view" in result.explanation
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_without_samples_the_edge_is_not_computed() -> None:
     """There is no other error that an error by the edge has to exceed."""
     cut = bump(0.7, 8, (0, 30))

@@ -44,6 +44,7 @@ def error(result: Fit) -> float:
     return distance(field.displacement, on_pixels(RING, (height, width)))
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_a_known_point_spread_is_undone() -> None:
     images = noisy([shot(0, blur=1.5), shot(1, blur=1.5)], NOISE)
     result = fitted(images, psf=1.5)
@@ -124,6 +125,7 @@ def test_a_shifted_image_is_brought_back(
     assert error(result) < 0.04
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_an_image_is_shifted_no_further_than_it_may_be(shots: list[FloatArray]) -> None:
     images = noisy([shots[0], shot(1, frame=(1.2, 1, 0, -2.0, 0, 1))], NOISE)
     options = FitOptions(
@@ -134,6 +136,7 @@ def test_an_image_is_shifted_no_further_than_it_may_be(shots: list[FloatArray]) 
     assert result.verdict == Verdict.MISFIT
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_a_turned_and_magnified_image_is_brought_back() -> None:
     """Two objects apart tell how one image is turned, which a round one does not."""
     pair = together(bump(3.0, 4.5, (18, 36)), bump(-1.4, 5, (31, 17)))

@@ -62,6 +62,7 @@ def error(result: Fit) -> float:
     return distance(result.fields[0].displacement, on_pixels(RING, SIZE))
 
 
+@pytest.mark.usefixtures("no_causes")
 @pytest.mark.parametrize(
     ("imperfection", "instrument", "key"),
     [
@@ -83,6 +84,7 @@ def test_two_energies_determine_what_is_stated(
     assert aware.total_error > aware.errors.shares["noise"] > 0
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_a_point_spread_wider_than_stated_is_found() -> None:
     images = shots(blur=1.6)
     aware = fitted(images, Instrument(**EXACT_BEAM, blur=1.3), psf=1.0)
@@ -220,6 +222,7 @@ def test_stated_correlation_of_noise_widens_the_errors(assumed: Fit) -> None:
     assert by_noise[0] == pytest.approx(np.sqrt(4 * np.pi) * by_noise[1])
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_each_fit_states_its_sensitivities(plain: Fit) -> None:
     """By as much as fits of changed images move."""
     names = {name.partition(",")[0] for name in plain.errors.sensitivities}

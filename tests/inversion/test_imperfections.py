@@ -189,7 +189,8 @@ def test_parts_are_ranked_and_add_in_squares_to_the_total():
     errors = invert(lens(0.006), options=OPTIONS, instrument=instrument).errors
     sizes = [error.rms for error in errors.parts.values()]
     assert sizes == sorted(sizes, reverse=True)
-    assert next(iter(errors.parts)) == "beam assumed, 5 %"
+    assert next(iter(errors.parts)) == errors.of_peak.cause == "beam assumed, 5 %"
+    assert errors.of_peak.share == errors.total.at_peak / errors.peak
     assert errors.total.rms == pytest.approx(np.sqrt(np.sum(np.square(sizes))))
     assert errors.parts["other field, 10 %"].rms == pytest.approx(0.1 * errors.rms)
 

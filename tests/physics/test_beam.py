@@ -238,8 +238,3 @@ def test_deflection_warnings_doubt_fields_of_kilotesla_metres():
     )
     pixels = setup.displacement(np.array([[[0.2]], [[0.0]]]))
     assert "T m, far more" in deflection_warnings(setup, pixels)[0].text
-
-
-def test_a_collimated_beam_comes_back_from_json() -> None:
-    setup = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=1.2e-5)
-    assert OpticalSetup.model_validate_json(setup.model_dump_json()) == setup

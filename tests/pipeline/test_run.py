@@ -31,6 +31,7 @@ from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import number_of_sites
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.io.pradformat import write_shot
+from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline import Cache, read_recipe, run, write_recipe
@@ -221,9 +222,19 @@ SETUPS = (
 )
 
 
-@pytest.mark.parametrize("setup", SETUPS)
+FITS = (
+    FitChoices(),
+    FitChoices(fields=("B", "E"), beam="unknown", brightness="free", noise="poisson"),
+    FitChoices(noise=3.5, psf=0.0, options=FitOptions(align="affine", smoothness=2.0)),
+    FitChoices(source_size=1e-5, resolution=3e-5, options=FitOptions(threads=2, seed=7)),
+)
+
+
+@pytest.mark.parametrize(("setup", "fit"), list(zip(2 * SETUPS, FITS, strict=True)))
 @pytest.mark.parametrize("source", [*ESTIMATES.values(), MeasuredSource])
-def test_a_recipe_survives_its_file(tmp_path: Path, source: Any, setup: Any) -> None:
+def test_a_recipe_survives_its_file(
+    tmp_path: Path, source: Any, setup: Any, fit: FitChoices
+) -> None:
     chosen = MeasuredSource(file=tmp_path / "beam.tif", variable="b")
     recipe = Recipe(
         steps=tuple(changed(step) for step in STEPS.values()),
@@ -232,6 +243,7 @@ def test_a_recipe_survives_its_file(tmp_path: Path, source: Any, setup: Any) -> 
         setup=setup,
         instrument=Instrument(beam_rms=0.02, gamma=0.1),
         options=InversionOptions(n_sites=7, boundary="free", flux="known"),
+        fit=fit,
     )
     path = tmp_path / "recipe.toml"
     write_recipe(path, recipe)

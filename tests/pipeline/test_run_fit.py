@@ -16,14 +16,13 @@ from napari_shadowinv.io import read, read_dataset, write
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.pipeline import read_recipe, run_fit, write_recipe
+from napari_shadowinv.pipeline import run_fit
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.pipeline.rerun import provenance_of
 from napari_shadowinv.preprocessing import (
     Bin,
     Crop,
     LowPassEstimate,
-    MeasuredSource,
     Recipe,
     low_pass_source,
 )
@@ -158,21 +157,6 @@ def test_an_unknown_beam_takes_no_source(images: list[FloatArray]) -> None:
     both = unknown.model_copy(update={"source": LowPassEstimate()})
     with pytest.raises(InputError, match="a source and a fit with an unknown beam"):
         collect_fit_inputs(both, [images[0]])
-
-
-CHOICES = (
-    FitChoices(),
-    FitChoices(fields=("B", "E"), beam="unknown", brightness="free", noise="poisson"),
-    FitChoices(noise=3.5, psf=0.0, options=FitOptions(align="affine", smoothness=2.0)),
-    FitChoices(source_size=1e-5, resolution=3e-5, options=FitOptions(threads=2, seed=7)),
-)
-
-
-@pytest.mark.parametrize("choices", CHOICES)
-def test_its_section_survives_a_file(tmp_path: Path, choices: FitChoices) -> None:
-    recipe = Recipe(steps=STEPS, source=MeasuredSource(file=tmp_path / "beam.tif"), fit=choices)
-    write_recipe(tmp_path / "recipe.toml", recipe)
-    assert read_recipe(tmp_path / "recipe.toml") == recipe
 
 
 def test_fit_warns_of_broken_pixels_in_an_image(images: list[FloatArray], tmp_path: Path) -> None:
