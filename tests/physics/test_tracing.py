@@ -517,52 +517,38 @@ def test_unusable_dataset_is_refused_in_a_sentence(change, sentence):
         trace(change(dataset()), SETUP, (20, 20))
 
 
-def test_grid_beyond_source_or_detector_is_refused():
+def centred_at(*centre):
     grid = toroid_grid(nodes=11)
-    for centre in ((-1e-2, 0, 0), (0.2, 0, 0)):
-        with pytest.raises(InputError, match="the source is at"):
-            trace(FieldGrid(grid.magnetic, spacing=grid.spacing, centre=centre), SETUP)
+    return FieldGrid(grid.magnetic, spacing=grid.spacing, centre=centre)
 
 
-def test_grid_beside_the_image_is_refused():
-    grid = toroid_grid(nodes=11)
-    with pytest.raises(InputError, match="centre the grid"):
-        trace(FieldGrid(grid.magnetic, spacing=grid.spacing, centre=(0, 0, 0.1)), SETUP)
-
-
-def test_field_that_leaves_the_float_range_is_refused():
-    with pytest.raises(InputError, match="unit of the field"):
-        trace_particles(uniform_grid(ez=1e38, nodes=3), SETUP, [[0.0], [0.0]])
+COUNTS = {"output": "counts"}
 
 
 @pytest.mark.parametrize(
-    ("options", "keywords", "sentence"),
+    ("given", "sentence"),
     [
-        ({"source_size": 1e-5}, {}, "use output 'counts'"),
-        ({"output": "counts", "energy_spread": 10.0}, {}, "use a spectrum"),
-        ({"output": "counts"}, {"spectrum": [[3.0, 1.0], [1.0, 1.0]]}, "sort them"),
-        ({"output": "counts"}, {"spectrum": [1.0, 2.0]}, "energies in MeV"),
-        ({}, {"profile": np.ones((3, 3))}, "must match"),
-        ({}, {"profile": -np.ones((20, 20))}, "negative"),
-        ({"threads": 0}, {}, "threads"),
-        ({"seed": -1}, {}, "seed"),
-        ({"step": 2.0}, {}, "step"),
+        ({"options": {"source_size": 1e-5}}, "use output 'counts'"),
+        ({"options": COUNTS | {"energy_spread": 10.0}}, "use a spectrum"),
+        ({"options": COUNTS, "spectrum": [[3.0, 1.0], [1.0, 1.0]]}, "sort them"),
+        ({"options": COUNTS, "spectrum": [1.0, 2.0]}, "energies in MeV"),
+        ({"options": COUNTS | {"source_size": 1e-5}, "setup": PARALLEL}, "collimated"),
+        ({"profile": np.ones((3, 3))}, "must match"),
+        ({"profile": -np.ones((20, 20))}, "negative"),
+        ({"options": {"threads": 0}}, "threads"),
+        ({"options": {"seed": -1}}, "seed"),
+        ({"options": {"step": 2.0}}, "step"),
+        ({"setup": OpticalSetup.example()}, "charged particles"),
+        ({"field": centred_at(-1e-2, 0, 0)}, "the source is at"),
+        ({"field": centred_at(0.2, 0, 0)}, "the source is at"),
+        ({"field": centred_at(0, 0, 0.1)}, "centre the grid"),
+        ({"field": uniform_grid(ez=1e38, nodes=3)}, "unit of the field"),
     ],
 )
-def test_unusable_choice_is_refused_in_a_sentence(options, keywords, sentence):
+def test_unusable_choice_is_refused_in_a_sentence(given, sentence):
+    usual = {"field": toroid_grid(nodes=11), "setup": SETUP, "shape": (20, 20)}
     with pytest.raises(InputError, match=sentence):
-        trace(toroid_grid(nodes=11), SETUP, (20, 20), options=options, **keywords)
-
-
-def test_source_size_of_a_collimated_beam_is_refused():
-    options = {"output": "counts", "source_size": 1e-5}
-    with pytest.raises(InputError, match="collimated"):
-        trace(toroid_grid(nodes=11), PARALLEL, (20, 20), options=options)
-
-
-def test_setup_of_light_is_refused():
-    with pytest.raises(InputError, match="charged particles"):
-        trace(toroid_grid(nodes=11), OpticalSetup.example(), (20, 20))
+        trace(**usual | given)
 
 
 def test_request_to_stop_ends_the_tracing():
