@@ -57,6 +57,14 @@ def changed(truth: Truth, tmp_path: Path) -> Callable[..., Path]:
     return write_pack
 
 
+def scan_again(pack: Path, name: str, scan: np.ndarray, per_inch: int = 300) -> None:
+    """Replace a scan beside a changed pack; that of `truth` stays."""
+    (pack.parent / name).unlink()
+    kind = "rgb" if scan.ndim == 3 else "minisblack"
+    dots = {"resolution": (per_inch, per_inch), "resolutionunit": "INCH"}
+    tifffile.imwrite(pack.parent / name, scan, photometric=kind, **dots)
+
+
 def sentences_of(doses: FilmDoses) -> str:
     return "; ".join(caution.text for caution in doses.cautions)
 
@@ -236,10 +244,7 @@ def test_resolution_unlike_a_scanner_is_doubted(changed, numbers, is_doubtful) -
 def test_scans_saved_again_by_a_picture_program_are_doubted(truth: Truth, changed) -> None:
     pack = changed()
     for file in truth.files:
-        scan = pack.parent / file.name
-        scan.unlink()
-        dots = {"resolution": (72, 72), "resolutionunit": "INCH"}
-        tifffile.imwrite(scan, tifffile.imread(file), photometric="rgb", **dots)
+        scan_again(pack, file.name, tifffile.imread(file), per_inch=72)
     doses = run_film(read_pack(pack))
     assert "72 dots per inch (pixels of 352.8 µm)" in sentences_of(doses)
     assert "pixel size" in sentences_of(doses)
@@ -249,9 +254,7 @@ def test_scans_saved_again_by_a_picture_program_are_doubted(truth: Truth, change
 def test_films_laid_another_way_round(truth: Truth, doses, changed, way) -> None:
     pack = changed()
     scan = tifffile.imread(truth.files[1])[way]
-    (pack.parent / "film_02.tif").unlink()
-    dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
-    tifffile.imwrite(pack.parent / "film_02.tif", scan, photometric="rgb", **dots)
+    scan_again(pack, "film_02.tif", scan)
     entry = "turned = 180" if len(way) == 2 and way[0].step == -1 else "mirrored = true"
     with pytest.raises(InputError, match=f"film [23] does not lie as film [12] does.*{entry}"):
         run_film(read_pack(pack))
@@ -294,10 +297,8 @@ def test_a_corner_inside_the_film_is_refused(truth: Truth, changed, tmp_path: Pa
 def test_films_seen_from_the_detector_are_mirrored(truth: Truth, doses, changed) -> None:
     pack = changed(('seen_from = "source"', 'seen_from = "detector"'))
     for file in truth.files:
-        (pack.parent / file.name).unlink()
         scan = tifffile.imread(file)[:, ::-1]
-        dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
-        tifffile.imwrite(pack.parent / file.name, scan, photometric="rgb", **dots)
+        scan_again(pack, file.name, scan)
     result = run_film(read_pack(pack))
     np.testing.assert_allclose(result.dose, doses.dose, rtol=1e-3)
     assert "from the detector, mirrored" in result.pack.seen_from_text
@@ -475,10 +476,7 @@ def bright(scan: np.ndarray) -> np.ndarray:
 def test_wrong_scans_are_refused(truth: Truth, changed, spoil, message: str) -> None:
     pack = changed()
     scan = spoil(tifffile.imread(truth.files[0]))
-    (pack.parent / "film_01.tif").unlink()
-    kind = "rgb" if scan.ndim == 3 else "minisblack"
-    dots = {"resolution": (300, 300), "resolutionunit": "INCH"}
-    tifffile.imwrite(pack.parent / "film_01.tif", scan, photometric=kind, **dots)
+    scan_again(pack, "film_01.tif", scan)
     with pytest.raises((InputError, FileFormatError), match=re.escape(message)):
         run_film(read_pack(pack))
 
