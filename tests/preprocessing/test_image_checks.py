@@ -437,6 +437,13 @@ def test_noise_of_the_image_shows_negatives_of_an_even_beam(seed):
     assert "negative" in named(2200 - image, 2200 - source)
 
 
+def test_images_without_noise_are_no_negatives():
+    """Only bends are left of them, the steepest where a beam is dim."""
+    clean = np.exp(-2 * ((np.indices(SHAPE) / SHAPE[0] - 0.5) ** 2).sum(axis=0))
+    ripples = 0.02 * np.cos(np.indices(SHAPE) / 9).sum(axis=0)
+    assert "negative" not in named(clean * (1 + ripples), clean)
+
+
 def test_a_source_without_noise_makes_no_negative():
     rows, columns = np.indices(SHAPE) / SHAPE[0] - 0.5
     source = 400 * (0.25 + np.exp(-4 * ((rows - 0.05) ** 2 + (columns + 0.08) ** 2) / 1.4))

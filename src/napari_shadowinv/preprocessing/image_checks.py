@@ -103,6 +103,7 @@ class CheckedImage:
     saturation: SaturationCheck = SaturationCheck()
     bins: int = 20  # of brightness, in which noise is measured
     left_out: float = 0.05  # share of the brightest pixels there: bright lines are not smooth
+    least_noise: float = 1e-4  # of the brightness; less are the bends of an image without noise
 
     @classmethod
     def of(cls, image: FloatArray, mask: BoolArray | None = None) -> CheckedImage:
@@ -189,7 +190,8 @@ class CheckedImage:
         if not self.shows_noise:
             return 0.0
         levels, noise, uncertainty = self.noise_bins
-        if not ((noise > 0).all() and np.ptp(levels) > 0):
+        is_noise = (noise > 0).all() and np.median(noise) > self.least_noise * levels.mean()
+        if not (is_noise and np.ptp(levels) > 0):
             return 0.0
         weights = 1 / (noise * uncertainty)
         levels = levels - np.average(levels, weights=weights**2)
