@@ -53,17 +53,10 @@ class Origin(CheckedModel):
 
 
 class MaskOrigin(Origin):
-    """Origin of a mask.
+    """Origin of a mask."""
 
-    Attributes
-    ----------
-    checksum : str
-        SHA-256 of its pixels.
-    pixels : ndarray of bool or None
-        The mask, an array beside the provenance; None where that is missing.
-    """
-
-    checksum: str = ""
+    checksum: str = ""  # SHA-256 of its pixels
+    # An array beside the provenance; None where that is missing.
     pixels: Any = Field(None, exclude=True, repr=False)
 
     @classmethod
@@ -243,11 +236,7 @@ def index_masks(
 ) -> dict[str, Any]:
     """Return the entries `images` and `masks` of a provenance, with each mask once.
 
-    Parameters
-    ----------
-    images : sequence of ImageOrigin
-    masks : sequence of pairs of MaskOrigin or None
-        Mask and source mask of each image.
+    For each image there is a pair of its mask and its source mask.
     """
     pairs = list(masks)
     unique = tuple(dict.fromkeys(mask for pair in pairs for mask in pair if mask is not None))

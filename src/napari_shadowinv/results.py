@@ -39,10 +39,7 @@ def result_from_dataset(dataset: xarray.Dataset) -> AnyResult:
 def unpack_result(result: Any) -> AnyResult:
     """Return a result, or the result in a dataset, of a single shot.
 
-    Raises
-    ------
-    InputError
-        If it is neither, or is a stack or a damaged dataset.
+    An `InputError` if it is neither, or is a stack or a damaged dataset.
     """
     if hasattr(type(result), "headline"):
         content: AnyResult = result

@@ -251,7 +251,7 @@ def shots_of(images: Any, **values: Any) -> list[Shot]:
     images : sequence of array_like, or ndarray of shape (L, H, W) or (H, W)
     **values
         Attributes of the shots: a list, a tuple or an array of one or three dimensions has a value
-        for each, anything else is that of all.
+        for each, anything else is for all.
 
     Raises
     ------

@@ -37,8 +37,8 @@ def analyse(
 ) -> list[ProductResult]:
     """Measure products of a result, each with its band.
 
-    All products share one pass over samples of the field. Those of an inversion, also of one that
-    was read from a file, are drawn from the noise of its image and from its instrument, as by
+    All products share one pass over samples of the field. An inversion's, also of one that was
+    read from a file, are drawn from the noise of its image and from its instrument, as by
     `uncertainty`; its discretisation error is added. A fit has stored its samples. The field of
     another program has none, so its products have no bands.
 
@@ -54,9 +54,9 @@ def analyse(
         number that it has stored.
     unit : str, optional
         Unit of the field, such as "MG µm"; all are in `FIELD_UNITS`. It chooses the field, too:
-        "V" an electric one. Default: the SI unit of what deflects.
+        "V" an electric one. Default: the SI unit of the deflector.
     deflector : str, optional
-        Key of what deflects, such as "E". Of a fit with several fields only this one is analysed.
+        Key of the deflector, such as "E". Of a fit with several fields only this one is analysed.
     setup : Setup, optional
         The experiment, for SI units. Default: the result's.
     on_progress, should_stop
@@ -152,7 +152,7 @@ class _Task:
     _shapes: Sequence[dict[str, tuple[int, ...]]] = ()
 
     def choose(self, noise: FieldNoise | None) -> Any:
-        """Choose what follows from the noise, and return the function that measures everything."""
+        """Make the choices by the noise, and return the function that measures everything."""
         frame, potential = self.field.frame, self.field.potential
         self.products = [each.adapt(potential, noise, frame) for each in self.products]
         values = self._values(potential, self.field.displacement)

@@ -110,7 +110,7 @@ class ResampledInversion(SampledField):
     def at_points(
         self, potential: FloatArray, displacement: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the values of what is read out as a mean over pixels, and by differences."""
+        """Return a field that is read out as a mean over pixels, and by differences, at points."""
         return finer_field(potential, displacement)
 
     def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:

@@ -1,6 +1,6 @@
 """Abel inversion of a deflection by a small linear operator.
 
-- what an axisymmetric object does to rays: `deflection_matrix`, `projection_matrix`
+- deflections and line integrals of an axisymmetric object: `deflection_matrix`, `projection_matrix`
 - its inverse, regularised: `inverse_matrix`
 - how far to smooth, by the difference of the object's sides: `choose_smoothing`
 
@@ -45,26 +45,8 @@ _SMOOTHINGS = tuple(10.0 ** (power / 2) for power in range(-4, 11))
 def deflection_matrix(count: int, offset: float = FIRST_OFFSET) -> FloatArray:
     """Return the deflections at y = offset + 0, 1, … by a profile at r = 0, 1, … px.
 
-    Parameters
-    ----------
-    count : int
-        Number of radii, R in px; at least 4, else an `InputError`.
-    offset : float
-        From 0 to 1 px.
-
-    Returns
-    -------
-    ndarray, shape (count, count)
-        Times f in px gives δ in px, positive away from the axis.
-
-    Examples
-    --------
-    >>> r = np.arange(40.0)
-    >>> y = r + FIRST_OFFSET
-    >>> deflection = deflection_matrix(40) @ np.exp(-(r**2) / 72)
-    >>> exact = y * np.sqrt(2 * np.pi) / 6 * np.exp(-(y**2) / 72)
-    >>> bool(abs(deflection - exact).max() < 0.005)
-    True
+    The matrix, (count, count), times f in px gives δ in px, positive away from the axis. An
+    `InputError` refuses fewer than 4 radii.
     """
     y, _, integral = _grid(count, offset)
     pieces = -2 * y * np.diff(integral, axis=1)
@@ -77,15 +59,7 @@ def deflection_matrix(count: int, offset: float = FIRST_OFFSET) -> FloatArray:
 def projection_matrix(count: int, offset: float = 0.0) -> FloatArray:
     """Return the line integrals at y = offset + 0, 1, … of a profile at r = 0, 1, … px.
 
-    Parameters
-    ----------
-    count, offset
-        As of `deflection_matrix`.
-
-    Returns
-    -------
-    ndarray, shape (count, count)
-        Times f gives F, in units of f times px.
+    The matrix, (count, count), times f gives F, in units of f times px.
     """
     y, radii, integral = _grid(count, offset)
     root = np.sqrt(np.maximum(radii**2 - y**2, 0.0))
@@ -99,21 +73,10 @@ def projection_matrix(count: int, offset: float = 0.0) -> FloatArray:
 
 
 def inverse_matrix(matrix: FloatArray, smoothing: float) -> FloatArray:
-    """Return the linear operator from deflections or projections to the profile.
+    """Return the operator, (n, m), from deflections or projections to the profile.
 
-    It minimises |K f - δ|² + s |f''|² with second differences of f, which is even at the axis and
-    zero beyond R.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (m, n)
-        The operator K, such as `deflection_matrix`.
-    smoothing : float
-        Weight s of the penalty, at least 0.
-
-    Returns
-    -------
-    ndarray, shape (n, m)
+    With the matrix K, (m, n), it minimises |K f - δ|² + s |f''|² by second differences of f, which
+    is even at the axis and zero beyond R; s is the smoothing.
     """
     count = matrix.shape[1]
     bends = -2.0 * np.eye(count) + np.eye(count, k=1) + np.eye(count, k=-1)
@@ -127,23 +90,10 @@ def choose_smoothing(
 ) -> float:
     """Return the largest smoothing whose error is small against that by noise.
 
-    The sides of an axisymmetric object differ by their noise, and half of their difference is the
-    error of their mean. The profile is smoothed as far as one more smoothing changes it by a
-    share of that (r.m.s.), so that bands by noise hold.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (m, n)
-        Such as `deflection_matrix`.
-    side, opposite_side : ndarray, shape (slices, m)
-        Deflections of the two sides, both positive away from the axis.
-    share : float, default 0.25
-        Largest change by one more smoothing, over the error by noise.
-
-    Raises
-    ------
-    InputError
-        If a deflection is not finite.
+    The sides of an axisymmetric object, (slices, m), both positive away from the axis, differ by
+    their noise, and half of their difference is the error of their mean. The profile is smoothed as
+    far as one more smoothing changes it by a share of that (r.m.s.), so that bands by noise hold.
+    An `InputError` refuses deflections that are not finite.
     """
     if not np.isfinite([side, opposite_side]).all():
         raise InputError("the deflections are not finite, expected numbers everywhere")

@@ -63,25 +63,11 @@ class Axis:
 def sample_sides(
     component: FloatArray, axis: Axis, radius: int, *, is_odd: bool = True, every: int = 1
 ) -> tuple[FloatArray, FloatArray]:
-    """Return a component of the field on both sides of an axis.
+    """Return a component, (H, W), of the field on both sides of an axis, (places, radius) each.
 
-    Parameters
-    ----------
-    component : ndarray, shape (H, W)
-    axis : Axis
-    radius : int
-        Largest distance from the axis in px.
-    is_odd : bool
-        Whether the component changes its sign across the axis of a symmetric object; the second
-        side is then turned round.
-    every : int
-        Distance of places along the axis in px.
-
-    Returns
-    -------
-    right, left : ndarray, shape (places, radius)
-        At the distances of `abel.deflection_matrix`, or of `projection_matrix` if it is not odd.
-        They are equal if the field is symmetric.
+    Places along the axis are `every` px apart. If the component is odd, it changes its sign across
+    the axis of a symmetric object: the second side is turned round, and distances are as in
+    `abel.deflection_matrix`, else as in `projection_matrix`. Sides of a symmetric field are equal.
     """
     first = FIRST_OFFSET if is_odd else 0.0
     offsets, places = first + np.arange(float(radius)), axis.places()[::every]
@@ -111,29 +97,13 @@ def find_axis(
     radius_share: float = 0.9,
     places: int = 200,
 ) -> Axis:
-    """Return the axis about which the deflection across it is most nearly odd.
+    """Return the axis about which the deflection, (2, H, W), across it is most nearly odd.
 
-    Parameters
-    ----------
-    displacement : ndarray, shape (2, H, W)
-        In px.
-    direction : {"vertical", "horizontal"}
-        Rough direction of the axis, unless a start is stated.
-    start : Axis, optional
-        To refine. Default: the best of all positions along that direction.
-    find_tilt : bool
-        Whether the axis may be inclined.
-    most_tilt : float, default 20
-        In degrees.
-    radius_share : float, default 0.9
-        Radius over the largest, so that a shifted axis stays inside.
-    places : int, default 200
-        Least number of places along a long axis that are compared: neighbours share their noise.
-
-    Returns
-    -------
-    Axis
-        So long that all of its both sides are inside the image; of a start, as long as that.
+    It is refined from a start, by default the best of all positions along a direction, "vertical"
+    or "horizontal". With `find_tilt` it may be inclined, by `most_tilt` degrees. The radius is a
+    share of the largest, so that a shifted axis stays inside; of a long axis no more places than
+    `places` or twice that are compared, as neighbours share their noise. It is so long that all of
+    its both sides are inside the image; of a start, as long as that.
     """
     shape = displacement.shape[1:]
     is_free = start is None

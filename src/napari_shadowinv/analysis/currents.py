@@ -64,7 +64,7 @@ class Flux(Product):
 
 
 class _Enclosed(Outlined):
-    """Outward flux of the deflection through an outline, which follows from what is inside."""
+    """Outward flux of the deflection through an outline, which follows from sources inside."""
 
     unit: ClassVar[str]
     long_name: ClassVar[str]

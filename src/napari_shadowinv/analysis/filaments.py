@@ -39,18 +39,11 @@ _FWHM = 2 * math.sqrt(2 * math.log(2))
 
 
 def field_autocorrelation(component: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the autocorrelation of one component of the field, 1 at no lag.
+    """Return the autocorrelation of a component, (H, W), of the field, 1 at no lag.
 
-    Parameters
-    ----------
-    component : ndarray, shape (H, W)
-    weights : ndarray, shape (H, W)
-        Of the pixels, 0 where masked. Each lag is divided by the overlap of the weights.
-
-    Returns
-    -------
-    ndarray, shape (2h + 1, 2w + 1)
-        By lags from -h to h along y and -w to w along x, with h and w 40 % of the sides.
+    Its shape is (2h + 1, 2w + 1), by lags from -h to h along y and -w to w along x, with h and w 40
+    % of the sides. Each lag is divided by the overlap of the pixels' weights, (H, W), 0 where
+    masked.
     """
     mean = float((weights * component).sum() / weights.sum())
     shape = [2 * count for count in component.shape]

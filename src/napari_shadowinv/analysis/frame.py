@@ -1,7 +1,7 @@
 """The plane in which products are measured, and the units of its field: `FieldFrame`.
 
 - units to choose from: `FIELD_UNITS`, `field_unit`
-- what a radiograph cannot show, in sentences: `FieldFrame.limits`
+- the limits of a radiograph, in sentences: `FieldFrame.limits`
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """All kinds of products, and their descriptions in files and commands.
 
 - by name: `PRODUCTS`; of a table of TOML: `product_from_dict`; of a line: `product_from_text`
-- what a line may contain: `product_syntax`
+- the words of a line: `product_syntax`
 
 A module with another product is imported here, and nowhere else.
 """

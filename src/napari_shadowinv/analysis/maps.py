@@ -47,7 +47,7 @@ _HALF_GAIN = math.sqrt(-2 * math.log(1 - 0.5 ** (1 / ORDER)))
 
 
 def _gain(shape: tuple[int, ...], width: float, order: int = ORDER) -> FloatArray:
-    """Gain 1 - (1 - G)^order for each cosine of a plane, with G that of a Gaussian."""
+    """Gain 1 - (1 - G)^order for each cosine of a plane, with the gain G of a Gaussian."""
     rows, columns = (np.exp(-0.5 * (np.pi * width * np.arange(n) / n) ** 2) for n in shape)
     return np.asarray(1 - (1 - rows[:, None] * columns) ** order)
 
@@ -70,18 +70,10 @@ def least_width(spacing: float, spacings: float = 1.5) -> float:
 def chosen_width(
     plane: FloatArray, noise: FloatArray, spacing: float, *, most_share: float = 0.1
 ) -> float:
-    """Return the width in px that minimises the expected error of a smoothed plane.
+    """Return the width in px that minimises the expected error of a smoothed plane, (H, W).
 
-    Parameters
-    ----------
-    plane : ndarray, shape (H, W)
-        With its noise.
-    noise : ndarray, shape (k, H, W)
-        Samples of the noise.
-    spacing : float
-        Spacing of the sites in px; structures of single cells are smoothed away in any case.
-    most_share : float, default 0.1
-        Largest width over the shorter side.
+    The noise has samples, (k, H, W). Structures of single cells, by the spacing of the sites in px,
+    are smoothed away in any case; the width is at most a share of the shorter side.
     """
     square = dctn(plane, norm="ortho") ** 2
     by_noise = np.mean([dctn(sample, norm="ortho") ** 2 for sample in noise], axis=0)

@@ -234,32 +234,11 @@ def measure_response(
     """Measure how an inversion changes a spectrum, on random fields with that spectrum.
 
     Rays cross, and small structures are lost, the more the stronger the field. Random fields are
-    made with the measured spectrum, imaged, inverted and measured in the same window. As the
-    measured spectrum is too low where power is lost, it is corrected by the response of a first
-    field, and again by that of a second, before the response is measured.
-
-    Parameters
-    ----------
-    spectrum : RingSpectrum
-        As measured, less its noise.
-    weights : ndarray, shape (H, W)
-        Of the window.
-    n_sites : int
-        Number of sites of the inversion.
-    phantoms : int
-        Number of random fields for the response itself, at least 1.
-    seed : int
-    report : Reporter
-        Called before each random field.
-    corrections : int, default 2
-        Number of first fields, by which the spectrum is corrected.
-    least : float, default 0.05
-        Smallest response by which it is corrected.
-
-    Raises
-    ------
-    InversionCancelled
-        If the reporter is asked to stop.
+    made with the measured spectrum, less its noise, imaged, inverted with as many sites, and
+    measured in the same window, (H, W). As the measured spectrum is too low where power is lost, it
+    is corrected by the response of a first field, and again by a second one's, but by no response
+    below `least`, before the response is measured on the phantoms. The reporter is called before
+    each field.
     """
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0

@@ -1,4 +1,4 @@
-"""The base class of all products, and what describes their numbers: `Product`, `Measurand`.
+"""The base class of all products, and descriptions of their numbers: `Product`, `Measurand`.
 
 - a number with its bands in words: `quantity_text`, `value_text`
 """
@@ -268,17 +268,7 @@ def corrected(quantity: Quantity, *, notable: float = 0.3) -> FloatArray:
 
 
 def quantity_text(quantity: Quantity, unit: str, frame: FieldFrame) -> str:
-    """Return a number, corrected for a bias by noise, with its bands in words; "none" for NaN.
-
-    Parameters
-    ----------
-    quantity : Quantity
-        Of a single number.
-    unit : str
-        Of its values.
-    frame : FieldFrame
-        Has the unit that a field is shown in.
-    """
+    """Return a number, corrected for a bias by noise, with its bands in words; "none" for NaN."""
     value = float(corrected(quantity))
     if np.isnan(value):
         return "none"

@@ -182,7 +182,7 @@ def _single_numbers(result: ProductResult) -> dict[str, Measurand]:
 
 
 def _facts(series: ProductResult, times: FloatArray, unit: str) -> Iterator[Fact]:
-    """Yield each number in the first and last shot, its growth, and what the band holds."""
+    """Yield each number in the first and last shot, its growth, and the contents of the band."""
     for name, quantity in series.quantities.items():
         variable = series.variables[name]
         title = variable.title or name.replace("_", " ")
@@ -215,21 +215,10 @@ def _rate_unit(rate: float, unit: str) -> tuple[float, str]:
 
 
 def shot_times(numbers: Sequence[float], shots: Sequence[int], received: str) -> list[float]:
-    """Return the times of numbered shots from the time between two, or from a list of all.
+    """Return the times of numbered shots from the time in s between two, or from a list of all.
 
-    Parameters
-    ----------
-    numbers : sequence of float
-        One time, in s, between two successive shots of a store; or one for each of `shots`.
-    shots : sequence of int
-        Numbers of the shots in their store.
-    received : str
-        Start of an error, such as ``"--times is '1,2'"``.
-
-    Raises
-    ------
-    InputError
-        If there are neither one nor as many numbers as shots.
+    An `InputError`, which begins with the text received, such as ``"--times is '1,2'"``, if there
+    are neither one nor as many numbers as shots.
     """
     if len(numbers) == 1 and len(shots) > 1:
         return [float(shot) * numbers[0] for shot in shots]

@@ -63,7 +63,7 @@ _SYMBOLS = {_B: ("T", "Magnetic field"), _E: ("V/m", "Electric field"), _N: ("mâ
 
 @dataclass(frozen=True)
 class TrustedRings:
-    """Limits of what can be trusted; `benchmarks/spectra.py` measures slopes and bands by them."""
+    """Limits of rings; `benchmarks/spectra.py` measures slopes and bands by them."""
 
     contrast: float = 1.0  # most for a slope from one image
     raw_contrast: float = 0.8  # the same as the inversion returns it, which is less
@@ -77,25 +77,13 @@ class TrustedRings:
 
 @dataclass(frozen=True, eq=False)
 class CorrectedSpectrum:
-    """Power of a field without the noise, over the response of the inversion.
+    """Power of a field, of n rings, without the noise, over the response of the inversion."""
 
-    Attributes
-    ----------
-    rings : RingSpectrum
-        As retrieved.
-    noise, response, spread : ndarray, shape (n,)
-        Of each ring: power of the noise, retrieved over true power, and its standard error; empty
-        if they are not known.
-    resolution : float
-        Spacing of the sites in px; 0 without sites.
-    limits : TrustedRings
-    """
-
-    rings: RingSpectrum
-    noise: FloatArray
-    response: FloatArray
-    spread: FloatArray
-    resolution: float
+    rings: RingSpectrum  # as retrieved
+    noise: FloatArray  # (n,), its power; like the next two empty if they are not known
+    response: FloatArray  # (n,), retrieved over true power
+    spread: FloatArray  # (n,), standard error of the response
+    resolution: float  # spacing of the sites in px; 0 without sites
     limits: TrustedRings
 
     @property

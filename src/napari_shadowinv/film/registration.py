@@ -148,7 +148,7 @@ class _Film(NamedTuple):
         return cls(image, usable, fine[few], texture[few], counts[few])
 
     def with_dose_of(self, other: _Film, match: TextureMatch, *, steps: int = 24) -> _Film:
-        """Return the film with its dose mapped to that of another by a monotone function.
+        """Return the film with its dose mapped to another's by a monotone function.
 
         A kink of the calibration table shows as a line of equal dose, which moves with the dose.
         """

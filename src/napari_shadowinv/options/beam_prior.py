@@ -2,7 +2,7 @@
 
 - of a beam that nobody measured: `ASSUMED_BEAM`; that was recorded in another exposure:
   `REFERENCE_BEAM`
-- shapes in which it varies, and what they leave: `BeamComponents`
+- shapes in which it varies, and the rest: `BeamComponents`
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class BeamComponents:
         Relative r.m.s. of the variation that the shapes leave; it has the length of the prior.
     basis : str
         Origin: 'references'; 'outside' for an image outside its object; 'assumed' or 'stated' for
-        what filters and a source estimate leave; 'filtered' for what they take from an object in an
-        exact beam.
+        the remains after filters and a source estimate; 'filtered' for the part that they take from
+        an object in an exact beam.
     mean : ndarray, shape (H, W), optional
         The mean beam, whose mean is 1.
     """

@@ -449,12 +449,7 @@ class UsualGeometry:
 def geometry_text(setup: BeamSetup, shape: tuple[int, int] | None = None) -> str:
     """Return field of view, magnification and distance in a line, to be checked by eye.
 
-    Parameters
-    ----------
-    setup : BeamSetup
-    shape : tuple of int, optional
-        Height and width of the image in px. Default: the size of a pixel takes the place of the
-        field of view.
+    Without the shape of the image, the size of a pixel takes the place of the field of view.
 
     Examples
     --------
@@ -520,16 +515,7 @@ def setup_warnings(
 def deflection_warnings(
     setup: BeamSetup, displacement: FloatArray, *, usual: UsualGeometry = UsualGeometry()
 ) -> tuple[Caution, ...]:
-    """Return a sentence if a displacement is larger than such an experiment can make.
-
-    Parameters
-    ----------
-    setup : BeamSetup
-    displacement : ndarray, shape (2, H, W)
-        In px of the object plane.
-    usual : UsualGeometry, optional
-        Limits of common experiments.
-    """
+    """Warn of a displacement, (2, H, W) in px, that is larger than such an experiment can make."""
     largest = float(np.nanmax(np.hypot(*displacement), initial=0.0))
     angle, main = float(setup.deflection_angle(largest)), setup.main_field.name
     text = ""
@@ -550,7 +536,7 @@ def deflection_warnings(
 
 
 def _file_doubts(setup: BeamSetup, metadata: Mapping[str, Any], deviation: float) -> Iterator[str]:
-    """Compare the pixels with those of the image's file, which may be of either plane."""
+    """Compare the pixels with the file's, which may be of either plane."""
     geometry = metadata.get("geometry", {})
     names = ("pixel_size", "detector_pixel_size")
     stated = [geometry[name] * metadata.get("bin", 1) for name in names if geometry.get(name)]

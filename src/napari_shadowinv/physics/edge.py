@@ -143,14 +143,8 @@ def _even_source(shape: tuple[int, ...], spacing: float) -> FloatArray:
 def edge_sides(squares: FloatArray, strip: float = 0.1, share: float = 0.25) -> tuple[str, ...]:
     """Return the sides near which squared changes are largest.
 
-    Parameters
-    ----------
-    squares : ndarray, shape (H, W)
-        Sums of the squares of `edge_changes`.
-    strip : float, default 0.1
-        Width of the strip along each side, as a share of the shorter one.
-    share : float, default 0.25
-        Least mean in a strip, as a share of the largest.
+    The sums, (H, W), of the squares of `edge_changes` are averaged in a strip along each side,
+    whose width is a share of the shorter one; a side counts from a share of the largest mean on.
     """
     width = max(1, round(strip * min(squares.shape)))
     strips = squares[:width], squares[-width:], squares[:, :width], squares[:, -width:]
@@ -165,17 +159,11 @@ LARGER_FIELD = "record a larger field of view"
 
 
 def edge_doubt(error: float, others: float, largest: float, sides: Sequence[str]) -> str:
-    """Return in words how much of a field rests on what lies beyond its sides; "" if it is little.
+    """Return in words how much of a field rests on objects beyond its sides; "" if it is little.
 
-    Parameters
-    ----------
-    error, others : float
-        Errors of the field by the edge, and by all else, as shares of it. Errors that are half as
-        large move a field at the edge by chance.
-    largest : float
-        Largest error by the edge that needs no words.
-    sides : sequence of str
-        Where it comes from, of `SIDES`.
+    The errors are shares of the field, by the edge and by all `others`: those that are half as
+    large move a field at the edge by chance. Errors up to `largest` need no words; the sides are of
+    `SIDES`.
 
     Examples
     --------

@@ -140,21 +140,8 @@ def line_integrals(
 ) -> FloatArray:
     """Integrate a field over z along the straight rays from the source through the pixels' centres.
 
-    Parameters
-    ----------
-    field, setup, shape, threads
-        As for `trace`.
-
-    Returns
-    -------
-    ndarray, shape (4, H, W)
-        ∫B_y dz and ∫B_x dz in T m, ∫E_y dz and ∫E_x dz in V; exact for a field that is trilinear
-        between the nodes.
-
-    Raises
-    ------
-    InputError
-        As `trace`.
+    Takes the arguments of `trace`, and raises its errors. Returns ∫B_y dz and ∫B_x dz in T m, ∫E_y
+    dz and ∫E_x dz in V, (4, H, W); exact for a field that is trilinear between the nodes.
     """
     grid = field_grid(field)
     check_particles(setup)

@@ -190,16 +190,9 @@ def integrate_rays(
 ) -> None:
     """Integrate the field's components across the beam over z along straight rays.
 
-    Exact for a trilinear field: the ray is cut where it passes from cell to cell.
-
-    Parameters
-    ----------
-    first, last, field, origin, spacing
-        As for `push_particles`.
-    rays : ndarray, shape (N, 6)
-        A point of each ray in m and its direction.
-    integrals : ndarray, shape (N, 2) or (N, 4)
-        ∫B_y dz and ∫B_x dz in T m; then ∫E_y dz and ∫E_x dz in V.
+    A ray, (N, 6), has a point in m and a direction. Integrals, (N, 2) or (N, 4), are ∫B_y dz and
+    ∫B_x dz in T m, then ∫E_y dz and ∫E_x dz in V; exact for a trilinear field, as the ray is cut
+    where it passes from cell to cell.
     """
     rim_x, rim_y, rim_z = field.shape[1] - 1.0, field.shape[0] - 1.0, field.shape[2] - 1.0
     for p in range(first, last):

@@ -163,12 +163,9 @@ def transferred_displacement(
 def displacement_ratio(
     recorded_with: Setup, setup: Setup, *, deflector: str | None = None, dispersion: float = 1.0
 ) -> float:
-    """Return the displacement in px of one experiment over that in px of another.
+    """Return the displacement in px of one experiment over the one in px of another.
 
-    Parameters
-    ----------
-    recorded_with, setup, deflector, dispersion
-        As for `transferred_displacement`, whose errors this has.
+    Takes the arguments of `transferred_displacement`, and raises its errors.
     """
     if not (math.isfinite(dispersion) and dispersion != 0):
         raise InputError(f"dispersion is {dispersion:g}: it must be a finite number, not 0")

@@ -114,25 +114,11 @@ def find_structures(
     """Find the connected regions that stand above 2 σ and are not due to errors alone.
 
     Among many pixels, errors alone take some far above 2 σ, and since they are correlated these
-    form patches. A region is a structure if it contains a pixel above the level that errors alone
-    exceed somewhere in the image with a probability of 5 %, √(2 ln(20 n)) for n pixels (4.4 σ for
-    1,000, 5.5 σ for a million), and covers at least nine resolution elements. The level holds
-    whether or not the errors of pixels are correlated.
-
-    Parameters
-    ----------
-    significant : ndarray, shape (H, W)
-        Map of `significance`.
-    mask : ndarray of bool, shape (H, W), optional
-        Pixels that count. Default: all.
-    element : float, optional
-        Area of a resolution element in pixels, such as pixels for each site.
-    false_alarm, least_elements : float, default 0.05 and 9
-        The probability, and the number of resolution elements.
-
-    Returns
-    -------
-    Structures
+    form patches. A region of the map of `significance`, (H, W), is a structure if it contains a
+    pixel above the level that errors alone exceed somewhere in the image with a probability of 5 %,
+    √(2 ln(20 n)) for n pixels (4.4 σ for 1,000, 5.5 σ for a million), and covers at least nine
+    resolution elements, such as the areas of sites, in px. The level holds whether or not the
+    errors of pixels are correlated.
     """
     from scipy.ndimage import label
 
@@ -184,16 +170,8 @@ def significance_facts(
 ) -> list[Fact]:
     """Return the structures of a field in words; none without structures.
 
-    Parameters
-    ----------
-    structures : Structures or None
-    causes : sequence of str
-        Errors that the standard deviation holds, such as "noise" and "beam, 5 %"; empty if they are
-        not known.
-    key : str, optional
-        Key of the fact.
-    name : str, optional
-        Name of the field, if there are several.
+    The causes are the errors that the standard deviation holds, such as "noise" and "beam, 5 %",
+    empty if they are not known; a name stands for one of several fields.
     """
     if structures is None:
         return []

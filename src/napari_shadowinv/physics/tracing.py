@@ -4,8 +4,8 @@
 - displacements alone: `traced_displacement`
 
 Nothing is assumed of the object: it may be thick, its fields may bend the particles inside it and
-change their energy. So a traced image checks what the inversion and the fit make of it, which
-hold the object for thin. Outside the grid particles fly straight, inside they are pushed by the
+change their energy. So a traced image checks inversion and fit, which hold the
+object for thin. Outside the grid particles fly straight, inside they are pushed by the
 relativistic Boris scheme of `napari_shadowinv.physics.particle_push`.
 """
 
@@ -251,7 +251,7 @@ def trace(
 
     Notes
     -----
-    The direction of a particle changes by the exact angle in each step, so its error is that of
+    The direction of a particle changes by the exact angle in each step, so its error is by
     the place where the field is taken: of second order in `step`. A step of half a cell and a
     turn of 0.05 rad leave an error of the deflection below 0.1 % for fields that the grid
     resolves; in a uniform field the gyroradius is 0.02 % too small.
@@ -302,22 +302,10 @@ def trace(
 def traced_displacement(
     field: FieldGrid, setup: ProtonSetup, shape: Shape = (200, 200)
 ) -> FloatArray:
-    """Return the displacement of the ray through each pixel as `trace` does, without an image.
+    """Return the displacement, (2, H, W) in px, of the ray through each pixel, without an image.
 
-    Parameters
-    ----------
-    field, setup, shape
-        As of `trace`.
-
-    Returns
-    -------
-    ndarray, shape (2, H, W)
-        In px.
-
-    Raises
-    ------
-    InputError
-        As of `trace`, or if a ray does not reach the detector.
+    Takes the arguments of `trace`, and raises its errors; also an `InputError` if a ray misses the
+    detector.
     """
     check_particles(setup)
     size, threads = checked_shape(shape), usable_threads(None)

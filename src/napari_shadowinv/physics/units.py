@@ -325,14 +325,7 @@ def place_coordinates(
 ) -> dict[str, Any]:
     """Return y and x of the pixels in metres, or their indices if their size is unknown.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        Height and width of the image.
-    pixel_size : float or None
-        Size of a pixel in that plane, in metres.
-    plane : str, optional
-        The plane for the long names.
+    A pixel has its size in a plane, whose name is in the long names.
     """
     size, unit = (1.0, PIXEL) if pixel_size is None else (pixel_size, "m")
     return {

@@ -62,7 +62,7 @@ Result = TypeVar("Result")
 class Film:
     """The film of layer `number`: its scan the right way round, corners and calibration.
 
-    Its image is larger by `scale` than that of the first film.
+    Its image is larger by `scale` than the first film's.
     """
 
     number: int

@@ -2,7 +2,7 @@
 
 Shots are simulated with imperfections drawn from the stated instrument, and inverted (one image) or
 fitted (several). The errors made, the errors reported and the verdicts say whether the field would
-be determined, what limits it, and what a change buys.
+be determined, its limits, and the gain by a change.
 
 - the quantities that can be varied: `SWEPT`
 """
@@ -505,7 +505,7 @@ def _scales_of(result: Fit, inputs: ExperimentInputs) -> dict[str, float]:
 
 
 def _with_error_bars(shots: Sequence[PlannedShot]) -> tuple[PlannedShot, ...]:
-    """Copy error bars, and what follows from them, to the fits that have none."""
+    """Copy error bars, and verdicts by them, to the fits that have none."""
     searched = [shot for shot in shots if shot.is_searched]
     if len(searched) == len(shots):
         return tuple(shots)

@@ -71,32 +71,16 @@ class Grid(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlannedObject:
-    """A thin object, by the displacement of rays in one setup.
-
-    Attributes
-    ----------
-    samples : ndarray, shape (2, h, w)
-        Displacement in px of `setup`, at samples about the middle of the image.
-    title : str
-        In texts.
-    setup : Setup or None
-        Experiment of the displacement. Without one, the object can be planned in pixels only.
-    deflector : str or None
-        Title of the cause of the deflection. Default: see `default_deflector`.
-    finer : int, default 1
-        Samples along a side of a pixel.
-    shadow : ndarray of bool, shape (h, w), or None
-        Samples where the object stops the beam.
-    """
+    """A thin object, by the displacement of rays in one setup."""
 
     is_thin: ClassVar[bool] = True
 
-    samples: FloatArray
-    title: str = "a displacement"
-    setup: Setup | None = None
-    deflector: str | None = None
-    finer: int = 1
-    shadow: BoolArray | None = None
+    samples: FloatArray  # (2, h, w), displacement in px of `setup`, about the image's middle
+    title: str = "a displacement"  # in texts
+    setup: Setup | None = None  # without one, the object can be planned in pixels only
+    deflector: str | None = None  # title of the cause. Default: see `default_deflector`
+    finer: int = 1  # samples along a side of a pixel
+    shadow: BoolArray | None = None  # (h, w), where the object stops the beam
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -113,12 +97,8 @@ class PlannedObject:
     def displacement(self, setup: Setup | None, grid: Grid) -> FloatArray:
         """Return the displacement in px of a setup at the samples of a grid, (2, h, w).
 
-        Beyond the samples the nearest one is used.
-
-        Raises
-        ------
-        InputError
-            If the deflector does not act on the beam, or only one experiment is described.
+        Beyond the samples the nearest one is used. An `InputError` if the deflector does not act on
+        the beam, or only one experiment is described.
         """
         factor = 1.0
         if setup is not None and self.setup is not None:
@@ -146,20 +126,9 @@ class PlannedObject:
         return 1 - np.asarray(map_coordinates(shadow, places, order=0, mode="nearest"))
 
     def image(self, beam: FloatArray, displacement: FloatArray, grid: Grid) -> FloatArray:
-        """Return the image of a beam that rays carry to where they are displaced.
+        """Return the image, (H + 2 margin, W + 2 margin), of a beam that displaced rays carry.
 
-        Parameters
-        ----------
-        beam : ndarray, shape (h, w)
-            Flux density at the samples of the grid.
-        displacement : ndarray, shape (2, h, w)
-            Of the rays through the samples, px.
-        grid : Grid
-            Its margin is in the image, too.
-
-        Returns
-        -------
-        ndarray, shape (H + 2 margin, W + 2 margin)
+        Beam, (h, w), and displacement, (2, h, w) in px, are those at the samples of the grid.
         """
         fine = synthetic_image(grid.factor * displacement, beam, rays_per_pixel=_TILES, threads=1)
         return grid.in_pixels(fine)
@@ -177,17 +146,11 @@ class PlannedObject:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class TracedObject(PlannedObject):
-    """A 3-D field, through which particles are traced in every setup; it may be thick.
-
-    Attributes
-    ----------
-    field : FieldGrid
-        E and B around the object.
-    """
+    """A 3-D field, through which particles are traced in every setup; it may be thick."""
 
     is_thin: ClassVar[bool] = False
 
-    field: FieldGrid
+    field: FieldGrid  # E and B around the object
 
     def displacement(self, setup: Setup | None, grid: Grid) -> FloatArray:
         """Trace particles; an `InputError` if the setup has none, or one misses the detector."""
@@ -201,8 +164,8 @@ def object_of_field(
 ) -> TracedObject:
     """Return an object through which particles are traced.
 
-    A fit of several energies has the displacement of its first image: what the energies do
-    not share, because the object is thick or E and B act together, is in the error.
+    A fit of several energies has the displacement of its first image: differences between
+    the energies, because the object is thick or E and B act together, are in the error.
 
     Parameters
     ----------
@@ -233,22 +196,9 @@ def object_of_field(
 def object_of_phantom(
     recipe: PhantomRecipe, setup: Setup | None, shape: tuple[int, int]
 ) -> PlannedObject:
-    """Return a simulated object.
+    """Return a simulated object; an `InputError` if the phantom needs another setup.
 
-    Parameters
-    ----------
-    recipe : PhantomRecipe
-        The phantom and its parameters.
-    setup : Setup or None
-        The experiment that the parameters belong to, where they are in pixels or in shares of the
-        image.
-    shape : tuple of int
-        Height and width of the image in px.
-
-    Raises
-    ------
-    InputError
-        If the phantom needs another setup.
+    Its parameters belong to the setup, or without one to pixels or shares of the image, (H, W).
     """
     fine_shape = _FINER * shape[0], _FINER * shape[1]
     fine_setup = None if setup is None else finer_setup(setup, _FINER)
@@ -267,10 +217,7 @@ def object_of_phantom(
 def phantom_of_text(text: str) -> PhantomRecipe:
     """Return a phantom by its name and parameters, such as "toroid:peak=60,radius=3e-5".
 
-    Raises
-    ------
-    InputError
-        If the name or a parameter is unknown, or a value is no number.
+    An `InputError` if the name or a parameter is unknown, or a value is no number.
     """
     name, _, parameters = text.partition(":")
     key = name.strip().lower().replace("-", "_")
@@ -293,7 +240,7 @@ def phantom_of_text(text: str) -> PhantomRecipe:
 
 
 def shape_of_text(text: str, name: str) -> tuple[int, int]:
-    """Return height and width from a text such as "200x200"; `name` is what the text states."""
+    """Return height and width from a text such as "200x200"; `name` is its subject."""
     parts = text.lower().replace("×", "x").split("x")
     if len(parts) != 2 or not all(part.strip().isdecimal() for part in parts):
         raise InputError(f"{name} is '{text}': expected height and width in px, such as 200x200")

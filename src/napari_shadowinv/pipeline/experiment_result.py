@@ -1,7 +1,7 @@
 """Results of a planned experiment: `ExperimentPlan`, of `PlannedShot`.
 
 - a quantity of the experiment that is varied: `ExperimentSweep`
-- what a change of a stated number buys: `Gain`
+- the gain by a change of a stated number: `Gain`
 """
 
 from __future__ import annotations
@@ -111,21 +111,11 @@ class PlannedShot:
 
 @dataclass(frozen=True)
 class Gain:
-    """Reported error after a change of one stated number, in the linear budget.
+    """Reported error after a change of one stated number, in the linear budget."""
 
-    Attributes
-    ----------
-    cause : str
-        Part of the error that the change makes smaller.
-    text : str
-        The change in words.
-    total : float
-        Error after it, as a share of the field.
-    """
-
-    cause: str
-    text: str
-    total: float
+    cause: str  # part of the error that the change makes smaller
+    text: str  # the change in words
+    total: float  # error after it, as a share of the field
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -85,32 +85,15 @@ class ExperimentInputs:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedShots:
-    """Images of one object in one draw of the imperfections.
+    """Images of one object in one draw of the imperfections."""
 
-    Attributes
-    ----------
-    images : ndarray, shape (L, H, W)
-        Counts.
-    source : ndarray, shape (H, W), or None
-        Recorded reference in counts of an image; None if none was recorded and the beam is open
-        everywhere.
-    source_noise : float
-        Variance of the reference over its counts.
-    """
-
-    images: FloatArray
-    source: FloatArray | None
-    source_noise: float
+    images: FloatArray  # (L, H, W), counts
+    source: FloatArray | None  # (H, W), recorded or open beam, counts of an image; None: even
+    source_noise: float  # variance of the reference over its counts
 
 
 class ShotSimulator:
-    """Draws shots of an object.
-
-    Parameters
-    ----------
-    inputs : ExperimentInputs
-        The object, and the stated quality of the experiment.
-    """
+    """Draws shots of an object, with the stated quality of the experiment."""
 
     def __init__(self, inputs: ExperimentInputs) -> None:
         self.inputs = inputs

@@ -229,12 +229,8 @@ def missing_entries(entries: Mapping[str, Any]) -> list[str]:
 def write_new_pack(folder: Path, entries: Mapping[str, Any], *, overwrite: bool = False) -> Path:
     """Write the entries of a pack to ``pack.toml`` of a folder, and return its path.
 
-    Raises
-    ------
-    FileFormatError
-        If the file exists, unless `overwrite`, or cannot be written.
-    InputError
-        If the entries do not describe a pack; the message names the reason.
+    A `FileFormatError` if the file exists, unless `overwrite`, or cannot be written; an
+    `InputError` with the reason if the entries do not describe a pack.
     """
     path = Path(folder) / PACK_FILE
     validate(Pack, dict(entries), str(path))

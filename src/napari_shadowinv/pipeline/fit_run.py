@@ -127,18 +127,10 @@ def refinement_choices(inversion: Inversion, setup: Setup | None, psf: float = 0
 
 @dataclass(frozen=True, eq=False)
 class FitInputs:
-    """Inputs of a fit.
+    """Inputs of a fit: its images after the recipe's steps, and their origin."""
 
-    Attributes
-    ----------
-    shots : tuple of Shot
-        The images after the recipe's steps, with all that is known of them, on one grid of pixels.
-    provenance : Provenance
-        Origin of all inputs, and the recipe.
-    """
-
-    shots: tuple[Shot, ...]
-    provenance: Provenance
+    shots: tuple[Shot, ...]  # with all that is known of them, on one grid of pixels
+    provenance: Provenance  # with the recipe
 
     @property
     def choices(self) -> FitChoices:
@@ -466,14 +458,8 @@ def read_row_images(
 ) -> tuple[Shot, ...]:
     """Read the images of rows, whose energies or wavelengths complete the setups.
 
-    Parameters
-    ----------
-    rows : sequence of ShotRow
-        Description of each image.
-    recipe : Recipe
-        Its setup applies to images without one.
-    channel : str, optional
-        Part of each file to read, and of its source.
+    The recipe's setup applies to images without one; `channel` is the part of each file to read,
+    and of its source.
     """
     images = []
     for row in rows:

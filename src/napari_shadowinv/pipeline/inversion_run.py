@@ -186,21 +186,11 @@ AnyShot = Shot | ArrayLike | str | Path
 
 @dataclass(frozen=True, eq=False)
 class Inputs:
-    """Inputs of a recipe.
+    """Inputs of a recipe, from which an inversion can be repeated."""
 
-    Attributes
-    ----------
-    recipe : Recipe
-        With the setup and the kind of source of this shot.
-    shot : Shot
-        The shot as recorded, with its source and masks.
-    provenance : Provenance
-        Origin of all inputs.
-    """
-
-    recipe: Recipe
-    shot: Shot
-    provenance: Provenance
+    recipe: Recipe  # with the setup and the kind of source of this shot
+    shot: Shot  # as recorded, with its source and masks
+    provenance: Provenance  # origin of all of them
 
     def prepare(self, should_stop: ShouldStop | None = None) -> Shot:
         """Return the shot after the recipe's steps; see `Recipe.prepare`."""
@@ -294,14 +284,8 @@ def run_prepared(
 ) -> Inversion:
     """Invert a shot after the recipe's steps, otherwise as `run`.
 
-    Parameters
-    ----------
-    inputs : Inputs
-        The shot as recorded and its recipe.
-    shot : Shot
-        The shot after the recipe's steps.
-    began : float, optional
-        Value of `time.perf_counter` when the work began. Default: now.
+    The inputs have the shot as recorded; the work began at a value of `time.perf_counter`, now by
+    default.
     """
     report = Reporter(on_progress, should_stop)
     cache = Cache() if cache is None else cache
@@ -466,7 +450,7 @@ def load_shot(shot: AnyShot, name: str) -> Shot:
 
 
 def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
-    """Return the source of a shot: its own, that of the recipe, or that in the image's file."""
+    """Return the source of a shot: its own, the recipe's, or the one in the image's file."""
     if shot.beam_unknown:
         raise InputError(
             "the source is 'unknown', which only a fit can find: give an image of it, or none"

@@ -37,25 +37,15 @@ def after_steps(
 ) -> Instrument:
     """Return an instrument with the beam's error after a recipe's steps and source estimate.
 
-    Parameters
-    ----------
-    instrument : Instrument
-        With the beam before them, stated or assumed.
-    recipe : Recipe
-        Its steps are applied to the shot with other beams.
-    recorded : Shot
-        The shot before them.
-    source_of : callable
-        Estimates the source of a shot after them, shape (H, W).
-    measured : bool, default False
-        Whether the source was recorded.
+    The beam before them is the instrument's, stated or assumed. The steps are applied to the
+    recorded shot with other beams, whose sources, (H, W), `source_of` estimates.
 
     Notes
     -----
     Structure r that they remove is the beam's or the object's. How much an object like this one
-    loses, L (r.m.s.), is seen where it is shifted; b is what they remove of the beam, as the prior
-    says, or as r shows if that is more. Then the object has lost r L² / (L² + b²), with a variance
-    of L² b² / (L² + b²). An exact beam has b = 0, so that r is the loss.
+    loses, L (r.m.s.), is seen where it is shifted; b is their loss of the beam, by the prior, or by
+    r if that is more. Then the object has lost r L² / (L² + b²), with a variance of
+    L² b² / (L² + b²). An exact beam has b = 0, so that r is the loss.
     """
     beam = instrument.beam_of(measured=measured, source=recorded.source)
     flattening, moving = (

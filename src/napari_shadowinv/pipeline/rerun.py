@@ -75,30 +75,14 @@ class Rerun:
 
 @dataclass(frozen=True, eq=False)
 class RerunInputs:
-    """Inputs of a rerun.
+    """Inputs of a rerun: the first result, and the files of its provenance."""
 
-    Attributes
-    ----------
-    dataset : Dataset
-        The first result.
-    provenance : Provenance
-        Its provenance.
-    recipe : Recipe
-        The recipe, with the dark frame where it is now.
-    shots : tuple of Shot
-        The images with source, masks and setup; empty for a film pack.
-    files : tuple of Path
-        All files that were read, the images first.
-    changes : tuple of str
-        Changes of the version.
-    """
-
-    dataset: xarray.Dataset
+    dataset: xarray.Dataset  # the first result
     provenance: Provenance
-    recipe: Recipe
-    shots: tuple[Shot, ...] = ()
-    files: tuple[Path, ...] = ()
-    changes: tuple[str, ...] = ()
+    recipe: Recipe  # with the dark frame where it is now
+    shots: tuple[Shot, ...] = ()  # with source, masks and setup; none for a film pack
+    files: tuple[Path, ...] = ()  # all that were read, the images first
+    changes: tuple[str, ...] = ()  # of the version
 
     @property
     def kind(self) -> ResultKind:

@@ -132,18 +132,10 @@ def shot_rows(
     lists: Mapping[str, str | None],
     names: Mapping[str, str] = MappingProxyType({}),
 ) -> list[ShotRow]:
-    """Describe the images of a fit.
+    """Describe the images of a fit, or the rows of their table.
 
-    Parameters
-    ----------
-    images : sequence of Path
-        Images, or one table with a row for each.
-    shared : mapping
-        Defaults for all images, by the names of the columns.
-    lists : mapping of str to str
-        Numbers separated by commas, one for each image, by the names of the columns.
-    names : mapping of str to str, optional
-        Names of the lists in errors, by the names of the columns.
+    By the names of the columns, `shared` has defaults for all images, `lists` numbers separated by
+    commas, one for each image, and `names` the names of these lists in errors.
     """
     texts = {name: text for name, text in lists.items() if text is not None}
     if len(images) == 1 and is_table(images[0]):

@@ -10,6 +10,9 @@
 - a style of their own, whatever a user's matplotlibrc says: `own_style`
 - a stack as a movie: `write_film`
 
+All figures have an Agg canvas, axes in metres and fields in SI units if there is a setup, pixels
+without, and take the name of a shot, of images or of a pack as their title.
+
 The figures use matplotlib's objects and no pyplot, so they neither need a window nor
 disturb the figures of a notebook.
 """

@@ -23,18 +23,6 @@ def pack_figure(doses: FilmDoses, *, title: str | None = None) -> Figure:
 
     Masked pixels are light grey. In the last panel, three aligned films add up to grey;
     misalignment gives coloured fringes.
-
-    Parameters
-    ----------
-    doses : FilmDoses
-        Result of `run_film`.
-    title : str, optional
-        A heading, such as the pack's name.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
     """
     planes, usable = doses.dose, doses.usable
     count, *shape = planes.shape

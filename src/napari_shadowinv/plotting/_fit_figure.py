@@ -32,21 +32,9 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
 
     For each image: the beam unless it is uniform, the image, its re-projection, and the residual
     over the standard deviation of each pixel's noise. Below for each field: its potential where
-    there is room, the field with arrows, the standard deviation that the noise leaves, and
-    profiles along the dashed lines on the field. White outlines mark where rays have crossed in
-    any image; masked pixels are hatched.
-
-    Parameters
-    ----------
-    fit : Fit
-        With its setups, which give axes in metres and fields in SI units; pixels without.
-    title : str, optional
-        A heading, such as the images' names.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
+    there is room, the field with arrows, the standard deviation that the noise leaves, and profiles
+    along the dashed lines on the field. White outlines mark where rays have crossed in any image;
+    masked pixels are hatched.
     """
     count, *shape = fit.images.shape
     levels = fit.source.mean(axis=(1, 2), keepdims=True)
@@ -133,19 +121,8 @@ def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figur
     """Show how well the others predict each image that was left out.
 
     Each row has the image, the prediction of the others, and the residual over the standard
-    deviation of each pixel's noise. On top: the images that one static field does not explain.
-
-    Parameters
-    ----------
-    left_out : LeaveOneOut
-        With its setups, which name the images and give axes in metres.
-    title : str, optional
-        A heading, such as the images' names.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
+    deviation of each pixel's noise. On top: the images that one static field does not explain. The
+    setups name the images.
     """
     count, *shape = left_out.images.shape
     side_by_side = -(-count // 6)  # rows of three panels

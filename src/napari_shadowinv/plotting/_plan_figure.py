@@ -27,17 +27,8 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
     """Show a plan on a page.
 
     Six panels: the image of the first draw, the field of the object and the one retrieved in the
-    first draw, cuts through both along the dashed lines, the errors made and reported of all
-    draws, and what the reported error is made of. The headline stands above the panels.
-
-    Parameters
-    ----------
-    plan : ExperimentPlan
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
+    first draw, cuts through both along the dashed lines, the errors made and reported of all draws,
+    and the parts of the reported error. The headline stands above the panels.
     """
     setup = plan.setups[0] if plan.setups else None
     true, retrieved = shown_fields([plan.truth, plan.retrieved], setup)
@@ -57,15 +48,6 @@ def sweep_figure(sweep: ExperimentSweep) -> Figure:
 
     The band holds 68 % of the draws; the dashed line is the error that is reported. Below stands
     the share of the draws whose field is determined.
-
-    Parameters
-    ----------
-    sweep : ExperimentSweep
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
     """
     with _panels.styled_figure((6.4, 4.8), layout="constrained") as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
@@ -85,12 +67,7 @@ def draw_errors(
 ) -> None:
     """Draw the errors made and reported, of each draw of a plan or of each value of a sweep.
 
-    Parameters
-    ----------
-    axes : Axes
-    content : ExperimentPlan or ExperimentSweep
-    ink : str
-        Colour of the errors reported.
+    The ink is the colour of the errors reported.
     """
     if isinstance(content, ExperimentSweep):
         _draw_sweep(axes, content, ink)

@@ -24,19 +24,7 @@ _COLOURS = ("#1f77b4", "#d95f02", "#1b9e77", "#7a5195", "0.4")
 
 
 def products_figure(results: Sequence[ProductResult], *, title: str | None = None) -> Figure:
-    """Show products on a page: curves and maps with their bands, and all numbers below.
-
-    Parameters
-    ----------
-    results : sequence of ProductResult
-    title : str, optional
-        A heading, such as the shot's name.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
-    """
+    """Show products on a page: curves and maps with their bands, and all numbers below."""
     panels = [(each, names) for each in results for names in _panels_of(each)]
     lines = _footer(results)
     line, panel = 0.19, 3.2  # inches
@@ -91,12 +79,7 @@ def _draw(axes: Axes, result: ProductResult, names: Sequence[str]) -> None:
 
 
 def make_logarithmic(axes: Axes) -> None:
-    """Make both axes logarithmic, with plain numbers at 1, 2 and 5 below.
-
-    Parameters
-    ----------
-    axes : Axes
-    """
+    """Make both axes logarithmic, with plain numbers at 1, 2 and 5 below."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -109,17 +92,7 @@ def make_logarithmic(axes: Axes) -> None:
 def draw_curves(
     axes: Axes, result: ProductResult, names: Sequence[str], colours: Sequence[str] = _COLOURS
 ) -> None:
-    """Draw variables along a common axis with their bands, in the unit that they are shown in.
-
-    Parameters
-    ----------
-    axes : Axes
-    result : ProductResult
-    names : sequence of str
-        The variables, one of the result's `curve_groups`.
-    colours : sequence of str
-        Of the curves.
-    """
+    """Draw one of a result's `curve_groups` with bands, in the unit that it is shown in."""
     from matplotlib.ticker import MaxNLocator
 
     places, words = result.shown_places(names[0])

@@ -36,17 +36,6 @@ def report_figure(inversion: Inversion, *, title: str | None = None) -> Figure:
     Six panels: image, potential with contours, field with arrows, re-projection, residual and
     profiles along the dashed lines on the field. White outlines are caustics; masked pixels are
     hatched. The headline stands above the panels.
-
-    Parameters
-    ----------
-    inversion : Inversion
-    title : str, optional
-        A heading, such as the shot's name.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
     """
     shape, setup = inversion.potential.shape, inversion.setup
     (field,) = shown_fields([inversion.displacement], setup, mask=inversion.mask)
@@ -89,15 +78,8 @@ def comparison_figure(
         Displacements in px by name; the first is the reference.
     setup : Setup, optional
         Gives axes in metres and fields in SI units; pixels without.
-    title : str, optional
-        A heading.
-    caption : str
-        A line below.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        One panel for each field and one with the profiles.
+    title, caption : str
+        A heading, and a line below.
 
     Raises
     ------
@@ -119,24 +101,7 @@ def comparison_figure(
 
 
 def result_figure(result: AnyResult, *, title: str | None = None) -> Figure:
-    """Show a result on a page.
-
-    Parameters
-    ----------
-    result : Inversion, Fit or FilmDoses
-    title : str, optional
-        A heading, such as the name of the image.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A figure with an Agg canvas; write it with `save_figure`.
-
-    Raises
-    ------
-    InputError
-        If it is a field alone.
-    """
+    """Show an inversion, a fit or a film pack on a page; an `InputError` refuses a field alone."""
     figures: dict[ResultKind, Callable[..., Figure]] = {
         ResultKind.INVERSION: report_figure,
         ResultKind.FIT: fit_figure,
