@@ -19,22 +19,8 @@ if TYPE_CHECKING:
     from napari_shadowinv.options import Noise
     from napari_shadowinv.physics.setup import Setup
 
-# Attributes that come from the user, and precede those of the image's file.
-_KNOWN = (
-    "setup",
-    "source",
-    "mask",
-    "source_mask",
-    "dark",
-    "strength",
-    "brightness",
-    "psf",
-    "noise",
-    "fiducials",
-    "start",
-    "name",
-    "measured",
-)
+# Others come from the user, and precede those of the image's file.
+_OF_FILE = ("image", "path", "metadata", "warnings", "in_file")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -172,7 +158,7 @@ class Shot(Summarised):
 
     def completed_by(self, recorded: Shot) -> Shot:
         """Return the shot as read from its file, with all that is known beside the file."""
-        values = {name: getattr(self, name) for name in _KNOWN}
+        values = {name: value for name, value in vars(self).items() if name not in _OF_FILE}
         changes = {name: value for name, value in values.items() if value is not None}
         return replace(recorded, **changes)
 
