@@ -78,7 +78,8 @@ def prepared(
 ) -> Shot:
     """Return a shot and its source after the steps in texts."""
     recipe = Recipe(mask=None if mask is None else Path(mask), steps=with_steps((), steps, {}))
-    return collect_inputs(recipe, Shot(image, source=source)).prepare()
+    inputs = collect_inputs(recipe, Shot(image, source=source))
+    return inputs.recipe.prepare(inputs.shot)
 
 
 def dataset(path: str | Path) -> xr.Dataset:

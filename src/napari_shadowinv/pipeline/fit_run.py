@@ -141,7 +141,8 @@ class FitInputs:
     @property
     def fields(self) -> tuple[str, ...]:
         """Keys of the fields."""
-        return self.choices.fields or ("B",)
+        assert self.choices.fields is not None
+        return self.choices.fields
 
     @cached_property
     def setups(self) -> tuple[Setup, ...] | None:
@@ -389,8 +390,8 @@ def _collect_image(recipe: Recipe, shot: Shot, name: str, *, unknown: bool) -> I
 
 def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) -> Shot:
     try:
-        shot = inputs.prepare(should_stop)
-        source, estimate = shot.source, inputs.recipe.estimate
+        shot = inputs.recipe.prepare(inputs.shot, should_stop)
+        source = shot.source
         mask, doubts = mask_unlit(shot.image, source, shot.mask)
         shot = replace(shot, mask=mask)
         doubts += image_warnings(shot.image, source, shot.mask)
@@ -401,10 +402,9 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
                 doubts.append(Caution("register", text))
         if shot.setup is not None:
             doubts += setup_warnings(shot.setup, shot.shape, shot.metadata)
+        estimate = inputs.estimate_for(shot)
         if estimate is not None and not isinstance(estimate, UniformEstimate):
-            recorded = inputs.shot.shape
-            positioned = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))
-            source = estimate_source(positioned, shot, should_stop, doubts.append)
+            source = estimate_source(estimate, shot, should_stop, doubts.append)
         return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
     except InputError as error:
         raise InputError(f"{name}: {error}") from error

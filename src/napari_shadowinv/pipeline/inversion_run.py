@@ -192,9 +192,10 @@ class Inputs:
     shot: Shot  # as recorded, with its source and masks
     provenance: Provenance  # origin of all of them
 
-    def prepare(self, should_stop: ShouldStop | None = None) -> Shot:
-        """Return the shot after the recipe's steps; see `Recipe.prepare`."""
-        return self.recipe.prepare(self.shot, should_stop)
+    def estimate_for(self, shot: Shot) -> Estimate | None:
+        """Return the estimate of the source of a shot after the steps; None if it is measured."""
+        estimate, recorded = self.recipe.estimate, self.shot.shape
+        return estimate and estimate.adapt_to(shot.setup, recorded, self.recipe.matrix(recorded))
 
 
 def run(
@@ -259,7 +260,7 @@ def run(
             inputs = replace(inputs, shot=replace(inputs.shot, warnings=warnings))
         return run_prepared(
             inputs,
-            inputs.prepare(should_stop),
+            inputs.recipe.prepare(inputs.shot, should_stop),
             on_progress=on_progress,
             should_stop=should_stop,
             cache=cache,
@@ -359,17 +360,15 @@ def _source(
     *,
     preview: bool,
 ) -> FloatArray:
-    recorded = inputs.shot.shape
-    matrix = inputs.recipe.matrix(recorded)
-    estimate = inputs.recipe.estimate
-    if isinstance(estimate, UniformEstimate):
-        centre = centre_within(recorded, matrix)
+    if isinstance(inputs.recipe.estimate, UniformEstimate):
+        recorded = inputs.shot.shape
+        centre = centre_within(recorded, inputs.recipe.matrix(recorded))
         doubts.extend(uniform_warnings(shot.shape, shot.setup, centre=centre))
     if shot.source is not None:
         usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
         return check_source(shot.source, usable)
+    estimate = inputs.estimate_for(shot)
     assert estimate is not None
-    estimate = estimate.adapt_to(shot.setup, recorded, matrix)
     report("source", 0, None, estimate.title)
     cached = partial(cache.source, estimate, most_pixels=PREVIEW_PIXELS if preview else None)
     return estimate_source(estimate, shot, report.should_stop, doubts.append, by=cached)
@@ -377,11 +376,10 @@ def _source(
 
 def _remaining_source(inputs: Inputs, shot: Shot, should_stop: ShouldStop | None) -> FloatArray:
     """Return the source of a shot with another beam, quickly; flat if its error is stated."""
-    estimate = inputs.recipe.estimate
-    if estimate is None or inputs.recipe.instrument.beam_rms is not None:
+    is_stated = inputs.recipe.instrument.beam_rms is not None
+    estimate = None if is_stated else inputs.estimate_for(shot)
+    if estimate is None:
         return np.ones(shot.shape)
-    recorded = inputs.shot.shape
-    estimate = estimate.adapt_to(shot.setup, recorded, inputs.recipe.matrix(recorded))
     by = partial(quick_source, estimate, most_pixels=PREVIEW_PIXELS)
     return estimate_source(estimate, shot, should_stop, lambda caution: None, by=by)
 

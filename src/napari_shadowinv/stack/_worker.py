@@ -195,7 +195,7 @@ class InvertTask(Task):
             origin = self.inputs.provenance.image.source
             inputs = replace(inputs, provenance=inputs.provenance.with_image(source=origin))
         inputs.recipe.check(inputs.shot)
-        ready = inputs.prepare(should_stop)
+        ready = inputs.recipe.prepare(inputs.shot, should_stop)
         if isinstance(inputs.recipe.source, UniformEstimate):
             # The same for all shots, so that they share their sites.
             relative = _divide_by_mean(ready.image, ready.mask)
