@@ -7,9 +7,9 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from napari_shadowinv.errors import InputError
 
@@ -101,6 +101,25 @@ class CheckedModel(BaseModel):
                 f"{type(self).__name__}: '{name}' cannot be changed, make a changed copy with "
                 "model_copy(update=…)"
             ) from error
+
+
+# Fields that several models have.
+Seed = Annotated[
+    int,
+    Field(
+        ge=0,
+        title="Random seed",
+        description="Seed of all random choices; the same seed gives the same result.",
+    ),
+]
+Threads = Annotated[
+    int | None,
+    Field(
+        ge=1,
+        title="Number of threads",
+        description="Number of threads. Default: all cores. It does not affect the result.",
+    ),
+]
 
 
 def as_model(model_class: type[Model], value: Any, name: str) -> Model:

@@ -7,12 +7,39 @@ from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
-from napari_shadowinv._system.validation import CheckedModel, CombinationError
+from napari_shadowinv._system.validation import CheckedModel, CombinationError, Seed, Threads
 from napari_shadowinv.options.inversion import MaxError
 from napari_shadowinv.physics.setup import deflector_titles
 
 MAX_STRENGTH = 1e4
 """Largest ratio of an image's displacement to the first one's."""
+
+
+PointSpread = Annotated[
+    float | None,
+    Field(
+        ge=0,
+        title="Point spread (px)",
+        description="Standard deviation of the point spread in px after all steps. Default: none.",
+    ),
+]
+SourceSize = Annotated[
+    float | None,
+    Field(
+        ge=0,
+        title="Source size (m)",
+        description="Standard deviation of the beam's source in m (FWHM / 2.355). Use it with the "
+        "resolution, instead of the point spread in px.",
+    ),
+]
+Resolution = Annotated[
+    float | None,
+    Field(
+        ge=0,
+        title="Resolution (m)",
+        description="Standard deviation of the detector's point spread in m, at the detector.",
+    ),
+]
 
 
 def refuse_two_point_spreads(choices: Any) -> None:
@@ -126,18 +153,8 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
         description="Fit a single image even if its source is unknown, although many beams and "
         "fields explain it equally well.",
     )
-    seed: int = Field(
-        default=0,
-        ge=0,
-        title="Random seed",
-        description="Seed of all random choices; the same seed gives the same result.",
-    )
-    threads: int | None = Field(
-        default=None,
-        ge=1,
-        title="Number of threads",
-        description="Number of threads. Default: all cores. It does not affect the result.",
-    )
+    seed: Seed = 0
+    threads: Threads = None
 
 
 def _parse_noise(value: Any) -> Any:
@@ -196,25 +213,9 @@ class FitChoices(CheckedModel, allow_inf_nan=False):
         "each pixel, as on film; or the standard deviation of a pixel after all steps. Default: "
         "estimated from the images, the same for all pixels.",
     )
-    psf: float | None = Field(
-        default=None,
-        ge=0,
-        title="Point spread (px)",
-        description="Standard deviation of the point spread in px after all steps. Default: none.",
-    )
-    source_size: float | None = Field(
-        default=None,
-        ge=0,
-        title="Source size (m)",
-        description="Standard deviation of the beam's source in m (FWHM / 2.355). Use it with the "
-        "resolution, instead of the point spread in px.",
-    )
-    resolution: float | None = Field(
-        default=None,
-        ge=0,
-        title="Resolution (m)",
-        description="Standard deviation of the detector's point spread in m, at the detector.",
-    )
+    psf: PointSpread = None
+    source_size: SourceSize = None
+    resolution: Resolution = None
     options: FitOptions = Field(default=FitOptions(), description="Options of the fit.")
 
     @field_validator("fields", mode="before")

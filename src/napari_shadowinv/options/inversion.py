@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from napari_shadowinv._system.validation import CheckedModel, CombinationError
+from napari_shadowinv._system.validation import CheckedModel, CombinationError, Seed, Threads
 
 _Fraction = Annotated[float, Field(gt=0, lt=1)]
 MaxError = Annotated[
@@ -167,17 +167,8 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         description="Image units per detected quantum, for the error budget: the noise is then "
         "Poisson noise.",
     )
-    seed: int = Field(
-        default=0,
-        ge=0,
-        description="Random seed for the site positions; the same seed gives the same result.",
-        json_schema_extra=_MOVES_SITES | _RARE,
-    )
-    threads: int | None = Field(
-        default=None,
-        ge=1,
-        description="Number of threads. Default: all cores. It does not affect the result.",
-    )
+    seed: Seed = Field(default=0, json_schema_extra=_MOVES_SITES | _RARE)
+    threads: Threads = None
 
     @model_validator(mode="after")
     def _check_combination(self) -> Self:

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from napari_shadowinv._system.validation import CheckedModel
+from napari_shadowinv._system.validation import CheckedModel, Seed, Threads
 from napari_shadowinv.physics.beam import number_field
 from napari_shadowinv.physics.field_grid import FieldGrid
 
@@ -72,18 +72,8 @@ class TraceOptions(CheckedModel):
         default=False,
         description="Also return start, landing point and deflection of each particle; for counts.",
     )
-    seed: int = Field(
-        default=0,
-        ge=0,
-        title="Random seed",
-        description="Seed of all random choices; for counts.",
-    )
-    threads: int | None = Field(
-        default=None,
-        ge=1,
-        title="Number of threads",
-        description="Number of threads. Default: all cores. It does not affect the result.",
-    )
+    seed: Seed = Field(default=0, description="Seed of all random choices; for counts.")
+    threads: Threads = None
 
 
 class GridView(CheckedModel):

@@ -6,9 +6,14 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from napari_shadowinv._system.validation import CheckedModel, CombinationError
+from napari_shadowinv._system.validation import CheckedModel, CombinationError, Seed, Threads
 from napari_shadowinv.options import MaxError
-from napari_shadowinv.options.fitting import refuse_two_point_spreads
+from napari_shadowinv.options.fitting import (
+    PointSpread,
+    Resolution,
+    SourceSize,
+    refuse_two_point_spreads,
+)
 
 
 class ExperimentOptions(CheckedModel, allow_inf_nan=False):
@@ -50,26 +55,9 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
         description="Relative r.m.s. structure of the beam that the reference records, over the "
         "beam's length. How far the beam differs from its reference is a number of the instrument.",
     )
-    psf: float | None = Field(
-        default=None,
-        ge=0,
-        le=20,
-        title="Point spread (px)",
-        description="Known standard deviation of the point spread in px. Default: none.",
-    )
-    source_size: float | None = Field(
-        default=None,
-        ge=0,
-        title="Source size (m)",
-        description="Standard deviation of the beam's source in m (FWHM / 2.355), for the point "
-        "spread of each setup.",
-    )
-    resolution: float | None = Field(
-        default=None,
-        ge=0,
-        title="Resolution (m)",
-        description="Standard deviation of the detector's point spread in m, at the detector.",
-    )
+    psf: PointSpread = Field(default=None, le=20)
+    source_size: SourceSize = None
+    resolution: Resolution = None
     draws: int = Field(
         default=20,
         ge=2,
@@ -90,18 +78,8 @@ class ExperimentOptions(CheckedModel, allow_inf_nan=False):
         "points and computes error bars. The other fits start near the true field.",
     )
     max_error: MaxError = 0.05
-    seed: int = Field(
-        default=0,
-        ge=0,
-        title="Random seed",
-        description="Seed of all random choices; the same seed gives the same plan.",
-    )
-    threads: int | None = Field(
-        default=None,
-        ge=1,
-        title="Number of threads",
-        description="Shots that are computed at once. Default: all cores. The result is the same.",
-    )
+    seed: Seed = 0
+    threads: Threads = None
 
     @model_validator(mode="after")
     def _check_combinations(self) -> Self:
