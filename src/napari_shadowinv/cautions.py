@@ -58,18 +58,10 @@ CAUTION_CODES: Mapping[str, str] = MappingProxyType(
 
 @dataclass(frozen=True, slots=True)
 class Caution:
-    """A reason to doubt an image, a setup or a result.
+    """A reason to doubt an image, a setup or a result."""
 
-    Attributes
-    ----------
-    code : str
-        One of `CAUTION_CODES`.
-    text : str
-        The observation, its effect on the result, and the remedy, in a sentence.
-    """
-
-    code: str
-    text: str
+    code: str  # one of `CAUTION_CODES`
+    text: str  # the observation, its effect on the result, and the remedy, in a sentence
 
     def __post_init__(self) -> None:
         if self.code not in CAUTION_CODES:

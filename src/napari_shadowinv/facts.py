@@ -218,25 +218,13 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Assessment:
-    """Verdict on a field, with its limit and the next step.
-
-    Attributes
-    ----------
-    verdict : Verdict
-        Whether the field is known.
-    reason, advice : str
-        Its limit and the next step in a few words; empty if there is nothing to say.
-    explanation : str
-        The reason in a sentence. Default: reason and advice.
-    caution : Caution, optional
-        The one that decided it, if one did.
-    """
+    """Verdict on a field, with its limit and the next step."""
 
     verdict: Verdict
-    reason: str
-    advice: str = ""
-    explanation: str = ""
-    caution: Caution | None = None
+    reason: str  # its limit in a few words; empty if there is nothing to say
+    advice: str = ""  # the next step in a few words
+    explanation: str = ""  # the reason in a sentence. Default: reason and advice
+    caution: Caution | None = None  # the one that decided it, if one did
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "explanation", self.explanation or self.short)
@@ -307,31 +295,14 @@ class Headline:
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A property of a result in words.
+    """A property of a result in words."""
 
-    Attributes
-    ----------
-    key : str
-        Name for programs, such as "image_residual"; the code of a caution.
-    title : str
-        Name for people, such as "Image residual".
-    text : str
-        The value, with its unit.
-    level : Level
-        Not sound if it is a reason to doubt the result.
-    is_detail : bool
-        Whether it describes the work of the solver rather than the result. Windows fold it away.
-    short : str
-        The value in a few words, for one line about a result and for the title of a panel; empty
-        if it has no place there.
-    """
-
-    key: str
-    title: str
-    text: str
-    level: Level = Level.SOUND
-    is_detail: bool = False
-    short: str = ""
+    key: str  # for programs, such as "image_residual"; the code of a caution
+    title: str  # for people, such as "Image residual"
+    text: str  # the value, with its unit
+    level: Level = Level.SOUND  # not sound if it is a reason to doubt the result
+    is_detail: bool = False  # about the work of the solver: windows fold it away
+    short: str = ""  # the value for a headline or a panel's title; empty if it has no place there
 
 
 def verdict_fact(verdict: Verdict) -> Fact:

@@ -33,23 +33,13 @@ MaskVariable: TypeAlias = tuple[tuple[str, ...], BoolArray | None, dict[str, str
 
 
 class Origin(CheckedModel):
-    """Origin of an image or a table.
+    """Origin of an image or a table."""
 
-    Attributes
-    ----------
-    file, sha256 : str
-        Name of the file, without its folder, and its checksum; "" if it was an array.
-    variable, channel : str or int or None
-        Array and colour channel taken from the file.
-    shape : tuple of int or None
-        Shape as recorded.
-    """
-
-    file: str = ""
+    file: str = ""  # name without its folder, "" like the checksum if it was an array
     sha256: str = ""
-    variable: str | None = None
+    variable: str | None = None  # taken from the file, as the colour channel
     channel: str | int | None = None
-    shape: tuple[int, int] | None = None
+    shape: tuple[int, int] | None = None  # as recorded
 
 
 class MaskOrigin(Origin):

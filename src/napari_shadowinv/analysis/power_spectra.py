@@ -36,19 +36,10 @@ MIN_RINGS = 4  # for a slope
 
 
 def window_weights(mask: BoolArray, taper: float = 0.05) -> FloatArray:
-    """Return weights that rise from 0 at the border and at masked pixels to 1.
+    """Return weights, (H, W), that rise from 0 at the border and at masked pixels to 1.
 
-    Parameters
-    ----------
-    mask : ndarray of bool, shape (H, W)
-        Pixels to be used.
-    taper : float
-        Share of the shorter side, at each end, over which the weights rise as a squared sine.
-
-    Raises
-    ------
-    InputError
-        If the image is smaller than 32 px, or the masked pixels leave nothing.
+    The taper is the share of the shorter side, at each end, over which they rise as a squared sine.
+    An `InputError` if the image is smaller than 32 px, or the masked pixels leave nothing.
     """
     side = min(mask.shape)
     if side < 32:
@@ -103,19 +94,9 @@ class RingSpectrum:
 
 
 def ring_spectrum(potential: FloatArray, weights: FloatArray) -> RingSpectrum:
-    """Return the spectrum of the displacement d = -∇φ in a window.
+    """Return the spectrum of the displacement d = -∇φ, φ in px², in a window of weights, (H, W).
 
-    Parameters
-    ----------
-    potential : ndarray, shape (H, W)
-        In px².
-    weights : ndarray, shape (H, W)
-        Of `window_weights`.
-
-    Returns
-    -------
-    RingSpectrum
-        From one wavelength in the shorter side up to 0.9 of the Nyquist frequency.
+    It goes from one wavelength in the shorter side up to 0.9 of the Nyquist frequency.
     """
     plane = np.pad(potential, 1, mode="edge")
     curvature = plane[2:, 1:-1] + plane[:-2, 1:-1] + plane[1:-1, 2:] + plane[1:-1, :-2]
@@ -182,17 +163,8 @@ def random_displacement(
 ) -> tuple[FloatArray, FloatArray]:
     """Return potential and displacement of a Gaussian random field, periodic in its shape.
 
-    Parameters
-    ----------
-    density : callable
-        Ring-averaged spectrum of the displacement at wavenumbers in rad/px, px² for each (rad/px)².
-    shape : tuple of int
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    potential : ndarray, shape (H, W)
-    displacement : ndarray, shape (2, H, W)
+    Its density is the ring-averaged spectrum of the displacement at wavenumbers in rad/px, in px²
+    for each (rad/px)².
     """
     k_y, k_x = (2 * np.pi * np.fft.fftfreq(count) for count in shape)
     k = np.hypot(k_y[:, None], k_x)

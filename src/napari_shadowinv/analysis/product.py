@@ -36,24 +36,12 @@ _NO_PREFIX = ("", "1", PIXEL, "m⁻²", "m⁻³")
 
 @dataclass(frozen=True)
 class Measurand:
-    """Number, or array of numbers, of a product.
+    """Number, or array of numbers, of a product."""
 
-    Attributes
-    ----------
-    dims : tuple of str
-        Names of the axes of its values; empty for a number, "y" and "x" for a map.
-    unit : str
-        Unit of its values. Values in the frame's `si_unit` are shown in its `unit`.
-    long_name : str
-        In words.
-    title : str
-        In a few words, for tables. Default: its name.
-    """
-
-    dims: tuple[str, ...]
-    unit: str
-    long_name: str
-    title: str = ""
+    dims: tuple[str, ...]  # names of its axes; empty for a number, "y" and "x" for a map
+    unit: str  # of its values; those in the frame's `si_unit` are shown in its `unit`
+    long_name: str  # in words
+    title: str = ""  # in a few words, for tables. Default: its name
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,21 +60,11 @@ class Coordinate:
 
 @dataclass(frozen=True, eq=False)
 class FieldNoise:
-    """A few random errors of a field, from which a product chooses its smoothing.
+    """A few random errors of a field, from which a product chooses its smoothing."""
 
-    Attributes
-    ----------
-    potentials : ndarray, shape (k, H, W)
-        Changes of the potential in px² by noise and instrument.
-    spacing : float
-        Spacing of the sites in px; 0 for a field without sites.
-    report : Reporter
-        For choices that take long.
-    """
-
-    potentials: FloatArray
-    spacing: float = 0.0
-    report: Reporter = dataclasses.field(default_factory=Reporter)
+    potentials: FloatArray  # (k, H, W), changes of the potential in px² by noise and instrument
+    spacing: float = 0.0  # of the sites in px; 0 for a field without sites
+    report: Reporter = dataclasses.field(default_factory=Reporter)  # for choices that take long
 
 
 class Product(Choice):

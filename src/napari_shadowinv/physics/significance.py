@@ -24,46 +24,21 @@ LEVEL = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Structures:
-    """Connected regions in which a field stands above its standard deviation.
+    """Connected regions in which a field stands above its standard deviation."""
 
-    Attributes
-    ----------
-    labels : ndarray of int, shape (H, W)
-        Number of the structure in each pixel, from 1 for the most significant; 0 outside.
-    peaks : tuple of float
-        Largest significance in each structure, in the same order.
-    share : float
-        Share of the used pixels that lie in a structure.
-    largest : float
-        Largest significance of any used pixel.
-    limit : float
-        Significance that errors alone exceed somewhere in the image with a probability of 5 %.
-    n_pixels : int
-        Number of used pixels.
-    """
-
-    labels: NDArray[np.int32]
-    peaks: tuple[float, ...]
-    share: float
-    largest: float
-    limit: float
-    n_pixels: int
+    labels: NDArray[np.int32]  # (H, W), number of the structure, 1 the most significant; 0 outside
+    peaks: tuple[float, ...]  # largest significance in each, in the same order
+    share: float  # of the used pixels, that lies in a structure
+    largest: float  # significance of any used pixel
+    limit: float  # significance that errors alone exceed somewhere with a probability of 5 %
+    n_pixels: int  # used ones
 
 
 def deviation_along(displacement: FloatArray, std: FloatArray) -> FloatArray:
-    """Return the standard deviation of the length of a displacement.
+    """Return the standard deviation of the length of a displacement, (2, ...), in its unit.
 
-    Parameters
-    ----------
-    displacement, std : ndarray, shape (2, ...)
-        The displacement, and the standard deviation of each component, in the same unit. The errors
-        of the components count as independent.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        In the same unit, to first order in the errors; 0 where the displacement is 0, for which
-        there is no direction.
+    The errors of its components count as independent, to first order. 0 where the displacement is
+    0, for which there is no direction.
 
     Examples
     --------

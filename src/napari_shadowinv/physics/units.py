@@ -234,22 +234,11 @@ def peak_facts(
     error: PeakError | None = None,
     field_error: PeakError | None = None,
 ) -> list[Fact]:
-    """Return the strongest point of a field as facts.
+    """Return the strongest point of a field, whose displacement is in px, as facts.
 
-    Parameters
-    ----------
-    displacement : ndarray, shape (2, H, W)
-        In px.
-    setup : Setup or None
-        Adds the main field in SI units.
-    deflector : str, optional
-        See `shown_fields`.
-    mask : ndarray of bool, shape (H, W), optional
-        Pixels that count.
-    error : PeakError, optional
-        Standard error of the peak.
-    field_error : PeakError, optional
-        Standard error of the peak in SI units, if it differs.
+    A setup adds the main field in SI units, or that of a deflector, see `shown_fields`; a mask, (H,
+    W), has the pixels that count. The errors are the standard errors of the peak, and of the peak
+    in SI units if that differs.
     """
     (pixels,) = shown_fields([displacement], None, mask=mask)
     row, column = pixels.peak
@@ -278,20 +267,9 @@ def intensity_limits(
 ) -> tuple[float, float]:
     """Return grey limits of an image that a caustic's few bright pixels cannot spoil.
 
-    The lower limit is 0, unless the image has negative pixels or all of it is brighter than a
-    `shade` of the upper limit, which is at most `peak` times the mean.
-
-    Parameters
-    ----------
-    image : ndarray
-        Intensities in any unit. A large image is sampled.
-    ends, peak, shade
-        Percentiles of the darkest and brightest pixel; factor on the mean; and share.
-
-    Returns
-    -------
-    tuple of float
-        Darkest and brightest intensity to show, the second larger.
+    They are the percentiles `ends` of darkest and brightest pixels, of a sample if the image is
+    large. The lower limit is 0, unless the image has negative pixels or all of it is brighter than
+    a `shade` of the upper limit, which is at most `peak` times the mean.
     """
     step = max(1, int(np.sqrt(image.size / 100_000)))
     sample = np.asarray(image[::step, ::step])

@@ -162,24 +162,12 @@ class TracedObject(PlannedObject):
 def object_of_field(
     field: FieldGrid, setup: Setup | None, *, title: str = "a 3-D field"
 ) -> TracedObject:
-    """Return an object through which particles are traced.
+    """Return an object through which particles are traced, as a field in the experiment's frame.
 
-    A fit of several energies has the displacement of its first image: differences between
-    the energies, because the object is thick or E and B act together, are in the error.
-
-    Parameters
-    ----------
-    field : FieldGrid
-        E and B in the frame of the experiment.
-    setup : Setup
-        Its first image; pixels of this size cover the grid if no other shape is chosen.
-    title : str
-        In texts.
-
-    Raises
-    ------
-    InputError
-        If the setup is none of particles, or as of `traced_displacement`.
+    A fit of several energies has the displacement of its first image: differences between the
+    energies, because the object is thick or E and B act together, are in the error. The setup is
+    that of the first image; pixels of this size cover the grid if no other shape is chosen. An
+    `InputError` if it is none of particles, or as of `traced_displacement`.
     """
     checked = check_particles(setup)
     sides = [(last - first) / checked.object_pixel_size for first, last in field.extent[1:]]
@@ -275,23 +263,10 @@ def object_of_displacement(
     deflector: str | None = None,
     title: str = "a displacement",
 ) -> PlannedObject:
-    """Return an object with a displacement.
+    """Return an object with a displacement, (2, H, W) in px of a setup.
 
-    Parameters
-    ----------
-    displacement : array_like, shape (2, H, W)
-        In px of `setup`, axis order (y, x).
-    setup : Setup, optional
-        Its experiment.
-    deflector : str, optional
-        Title of the cause of the deflection.
-    title : str
-        In texts.
-
-    Raises
-    ------
-    InputError
-        If the shape is another or a value is not finite.
+    The deflector is the title of the cause of the deflection. An `InputError` if the shape is
+    another or a value is not finite.
     """
     samples = checked_displacement(displacement)
     if not np.isfinite(samples).all():
@@ -302,17 +277,9 @@ def object_of_displacement(
 
 
 def object_of_result(result: Any) -> PlannedObject:
-    """Return the object that an inversion, a fit or a retrieved field has shown.
+    """Return the object that an inversion, a fit, or a field, also as a dataset, has shown.
 
-    Parameters
-    ----------
-    result : Inversion, Fit, RetrievedField or Dataset
-        Of one shot; a dataset as `read` returns it.
-
-    Raises
-    ------
-    InputError
-        If it has no field or several, or is not of one shot.
+    An `InputError` if it has no field or several, or is not of one shot.
     """
     content = unpack_result(result)
     fields: tuple[Any, ...] = getattr(content, "fields", (content,))

@@ -161,16 +161,10 @@ def draft_pack(
     """Return the entries of a pack file for the scans of a folder, or for `layers` of them.
 
     Without layers, each scan is one, in the order of the names (film_2 before film_10), without
-    filters. A scan that is named after a film type, or with "unexposed" or "blank", shows
-    unexposed film. A table (.csv) that can be read as a calibration belongs to the type in its
-    name, or to all types.
-
-    Raises
-    ------
-    FileFormatError
-        If the folder cannot be read.
-    InputError
-        If it has no scans, or only one of two distances is given.
+    filters. A scan that is named after a film type, or with "unexposed" or "blank", shows unexposed
+    film. A table (.csv) that can be read as a calibration belongs to the type in its name, or to
+    all types. A `FileFormatError` if the folder cannot be read; an `InputError` if it has no scans,
+    or only one of two distances is given.
     """
     facts = facts or NewPack()
     folder = Path(folder)

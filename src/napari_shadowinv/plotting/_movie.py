@@ -30,27 +30,13 @@ _RECORDED = ("image", "source", "mask")  # shown under masks, too
 def stack_frames(
     stack: xarray.Dataset, variable: str | None = None, *, limits: tuple[float, float] | None = None
 ) -> Iterator[NDArray[np.uint8]]:
-    """Draw one variable of every shot, all on one colour scale.
+    """Yield one variable of every shot as a picture, (rows, columns, 3), all on one colour scale.
 
-    Parameters
-    ----------
-    stack : xarray.Dataset
-        From `napari_shadowinv.invert_stack` or a store.
-    variable : str, optional
-        An image for each shot; of vectors the magnitude is shown. Default: the potential.
-    limits : tuple of float, optional
-        Ends of the colour scale, in the variable's own units. Default: the smallest and
-        largest value of all shots, but for a few shots that stick out.
-
-    Yields
-    ------
-    ndarray of uint8, shape (rows, columns, 3)
-        A frame for each shot, with even numbers of rows and columns.
-
-    Raises
-    ------
-    InputError
-        If there is no such variable.
+    The stack is that of `napari_shadowinv.invert_stack` or of a store; the variable, by default the
+    potential, has an image for each shot, or vectors, whose magnitude is shown. The limits of the
+    scale are in the variable's own units; by default the smallest and largest value of all shots,
+    but for a few shots that stick out. Rows and columns are even numbers. An `InputError` if there
+    is no such variable.
     """
     setup = setup_from_dataset(stack)
     if variable is None:
@@ -138,21 +124,10 @@ def _draw_frames(
 def write_film(
     path: Path, frames: Iterable[NDArray[np.uint8]], rate: float, *, overwrite: bool = False
 ) -> int:
-    """Write frames as a film, whole or not at all; return their number.
+    """Write the frames of a stack as a film, whole or not at all; return their number.
 
-    Parameters
-    ----------
-    path : Path
-        The film, ``.mp4`` or ``.gif``.
-    frames : iterable of ndarray of uint8, shape (rows, columns, 3)
-        From `stack_frames`, one at least.
-    rate : float
-        Frames a second.
-
-    Raises
-    ------
-    FileFormatError
-        If the film exists and `overwrite` does not allow to replace it, or it cannot be written.
+    The film is an ``.mp4`` or ``.gif`` with a rate of frames a second. A `FileFormatError` if it
+    exists and `overwrite` does not allow to replace it, or it cannot be written.
     """
     with replacing(path, overwrite) as temporary, TemporaryDirectory() as folder:
         draft = Path(folder, f"film{path.suffix.lower()}")
