@@ -37,8 +37,9 @@ from scipy import ndimage
 
 import simulated_pack
 from napari_shadowinv import FitOptions, Recipe
-from napari_shadowinv.film import move_corners, straighten_film, write_corners
-from napari_shadowinv.film.scans import upright
+from napari_shadowinv.film import write_corners
+from napari_shadowinv.film.registration import move_corners
+from napari_shadowinv.film.scans import straighten_film, upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline import read_pack, run_film, run_fit

@@ -28,7 +28,8 @@ import tifffile
 from numba import njit
 from numpy.typing import NDArray
 
-from napari_shadowinv.film import Pack, PackLayer, ResponseMatrix, Slab
+from napari_shadowinv.film import Pack, PackLayer, Slab
+from napari_shadowinv.film.unfolding import ResponseMatrix
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -38,7 +38,8 @@ from napari_shadowinv import (
 )
 from napari_shadowinv._system.safety import LIMIT_VARIABLE, check_regular, resolved_path
 from napari_shadowinv.cli._export import _escape_cell
-from napari_shadowinv.film import Calibration, Pack, usable_pixels
+from napari_shadowinv.film import Calibration, Pack
+from napari_shadowinv.film.scans import usable_pixels
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_toml

@@ -7,13 +7,13 @@ import pytest
 from scipy import ndimage
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film import (
+from napari_shadowinv.film.registration import (
     check_orientation,
     move_corners,
     poses_by_fiducials,
     register,
-    straighten_film,
 )
+from napari_shadowinv.film.scans import straighten_film
 
 SHAPE = (150, 210)
 RNG = np.random.default_rng(3)

@@ -12,7 +12,8 @@ import tifffile
 from scipy.ndimage import binary_erosion
 
 import simulated_pack
-from napari_shadowinv.film import Pack, PackLayer, ResponseMatrix, Slab
+from napari_shadowinv.film import Pack, PackLayer, Slab
+from napari_shadowinv.film.unfolding import ResponseMatrix
 from simulated_pack import PITCH, Placement, Scene, Truth, simulate
 
 SHAPE = (90, 120)

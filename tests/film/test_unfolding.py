@@ -11,8 +11,13 @@ from pydantic import ValidationError
 from helpers.public_data import public_file
 from helpers.srim import TABLES
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film import Material, Pack, PackLayer, ResponseMatrix, Slab
-from napari_shadowinv.film.unfolding import check_increasing, relative_strengths, unfold
+from napari_shadowinv.film import Material, Pack, PackLayer, Slab
+from napari_shadowinv.film.unfolding import (
+    ResponseMatrix,
+    check_increasing,
+    relative_strengths,
+    unfold,
+)
 from napari_shadowinv.physics.setup import ProtonSetup
 
 

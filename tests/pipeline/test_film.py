@@ -15,7 +15,8 @@ from scipy import ndimage
 
 from helpers.public_data import public_file
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
-from napari_shadowinv.film import Pack, move_corners, read_corners, write_corners
+from napari_shadowinv.film import Pack, read_corners, write_corners
+from napari_shadowinv.film.registration import move_corners
 from napari_shadowinv.film.scans import upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read, read_toml, write

@@ -5,7 +5,6 @@ from .calibration import (
     combined_dose,
     dose,
     net_optical_density,
-    unexposed_pixel,
 )
 from .other_detectors import (
     Luminescence,
@@ -16,19 +15,9 @@ from .other_detectors import (
     ge_luminescence,
 )
 from .pack import FilmType, Material, Pack, PackLayer, Slab, Stopping
-from .registration import Poses, check_orientation, move_corners, poses_by_fiducials, register
-from .scans import (
-    burnt_edges,
-    find_films,
-    read_corners,
-    straighten_film,
-    usable_pixels,
-    write_corners,
-)
-from .unfolding import Band, ResponseMatrix, Spectra, unfold
+from .scans import read_corners, write_corners
 
 __all__ = [
-    "Band",
     "Calibration",
     "CombinedDose",
     "DoseMap",
@@ -37,29 +26,16 @@ __all__ = [
     "Material",
     "Pack",
     "PackLayer",
-    "Poses",
-    "ResponseMatrix",
     "Slab",
-    "Spectra",
     "Stopping",
     "TrackImage",
     "Tracks",
-    "burnt_edges",
-    "check_orientation",
     "combined_dose",
     "dose",
     "fading",
-    "find_films",
     "fuji_luminescence",
     "ge_luminescence",
-    "move_corners",
     "net_optical_density",
-    "poses_by_fiducials",
     "read_corners",
-    "register",
-    "straighten_film",
-    "unexposed_pixel",
-    "unfold",
-    "usable_pixels",
     "write_corners",
 ]

@@ -85,28 +85,16 @@ class TextureMatch:
 
 
 class Poses(NamedTuple):
-    """How films lie against where their edges are.
+    """How films lie against where their edges are."""
 
-    Attributes
-    ----------
-    shifts : ndarray, shape (n, 2)
-        Displacement (y, x) of their content, in px.
-    turns : ndarray, shape (n,)
-        The same as an angle about the middle in rad, from y towards x.
-    errors : ndarray, shape (n,)
-        Standard deviation of a shift in px, against the film that it is best compared with, and how
-        far that moved it from its edges (r.m.s. along an axis).
-    by_images : ndarray of bool, shape (n,)
-        Whether neighbouring films share its structure; else only its edges count.
-    closure : float
-        How far the comparisons of films, or their fiducials, contradict each other: r.m.s. along
-        an axis in px, NaN if none can.
-    """
-
-    shifts: FloatArray
-    turns: FloatArray
+    shifts: FloatArray  # (n, 2), displacement (y, x) of their content, px
+    turns: FloatArray  # (n,), the same as an angle about the middle in rad, from y towards x
+    # (n,), standard deviation of a shift in px, against the film that it is best compared with, and
+    # how far that moved it from its edges (r.m.s. along an axis)
     errors: FloatArray
-    by_images: BoolArray
+    by_images: BoolArray  # (n,), whether neighbours share its structure; else only its edges count
+    # How far the comparisons of films, or their fiducials, contradict each other: r.m.s. along an
+    # axis in px, NaN if none can.
     closure: float
 
     @classmethod
@@ -245,35 +233,19 @@ def register(
     """Align films by the structure that they share.
 
     Each film is compared with the next two: shift and turn by least squares on the fine structure,
-    which must agree all over the film. Before, the dose of one film is mapped to the other's
-    dose by a monotone function, so that lines of equal dose, such as kinks of a calibration table,
-    are not structure. A comparison is refused if it turns films more than three times the error of
+    which must agree all over the film. Before, the dose of one film is mapped to the other's dose
+    by a monotone function, so that lines of equal dose, such as kinks of a calibration table, are
+    not structure. A comparison is refused if it turns films more than three times the error of
     their edges, or moves a corner by more than 2.5 times that error; 4 times, if comparisons with a
-    third film of the same kind agree. Comparisons and edges together give the poses, each
-    weighted by its error. Where no comparison is further than 1.5 px from the edges, edges
-    count alone: fields displace the structure by different amounts, which looks like a shift.
-    For the same reason the error of a film that was moved is no smaller than its move.
+    third film of the same kind agree. Comparisons and edges together give the poses, each weighted
+    by its error. Where no comparison is further than 1.5 px from the edges, edges count alone:
+    fields displace the structure by different amounts, which looks like a shift. For the same
+    reason the error of a film that was moved is no smaller than its move.
 
-    Parameters
-    ----------
-    images : array_like, shape (n, H, W)
-        Logarithm of the dose, upright.
-    usable : array_like of bool, shape (n, H, W)
-        Where it is known.
-    spread : float or array_like, shape (n,), default 3
-        Standard deviation in px of a film's place by edges or marks.
-    kinds : sequence of hashable, length n, optional
-        Films of one kind were cut alike, so that the edges of one are as far off as the edges of
-        another. Default: all are.
-    match : TextureMatch, optional
-        How they are compared.
-    limits : MoveLimits, optional
-        How far a comparison may move films.
-
-    Raises
-    ------
-    InputError
-        If shapes do not fit.
+    The images, (n, H, W), are logarithms of the dose, upright, and `usable` where it is known. The
+    spread is the standard deviation in px of a film's place by edges or marks. Films of one of the
+    kinds, by default all, were cut alike, so that the edges of one are as far off as the edges of
+    another. An `InputError` if shapes do not fit.
     """
     values, is_usable = np.asarray(images, np.float64), np.asarray(usable, bool)
     if values.ndim != 3 or is_usable.shape != values.shape:
@@ -332,12 +304,8 @@ def check_orientation(
     Neighbours must show the same large structure, turned or mirrored: where the films show too
     little, or their structure is symmetric, they are not rejected. Means over `block` px are
     compared. Turned over, a film must correlate better than `correlation`, with a deficit from 1
-    below `deficit_ratio` of its deficit as it lies.
-
-    Raises
-    ------
-    InputError
-        If a film lies another way round; the message says how each of them was scanned.
+    below `deficit_ratio` of its deficit as it lies. The `InputError` says how each film was
+    scanned.
     """
     # Large structure in few pixels, and how much of each of them is known.
     planes = []
@@ -525,24 +493,11 @@ def poses_by_fiducials(
     One mark on a film determines its shift, two or more also its turn. A film without marks is
     aligned by its edges. Films are aligned to the mean of all, so a mark on one film has no effect.
 
-    Parameters
-    ----------
-    points : sequence of mapping from str to array_like, shape (2,)
-        For each film its marks by name, (y, x) in px of its scan.
-    corners : array_like, shape (n, 4, 2)
-        Of the films on their scans.
-    scales : array_like, shape (n,)
-        Px of each film in a px of the images, which magnify with the depth in the pack.
-    names : sequence of str
-        Names of the films for messages.
-    mark_error, max_misfit : float, default 0.3 and 10
-        Least error of a mark in px, as marks are read off a scan; and distance from its place by
-        the other marks beyond which a mark has a wrong name.
-
-    Raises
-    ------
-    InputError
-        If no mark is on two films, or one disagrees with the other marks of its film.
+    For each film there are its marks by name, (y, x) in px of its scan, its corners, (4, 2), and
+    its scale: its px in a px of the images, which magnify with the depth in the pack. The least
+    error of a mark in px is how marks are read off a scan. An `InputError` if no mark is on two
+    films, or one is further than `max_misfit` px from its place by the other marks of its film: it
+    has a wrong name.
     """
     film_marks = []  # px down and right from the film's middle
     for marks, film in zip(points, np.asarray(corners, np.float64), strict=True):

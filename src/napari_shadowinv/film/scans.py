@@ -91,26 +91,12 @@ class BurnCheck:
 def find_films(
     scan: ArrayLike, *, least_side: float | None = None, sides: SideFit = SideFit()
 ) -> list[FloatArray]:
-    """Return the corners of the films on a scan, row by row as one reads.
+    """Return the corners, (4, 2), of the films on a scan, row by row as one reads.
 
-    Parameters
-    ----------
-    scan : array_like, shape (H, W, 3)
-        Films on a bright bed, none of which touches another.
-    least_side : float, optional
-        Smaller side of the smallest film in px. Default: a seventh of the scan's.
-    sides : SideFit, optional
-        Limits of the search.
-
-    Returns
-    -------
-    list of ndarray, shape (4, 2)
-        Of straight lines along the sides; chips and notches do not count.
-
-    Raises
-    ------
-    InputError
-        If there is no film, or the scan has no colours.
+    The scan, (H, W, 3), has films on a bright bed, none of which touches another. The smaller side
+    of the smallest film is `least_side` px, by default a seventh of the scan's. Corners are those
+    of straight lines along the sides; chips and notches do not count. An `InputError` if there is
+    no film, or the scan has no colours.
     """
     values = checked_scan(scan)
     darkest = values.min(axis=-1)
@@ -138,21 +124,10 @@ def find_films(
 def straighten_film(
     scan: ArrayLike, corners: ArrayLike, *, shape: tuple[int, int] | None = None, scale: float = 1.0
 ) -> AnyArray:
-    """Return a film cut out of a scan and turned upright.
+    """Return a film cut out of a scan, (H, W) or (H, W, C), and turned upright.
 
-    Parameters
-    ----------
-    scan : array_like, shape (H, W) or (H, W, C)
-    corners : array_like, shape (4, 2)
-    shape : tuple of int, optional
-        Of the returned image. Default: the film's.
-    scale : float, default 1
-        Side of its pixels in px of the scan.
-
-    Returns
-    -------
-    ndarray of float64
-        Cubic between the scan's pixels, within their range; constant beyond its edge.
+    Its shape is by default the film's, the scale the side of its pixels in px of the scan. Cubic
+    between the scan's pixels, within their range; constant beyond its edge.
     """
     values = np.asarray(scan)
     axes, middle, size = upright(checked_corners(corners))
@@ -334,12 +309,8 @@ def _in_reading_order(films: Sequence[FloatArray]) -> list[FloatArray]:
 def read_corners(path: str | Path) -> dict[str, FloatArray]:
     """Read a table of corners: film, y1, x1, … y4, x4.
 
-    Raises
-    ------
-    FileFormatError
-        If the file is no table.
-    InputError
-        If it has other columns, or corners do not go around a film.
+    A `FileFormatError` if the file is no table; an `InputError` if it has other columns, or corners
+    do not go around a film.
     """
     corners = {}
     for line, row in read_rows(Path(path), _CornerRow).items():
@@ -369,35 +340,14 @@ def usable_pixels(
     rim: int = 6,
     marks: MarkCheck = MarkCheck(),
 ) -> BoolArray:
-    """Return the pixels whose dose can be trusted.
+    """Return the pixels, (H, W), of an upright film, (H, W, 3), whose dose can be trusted.
 
     The darkening of exposed film in blue follows from its darkening in red. At ink, scratches,
     notches, dust and burnt edges, the blue differs from its surroundings. A scratch that only
     removes part of the active layer looks like less dose, a grey mark on nearly black film like
-    more.
-
-    Parameters
-    ----------
-    film : array_like, shape (H, W, 3)
-        A film alone, upright.
-    calibration : Calibration
-        For its kind of film.
-    background : array_like, shape (3,), optional
-        Pixel of unexposed film. Default: the calibration's.
-    rim : int, default 6
-        Pixels along the edges that do not count.
-    marks : MarkCheck, optional
-        Limits of a mark.
-
-    Returns
-    -------
-    ndarray of bool, shape (H, W)
-        False on marks and along the rim.
-
-    Raises
-    ------
-    InputError
-        If the film has no colours, or the rim leaves nothing of it.
+    more. The background is the pixel of unexposed film, by default the calibration's; the rim in px
+    along the edges does not count. An `InputError` if the film has no colours, or the rim leaves
+    nothing of it.
     """
     values = checked_scan(film)
     if not 0 <= 2 * rim < min(values.shape[:2]):
@@ -432,21 +382,10 @@ def usable_pixels(
 
 
 def burnt_edges(dose: ArrayLike, *, burn: BurnCheck = BurnCheck()) -> BoolArray:
-    """Return the pixels along burnt edges of a film, which look like dose.
+    """Return the pixels along burnt edges of an upright film, which look like dose, (H, W).
 
     Heat and light darken a film as protons do, so colours do not show it. But the dose then falls
     steeply from the edge inwards, along a good part of a side, and hardly any more further in.
-
-    Parameters
-    ----------
-    dose : array_like, shape (H, W)
-        Dose of an upright film, positive.
-    burn : BurnCheck, optional
-        Limits of a burnt edge.
-
-    Returns
-    -------
-    ndarray of bool, shape (H, W)
     """
     logarithm = np.log(np.asarray(dose, np.float64))
     burnt = np.zeros(logarithm.shape, dtype=bool)

@@ -27,38 +27,20 @@ from napari_shadowinv.film.pack import PROTON_MASS, Pack, Slab, Stopping
 
 @dataclass(frozen=True)
 class Band:
-    """Energies to which a film is most sensitive, in MeV.
+    """Energies in MeV to which a film is most sensitive."""
 
-    Attributes
-    ----------
-    peak : float
-        Energy of the protons that lose most energy in the film: they stop there.
-    low, high : float
-        Energies around the peak at which they lose half as much.
-    """
-
-    peak: float
-    low: float
+    peak: float  # of the protons that lose most energy in the film: they stop there
+    low: float  # energies around the peak at which they lose half as much
     high: float
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseMatrix:
-    """Energy that one proton loses in the active layer of each film.
+    """Energy that one proton loses in the active layer of each film."""
 
-    Attributes
-    ----------
-    energies : ndarray, shape (n,)
-        Of protons in front of the pack, in MeV, increasing.
-    deposits : ndarray, shape (layers, n)
-        Energy that they lose in each active layer, in MeV.
-    doses : ndarray, shape (layers, n)
-        Dose in Gy by one proton per m².
-    """
-
-    energies: FloatArray
-    deposits: FloatArray
-    doses: FloatArray
+    energies: FloatArray  # (n,), of protons in front of the pack, in MeV, increasing
+    deposits: FloatArray  # (layers, n), energy that they lose in each active layer, in MeV
+    doses: FloatArray  # (layers, n), dose in Gy by one proton per m²
 
     @classmethod
     def of(
@@ -66,17 +48,9 @@ class ResponseMatrix:
     ) -> ResponseMatrix:
         """Compute the response of a pack.
 
-        Parameters
-        ----------
-        pack : Pack
-        energies : array_like, shape (n,), optional
-            In MeV. Default: so close together that each film's peak is well resolved, between
-            the `ends`, or up to the end of a stopping table.
-
-        Raises
-        ------
-        InputError
-            If an energy is above the range of a stopping table.
+        Energies in MeV are by default so close together that each film's peak is well resolved,
+        between the `ends`, or up to the end of a stopping table, above which an `InputError`
+        refuses others.
         """
         stoppings = pack.stoppings()
         last = min(ends[1], *(stopping.energies[-1] for stopping in stoppings.values()))
@@ -97,13 +71,7 @@ class ResponseMatrix:
 
     @property
     def bands(self) -> tuple[Band, ...]:
-        """Band of each film.
-
-        Raises
-        ------
-        InputError
-            If no proton of these energies reaches a film.
-        """
+        """Band of each film; an `InputError` if no proton of these energies reaches one."""
         bands = []
         for number, deposit in enumerate(self.deposits, 1):
             top = int(np.argmax(deposit))
@@ -150,22 +118,13 @@ _DISPLACEMENT_POWER = 0.75  # displacement falls with this power of the energy: 
 
 
 class Spectra(NamedTuple):
-    """Fluence per energy in every pixel.
+    """Fluence per energy in every pixel."""
 
-    Attributes
-    ----------
-    energies : ndarray, shape (n,)
-        In MeV, of the protons in a layer's fluence image: fields displace them by the mean
-        displacement of all protons that contribute.
-    fluence : ndarray of float64, shape (n, H, W)
-        Protons per m² and MeV at the energies that stop in each film.
-    error : ndarray of float64, shape (n, H, W)
-        Its standard deviation.
-    """
-
+    # (n,), in MeV, of the protons in a layer's fluence image: fields displace them by the mean
+    # displacement of all protons that contribute
     energies: FloatArray
-    fluence: FloatArray
-    error: FloatArray
+    fluence: FloatArray  # (n, H, W), protons per m² and MeV at energies that stop in each film
+    error: FloatArray  # (n, H, W), its standard deviation
 
 
 class _Basis(NamedTuple):
@@ -226,32 +185,17 @@ def unfold(
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Spectra:
-    """Return the spectrum in every pixel that explains the doses of all films.
+    """Return the spectrum in every pixel that explains the doses, (n, H, W) in Gy, of all films.
 
     The fluences minimise the squared errors of the doses without being negative; where doses are
-    unknown, the spectrum relative to the usual one is as straight as its curvature allows. The
-    usual spectrum, of the mean doses, falls exponentially from film to film and beyond the last.
+    unknown, the spectrum relative to the usual one is as straight as its curvature allows: the
+    usual bend from film to film, as a share of the mean spectrum. The usual spectrum, of the mean
+    doses, falls exponentially from film to film and beyond the last.
 
-    Parameters
-    ----------
-    doses : array_like, shape (n, H, W)
-        In Gy, the films in the order of the pack, on the same pixels.
-    errors : array_like, shape (n, H, W)
-        Standard deviations as shares of the doses; infinite where a dose is unknown. A dose
-        of exactly zero has no error to weight it by, and counts as unknown.
-    response : ResponseMatrix
-        Of the pack.
-    curvature : float, default 1
-        Usual bend of the spectrum from film to film, as a share of the mean spectrum.
-    on_progress, should_stop : callable, optional
-        Receives a `Progress` now and then; ends the work when it returns true.
-
-    Raises
-    ------
-    InputError
-        If shapes do not fit, doses are negative, or the films are in another order.
-    InversionCancelled
-        If `should_stop` returned true.
+    Films are in the order of the pack, on the same pixels. Errors, (n, H, W), are standard
+    deviations as shares of the doses, infinite where a dose is unknown; a dose of exactly zero has
+    no error to weight it by, and counts as unknown. An `InputError` if shapes do not fit, doses are
+    negative, or the films are in another order.
     """
     film_doses, shares = np.asarray(doses, np.float64), np.asarray(errors, np.float64)
     count = len(response.doses)

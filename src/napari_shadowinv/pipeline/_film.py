@@ -6,15 +6,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.machine import available_threads
+from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.tables import read_rows
 from napari_shadowinv._system.validation import CheckedModel
@@ -22,27 +22,25 @@ from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
-from napari_shadowinv.film import (
-    Calibration,
-    Pack,
-    PackLayer,
+from napari_shadowinv.film import Calibration, Pack, PackLayer, combined_dose, read_corners
+from napari_shadowinv.film.calibration import unexposed_pixel
+from napari_shadowinv.film.registration import (
+    EDGE_ERROR_PX,
     Poses,
-    ResponseMatrix,
-    burnt_edges,
     check_orientation,
-    combined_dose,
-    find_films,
     move_corners,
     poses_by_fiducials,
-    read_corners,
     register,
+)
+from napari_shadowinv.film.scans import (
+    burnt_edges,
+    common_shape,
+    find_films,
     straighten_film,
-    unexposed_pixel,
-    unfold,
+    upright,
     usable_pixels,
 )
-from napari_shadowinv.film.registration import EDGE_ERROR_PX
-from napari_shadowinv.film.scans import common_shape, upright
+from napari_shadowinv.film.unfolding import ResponseMatrix, unfold
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.inversion.noise import estimated_noise
 from napari_shadowinv.io.files import text_of
@@ -53,9 +51,6 @@ from napari_shadowinv.provenance import ImageOrigin, Provenance
 _UNEXPOSED_RANGE = (0.98, 1.2)  # unexposed film over the lightest film of the table
 # Films are cut at right angles, but by hand: by share of the diagonal, and in metres.
 _MAX_ASKEW_SHARE, _MAX_ASKEW_M = 0.015, 2e-3
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,11 +83,6 @@ class _FilmFiducial(CheckedModel):
     name: str
     y: float
     x: float
-
-
-def in_parallel(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    with ThreadPoolExecutor(available_threads(None)) as pool:
-        return list(pool.map(work, items))
 
 
 def read_films(pack: Pack, report: Reporter) -> list[Film]:
@@ -136,7 +126,7 @@ def read_films(pack: Pack, report: Reporter) -> list[Film]:
         scan, corners = to_scan_frame(scan, corners, *turn)
         return Film(number, layer, scan, corners, calibration, background, mask, marks, turn)
 
-    films = in_parallel(film, used)
+    films = results_of([partial(film, number) for number in used], available_threads(None))
     _check_distinct(films)
     return films
 
@@ -353,7 +343,8 @@ def run_film(
     marked = any(film.fiducials for film in films)
     if not marked:
         films = _scale_about_axis(films, pack)
-    edges = in_parallel(doses_of, films)
+    threads = available_threads(None)
+    edges = results_of([partial(doses_of, film) for film in films], threads)
     poses = _align_films(films, edges, pack, report)
     aligned = [
         replace(film, corners=move_corners(film.corners, shift, turn, film.scale))
@@ -363,7 +354,9 @@ def run_film(
         aligned = _scale_about_axis(aligned, pack)
     pairs = zip(films, aligned, strict=True)
     moved = any((film.corners != shifted.corners).any() for film, shifted in pairs)
-    doses = in_parallel(doses_of, aligned) if moved else edges
+    doses = edges
+    if moved:
+        doses = results_of([partial(doses_of, film) for film in aligned], threads)
     dose = by_layer([film_doses.dose for film_doses in doses])
     error = by_layer([film_doses.error for film_doses in doses])
     usable = by_layer([film_doses.usable for film_doses in doses], False)
