@@ -40,7 +40,8 @@ from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
-from napari_shadowinv.pipeline import collect_inputs, read_recipe
+from napari_shadowinv.pipeline import read_recipe
+from napari_shadowinv.pipeline.inversion_run import collect_inputs
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
     Bin,

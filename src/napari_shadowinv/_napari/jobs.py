@@ -32,9 +32,8 @@ from napari_shadowinv.options import (
     InversionOptions,
 )
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.pipeline import Cache, run_fit, run_refinement
-from napari_shadowinv.pipeline.fit_run import refinement_choices
-from napari_shadowinv.pipeline.inversion_run import run
+from napari_shadowinv.pipeline.fit_run import refinement_choices, run_fit, run_refinement
+from napari_shadowinv.pipeline.inversion_run import Cache, run
 from napari_shadowinv.preprocessing import Estimate, Recipe, estimate_source
 from napari_shadowinv.shot import Shot
 

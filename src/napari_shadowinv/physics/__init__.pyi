@@ -2,7 +2,7 @@ from .field_grid import FieldGrid, field_grid
 from .forward import jacobian_determinant, synthetic_image
 from .particle_flight import TracedParticles, trace_particles
 from .phantoms import Phantom, ellipse_pair, gaussian_blob, paper_setup, toroid
-from .poisson import border_mean, poisson_invert
+from .poisson import poisson_invert
 from .projection import predict_image, transferred_displacement
 from .setup import OpticalSetup, ProtonSetup, Setup, setup_from_dict
 from .trace_options import TraceOptions
@@ -17,7 +17,6 @@ __all__ = [
     "TraceOptions",
     "TracedImage",
     "TracedParticles",
-    "border_mean",
     "ellipse_pair",
     "field_grid",
     "gaussian_blob",

@@ -1,11 +1,9 @@
 """From a shot to its result by a recipe, for Python, commands and windows.
 
 - apply a recipe to a shot: `run`; sites and sources that a window reuses: `Cache`
-- the same in two parts, for stacks: `collect_inputs`, `run_prepared`
 - fit several images of one object by a recipe: `run_fit`; find the fields that explain them:
   `run_comparison`
 - test whether one static field explains them: `run_leave_one_out`
-- refine an inversion by a fit that starts from it: `run_refinement`
 - repeat a result from its provenance: module `rerun`
 - an experiment before its shot, by simulated shots: `plan_experiment`, `sweep_experiment`, with
   `ExperimentOptions`

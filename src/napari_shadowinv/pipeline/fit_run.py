@@ -61,30 +61,11 @@ def run_refinement(
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Fit:
-    """Fit the forward model to the image of an inversion, with its source and mask.
+    """Fit the forward model to the image of an inversion, with its source, mask and pixels.
 
-    Parameters
-    ----------
-    inversion : Inversion
-        Its potential is one of the starts of the fit.
-    setup : Setup or None
-        The experiment, with the pixels of the inversion.
-    choices : FitChoices
-        Such as `refinement_choices`; the source is known, and so is the brightness.
-    on_progress, should_stop : callable, optional
-        As for `napari_shadowinv.fit`.
-
-    Returns
-    -------
-    Fit
-        With its `provenance` if the inversion has one.
-
-    Raises
-    ------
-    InputError
-        If the image cannot be fitted.
-    InversionCancelled
-        If `should_stop` returned true.
+    Its potential is one of the starts of the fit. Choices are such as `refinement_choices`; the
+    source is known, and so is the brightness. The fit has a `provenance` if the inversion has one.
+    An `InputError` if the image cannot be fitted.
     """
     errors, instrument = inversion.errors, inversion.instrument
     if errors is not None and errors.beam is not None:

@@ -27,8 +27,8 @@ from napari_shadowinv.inversion.variables import dataset_from_field, variable_la
 from napari_shadowinv.io.files import sha256, split_address
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.pipeline import Inputs, collect_inputs
 from napari_shadowinv.pipeline.fit_run import check_fit
+from napari_shadowinv.pipeline.inversion_run import Inputs, collect_inputs
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
 from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.provenance import index_masks

@@ -32,8 +32,8 @@ from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, column_val
 from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.pipeline import Cache, Inputs, collect_inputs, run_fit, run_prepared
-from napari_shadowinv.pipeline.fit_run import usual_fields
+from napari_shadowinv.pipeline.fit_run import run_fit, usual_fields
+from napari_shadowinv.pipeline.inversion_run import Cache, Inputs, collect_inputs, run_prepared
 from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 from napari_shadowinv.provenance import MaskVariable, mask_variables
 from napari_shadowinv.shot import Shot
