@@ -335,8 +335,11 @@ class FitJob(ImageJob):
     task = "fit"
     pace: ClassVar[float | None] = None  # time of the last fit relative to its estimate
 
-    shots: tuple[Shot, ...]
-    names: tuple[str, ...]  # of the images
+    shots: tuple[Shot, ...]  # with the names of their images
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(str(shot.name) for shot in self.shots)
 
     @property
     def image_name(self) -> str:
@@ -359,7 +362,7 @@ class FitJob(ImageJob):
 
     @property
     def time_estimate(self) -> TimeEstimate:
-        choices, images = self.choices, len(self.names)
+        choices, images = self.choices, len(self.shots)
         fields, is_unknown = len(choices.fields or ("B",)), choices.beam == "unknown"
         return TimeEstimate(self.shape, images, fields, is_unknown, choices.options)
 
@@ -389,10 +392,6 @@ class Refinement(FitJob):
     inversion: Inversion
     setup: Setup | None
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        return self.inversion.image.shape
-
     def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         return run_refinement(
             self.inversion,
@@ -419,8 +418,7 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
     start = f"the inversion of '{name}'"
     return Refinement(
         recipe=Recipe(fit=refinement_choices(inversion, setup, psf)),
-        shots=(),
-        names=(name,),
+        shots=(Shot(inversion.image, name=name),),
         name=f"{name} refined",
         frame=frame_of(layer),
         origins={"Start": start, "Point spread": f"σ {psf:g} px" if psf else "none"},

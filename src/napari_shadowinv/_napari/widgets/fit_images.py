@@ -220,7 +220,6 @@ class FitImages(inputs.ImagePanel):
         described["origins"] |= _warnings_of(rows)
         return FitJob(
             shots=shots,
-            names=tuple(row.name for row in rows),
             name=f"{first.layer.name} fit",
             frame=result_frame(first.layer, recipe),
             **described,
@@ -234,6 +233,7 @@ class FitImages(inputs.ImagePanel):
         return tuple(
             replace(
                 image,
+                name=row.name,
                 setup=None if setup is None else self._setup_of(row, setup),
                 source=source,
                 mask=self.masks.usable(row.layer),
