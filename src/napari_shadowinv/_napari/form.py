@@ -272,7 +272,7 @@ class Entry:
         content = f"in {self._unit}" if self._unit else content
         hint = content if self._field.is_required() else f"not set ({content})"
         if tuple in self._kinds:
-            hint = "all, or 10:200"
+            hint = "all, or a range such as 10:200"
         elif self._default is not None:
             hint = _text_of(self._default, self._unit) if is_number else str(self._default)
         elif not content:
@@ -523,12 +523,13 @@ class StepForm(QWidget):
         self.up = qt.small_button("↑", "Move this step up.", lambda: move(self, -1))
         self.down = qt.small_button("↓", "Move this step down.", lambda: move(self, 1))
         self.remove = qt.small_button("✕", "Remove this step.", lambda: move(self, None))
-        qt.side_by_side(
-            (self.folded, 1), (self.up, 0), (self.down, 0), (self.remove, 0), holder=self
-        )
         for button in (self.up, self.down, self.remove):
             button.setAutoRaise(True)
-            self.layout().setAlignment(button, Qt.AlignmentFlag.AlignTop)
+        title = self.folded.toggleButton()
+        line = qt.side_by_side((title, 1), (self.up, 0), (self.down, 0), (self.remove, 0))
+        line.layout().setSpacing(0)
+        self.folded.layout().insertWidget(0, line)
+        qt.column(self, self.folded)
         self.form.changed.connect(self._show_title)
         self.form.changed.connect(self.changed)
         self.folded.toggled.connect(self._show_title)
