@@ -42,6 +42,15 @@ from napari_shadowinv.preprocessing.estimates import LowPassEstimate, TotalVaria
 from napari_shadowinv.shot import Shot
 
 _NOTABLE_PATTERN = 0.25
+_REFINE_TIP = (
+    "Fit the forward model to the image, starting from its last inversion. The fit includes blur, "
+    "gives error bars, and works beyond the first caustic. The verdict says whether the image "
+    "determines the field."
+)
+_SAVE_TIP = (
+    "Save the selected or last result, of a stack the shot in view: complete with its layers "
+    "(.shadowinv), for other programs (.h5), or its sites (.csv)."
+)
 _PREVIEW_DELAY_MS = 10  # merges simultaneous changes
 
 
@@ -107,23 +116,12 @@ class Invert(ImagePanel):
         self.live = QCheckBox("Live preview", toolTip=tip)
         self.store = StoreSection()
         self.cost, self.refine_form = CostLine(), forms.ModelForm(FitChoices, ["psf"])
-        self.refine_button = qt.push_button(
-            "Refine",
-            "Fit the forward model to the image, starting from its last inversion. The fit "
-            "includes blur, gives error bars, and works beyond the first caustic. The verdict "
-            "says whether the image determines the field.",
-            self.refine,
-        )
-        self.refine_section = forms.section(
-            "Refine the result", self.refine_form, self.refine_button
-        )
+        self.refine_button = qt.push_button("Refine", _REFINE_TIP, self.refine)
+        refine = self.refine_form, self.refine_button
+        self.refine_section = forms.section("Refine the result", *refine)
         self._refined = ResultLayers(self.viewer, self)
         self.save_result, self.more_layers = result_buttons(
-            self,
-            lambda: self.results,
-            "Save the selected or last result, of a stack the shot in view: complete with its "
-            "layers (.shadowinv), for other programs (.h5), or its sites (.csv).",
-            shot_to_save,
+            self, lambda: self.results, _SAVE_TIP, shot_to_save
         )
         buttons = qt.side_by_side((self.save_result, 1), (self.more_layers, 1))
         kinds, said = (Inversion, Fit), self.setup.warning_label.text
