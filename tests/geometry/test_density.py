@@ -76,10 +76,3 @@ def test_density_edges_through_corners_cancel_in_return(ends):
     got = integrate(triangle, density)
     np.testing.assert_allclose(abs(got[0]), abs(mass), atol=1e-12)
     np.testing.assert_allclose(np.abs(got[1:3]), np.abs(moments + 0.5 * mass), atol=1e-11)
-
-
-def test_total_is_the_image_sum():
-    image = np.random.default_rng(0).random((13, 5))
-    density = Density.from_image(image)
-    assert density.first_sums[0, :, -1].sum() == pytest.approx(image.sum(), rel=1e-14)
-    assert density.shape == (13, 5)

@@ -69,13 +69,7 @@ def test_no_panel_touches_another_or_leaves_the_page(
     )
     assert len(panels(figure)) == 6
     assert_nothing_overlaps(figure)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_pixels_are_square(make_inversion: Make, shape: tuple[int, int]) -> None:
-    figure = report_figure(make_inversion(shape))
-    figure.draw_without_rendering()
-    for axes in panels(figure)[:5]:
+    for axes in panels(figure)[:5]:  # pixels are square
         box = axes.get_window_extent()
         assert box.height / box.width == pytest.approx(shape[0] / shape[1], rel=0.01)
 
@@ -263,15 +257,6 @@ def test_a_fit_shows_each_image_its_explanation_and_the_field(
         "Beam",
         "Deflection potential",
     )
-
-
-def test_residuals_of_a_fit_are_in_units_of_the_noise(make_fit: MakeFit) -> None:
-    fit = make_fit()
-    for k, index in enumerate((2, 5)):
-        residual = np.ma.filled(panels(fit_figure(fit))[index].images[0].get_array(), np.nan)
-        # The noise of `make_fit` is 0.05 everywhere.
-        expected = np.where(fit.mask[k], fit.residual[k] / 0.05, np.nan)
-        np.testing.assert_allclose(residual, expected)
 
 
 def test_residuals_are_over_the_noise_of_each_image_or_pixel(make_fit: MakeFit) -> None:
