@@ -28,9 +28,9 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.normalise import mask_unlit, prepare
 from napari_shadowinv.physics import phantoms
-from napari_shadowinv.physics.beam import setup_warnings
+from napari_shadowinv.physics.beam import setup_cautions
 from napari_shadowinv.physics.setup import SETUPS, setup_from_dict
-from napari_shadowinv.preprocessing import image_warnings
+from napari_shadowinv.preprocessing import image_cautions
 from napari_shadowinv.preprocessing.alignment import register_source
 from reference import DATA, donut_case, toroid_case
 
@@ -147,7 +147,7 @@ def cautions_of(image: FloatArray, source: FloatArray | None) -> list[Caution]:
     """Return all cautions about an image, those of pixels without light among them."""
     mask, cautions = mask_unlit(image, source, None)
     usable = None if mask is None else np.asarray(mask)
-    cautions = [*cautions, *image_warnings(image, source, usable)]
+    cautions = [*cautions, *image_cautions(image, source, usable)]
     if source is not None:
         shot = prepare(image, source, InversionOptions(negative="clip"), usable)
         moved = register_source(shot.image, shot.source, shot.mask, Instrument()).caution
@@ -228,7 +228,7 @@ def _reference_images() -> Iterator[tuple[str, Shot]]:
 def is_refused_or_doubted(values: dict[str, object]) -> bool:
     """Whether a setup is refused, or something is said of it."""
     try:
-        return bool(setup_warnings(setup_from_dict(values), SHAPE))
+        return bool(setup_cautions(setup_from_dict(values), SHAPE))
     except InputError:
         return True
 

@@ -241,7 +241,7 @@ class FilmDoses(Summarised):
             "package_version": self.provenance.version,
             "created": self.created,
             "provenance": self.provenance.to_json(),
-            "warnings": json.dumps([asdict(caution) for caution in self.cautions]),
+            "cautions": json.dumps([asdict(caution) for caution in self.cautions]),
             "seen_from": self.pack.seen_from_text,
         }
         if self.pixel_size is not None:
@@ -285,7 +285,7 @@ class FilmDoses(Summarised):
             energies=numbers_of(dataset, "energy"),
             bands=np.stack(bands, axis=1),
             provenance=provenance,
-            cautions=tuple(map(Caution.from_json, json.loads(attributes.get("warnings", "[]")))),
+            cautions=tuple(map(Caution.from_json, json.loads(attributes.get("cautions", "[]")))),
             pixel_size=None if size is None else float(size),
             setups=tuple(validate(ProtonSetup, entry, "the pack's setup") for entry in setups),
             created=str(attributes.get("created", "")),

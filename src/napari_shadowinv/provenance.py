@@ -86,7 +86,7 @@ class ImageOrigin(Origin):
         Whether the source of an image of a fit was recorded, as `Shot.measured`.
     notes : tuple of str
         Notes of the steps, for people.
-    warnings : tuple of Caution
+    cautions : tuple of Caution
         Reasons to doubt an image of a fit, its source or its setup.
     """
 
@@ -101,7 +101,7 @@ class ImageOrigin(Origin):
     noise: Noise | None = None
     measured: bool = True
     notes: tuple[str, ...] = ()
-    warnings: tuple[Annotated[Caution, BeforeValidator(Caution.from_json)], ...] = ()
+    cautions: tuple[Annotated[Caution, BeforeValidator(Caution.from_json)], ...] = ()
 
 
 class Provenance(CheckedModel):

@@ -69,7 +69,7 @@ class Shot(Summarised):
     metadata : mapping
         Other facts from the file: ``kind``, ``dtype``, ``bits``, ``sha256``, and for pradformat
         ``geometry``, the part of the setup in the file.
-    warnings : tuple of Caution
+    cautions : tuple of Caution
         Reasons to doubt the content of the file.
     in_file : mapping
         Attributes that came in the image's file, such as its ``source``: a recipe precedes them,
@@ -96,7 +96,7 @@ class Shot(Summarised):
     measured: bool = True
     path: Path | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
-    warnings: tuple[Caution, ...] = ()
+    cautions: tuple[Caution, ...] = ()
     in_file: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -121,7 +121,7 @@ class Shot(Summarised):
         parts = [str(self.path)] if self.path is not None else []
         parts += [self.setup.probe] if self.setup is not None else []
         parts += [f"with {name}" for name in ("source", "mask") if getattr(self, name) is not None]
-        return [", ".join(parts) or "no setup", *(caution.text for caution in self.warnings)]
+        return [", ".join(parts) or "no setup", *(caution.text for caution in self.cautions)]
 
     def _picture(self) -> FloatArray | None:
         return np.asarray(self.image) if np.ndim(self.image) == 2 else None

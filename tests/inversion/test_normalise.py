@@ -81,13 +81,13 @@ def test_sites_default_to_the_pixels_up_to_a_limit():
 def test_a_mask_over_much_of_the_image_is_reported(rows, said):
     mask = np.ones((20, 30), bool)
     mask[:rows] = False
-    warnings = prepare(np.ones((20, 30)), None, InversionOptions(), mask).warnings
-    assert [caution.code for caution in warnings] == (["mask"] if said else [])
-    assert all("excludes 25 % of the pixels" in caution.text for caution in warnings)
+    cautions = prepare(np.ones((20, 30)), None, InversionOptions(), mask).cautions
+    assert [caution.code for caution in cautions] == (["mask"] if said else [])
+    assert all("excludes 25 % of the pixels" in caution.text for caution in cautions)
 
 
 @pytest.mark.parametrize(("factor", "codes"), [(0.9, ["flux"]), (1.0, []), (1.1, ["flux"])])
 def test_another_flux_than_the_sources_is_named(factor, codes):
     image = np.random.default_rng(0).uniform(0.9, 1.1, (24, 30))
     prepared = prepare(factor * image / image.mean(), np.ones(image.shape), InversionOptions())
-    assert [caution.code for caution in prepared.warnings] == codes
+    assert [caution.code for caution in prepared.cautions] == codes

@@ -106,12 +106,12 @@ def test_frames_lie_where_their_places_say(tmp_path: Path) -> None:
     # 100 px of 800 from the right edge.
     np.testing.assert_array_equal(shot.image[:, ::2], 0)
     assert shot.metadata["geometry"] == {"detector_pixel_size": pytest.approx(200e-6)}
-    assert not shot.warnings[1:]
+    assert not shot.cautions[1:]
 
 
 def test_ranges_choose_tracks_and_are_kept(scan: Path) -> None:
     assert read_shot(scan).image.sum() == 36 * 12
-    assert "all 432 tracks are counted" in read_shot(scan).warnings[0].text
+    assert "all 432 tracks are counted" in read_shot(scan).cautions[0].text
     for ranges, share in (
         ("diameter=4:", 2 / 3),
         ("diameter=:3", 1 / 3),  # both ends count
@@ -120,7 +120,7 @@ def test_ranges_choose_tracks_and_are_kept(scan: Path) -> None:
     ):
         shot = read_shot(f"{scan}::{ranges} bin=200")
         assert shot.image.sum() == shot.metadata["tracks"] == 432 * share
-        assert not shot.warnings
+        assert not shot.cautions
         # As the command and a result's provenance name them.
         again = read_shot(scan, variable=shot.metadata["variable"])
         np.testing.assert_array_equal(again.image, shot.image)
@@ -151,7 +151,7 @@ def test_impossible_ranges_are_refused(scan: Path, text: str) -> None:
 def test_gaps_between_frames_are_reported(tmp_path: Path) -> None:
     frames = snake(4, 4, lambda c, r: [ROUND])
     path = save(tmp_path / "a.cpsa", (4, 4), frames, pitch=1.2)
-    assert "overlap or leave gaps" in str(read_shot(path).warnings)
+    assert "overlap or leave gaps" in str(read_shot(path).cautions)
 
 
 @pytest.mark.parametrize(

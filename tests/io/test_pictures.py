@@ -27,7 +27,7 @@ def turned(orientation: int) -> Image.Exif:
 
 
 def codes(path: Path) -> list[str]:
-    return [caution.code for caution in read_shot(path).warnings]
+    return [caution.code for caution in read_shot(path).cautions]
 
 
 @pytest.mark.parametrize(

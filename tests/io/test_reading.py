@@ -15,7 +15,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read, read_dataset, read_shot, read_toml
 from napari_shadowinv.io.files import sha256
-from napari_shadowinv.io.images import film_warnings
+from napari_shadowinv.io.images import film_cautions
 from napari_shadowinv.shot import Shot
 
 RAMP = np.arange(6 * 9).reshape(6, 9)
@@ -268,14 +268,14 @@ def test_real_film_scan() -> None:
     assert red.image.shape == (548, 1022)
     assert red.metadata["bits"] == 16
     np.testing.assert_array_equal(red.image, tifffile.imread(path)[..., 0])
-    assert "wrong sign unless it is converted to dose first" in red.warnings[0].text
+    assert "wrong sign unless it is converted to dose first" in red.cautions[0].text
 
 
 @pytest.mark.parametrize("name", public_names("rcf", ".tif"))
 def test_real_films_get_the_film_warning(name: str) -> None:
     scan = tifffile.imread(public_file(name))
     for grey in (scan[..., 0], scan[..., 2], (scan[..., 1] // 257).astype(np.uint8)):
-        assert film_warnings(grey, None)
+        assert film_cautions(grey, None)
 
 
 def as_scan(image: FloatArray) -> AnyArray:
@@ -285,15 +285,15 @@ def as_scan(image: FloatArray) -> AnyArray:
 @pytest.mark.parametrize("peak", [24, 97, 194])  # the last is nearly empty in the middle
 def test_the_toroid_gets_no_film_warning(peak: int) -> None:
     for image in (toroid_image(peak), noisy_toroid_image(peak)):
-        assert not film_warnings(as_scan(image), None)
+        assert not film_cautions(as_scan(image), None)
 
 
 def test_the_donut_gets_no_film_warning() -> None:
-    assert not film_warnings(as_scan(load_donut()[0]), None)
+    assert not film_cautions(as_scan(load_donut()[0]), None)
 
 
 def test_real_shadowgram(burner: list[Path]) -> None:
-    assert not any(read_shot(path).warnings for path in burner)
+    assert not any(read_shot(path).cautions for path in burner)
     radiograph = read_shot(burner[0])
     assert radiograph.image.shape == (928, 1152)
     assert np.percentile(radiograph.image, 0.1) >= 54

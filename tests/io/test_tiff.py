@@ -143,8 +143,8 @@ def test_small_page_without_a_mark_is_left_out_with_a_caution(path: Path) -> Non
         tiff.write(SMALL, metadata=None)
     shot = read(path)
     np.testing.assert_array_equal(shot.image, SHOT)
-    assert [caution.code for caution in shot.warnings] == ["file"]
-    assert "6×8" in shot.warnings[0].text
+    assert [caution.code for caution in shot.cautions] == ["file"]
+    assert "6×8" in shot.cautions[0].text
 
 
 def test_pictures_of_similar_size_are_refused(path: Path) -> None:
@@ -329,15 +329,15 @@ def test_colour_profile_is_a_caution_unless_it_is_linear(path: Path) -> None:
     for name, codes in ((b"sRGB IEC61966-2.1", ["gamma"]), (b"Linear grey", [])):
         profile = (34675, "B", len(name), name, True)
         tifffile.imwrite(path, SHOT, extratags=[profile])
-        assert [caution.code for caution in read(path).warnings] == codes
+        assert [caution.code for caution in read(path).cautions] == codes
 
 
 def test_grey_jpeg_in_a_tiff_is_not_linear(path: Path) -> None:
     image = np.full((16, 16), 80, np.uint8)
     tifffile.imwrite(path, image, compression="jpeg", photometric="minisblack")
-    assert [caution.code for caution in read(path).warnings] == ["gamma"]
+    assert [caution.code for caution in read(path).cautions] == ["gamma"]
     tifffile.imwrite(path, image, compression="jpeg2000", photometric="minisblack")
-    assert read(path).warnings == ()
+    assert read(path).cautions == ()
 
 
 # Size of the pixels
@@ -360,7 +360,7 @@ def test_pixels_that_are_not_square_are_a_caution(
     path: Path, options: dict[str, Any], words: str
 ) -> None:
     tifffile.imwrite(path, SHOT, **options)
-    (caution,) = read(path).warnings
+    (caution,) = read(path).cautions
     assert words in caution.text
     assert size_in(path) is None
 

@@ -108,7 +108,7 @@ def test_warnings_are_told_when_a_pack_is_opened(
     viewer: ViewerModel, pack_doses: Any, tmp_path: Path, messages: list[str]
 ) -> None:
     dark = '[{"code": "film-range", "text": "film 2 is too dark"}]'
-    warned = pack_doses.to_dataset().assign_attrs(warnings=dark)
+    warned = pack_doses.to_dataset().assign_attrs(cautions=dark)
     opened(viewer, write(tmp_path / "dark.shadowinv", warned))
     assert messages == ["dark.shadowinv: film 2 is too dark"]
 

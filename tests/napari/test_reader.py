@@ -26,7 +26,7 @@ from napari_shadowinv._napari.layers import add_layers, sample_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv._napari.stores import follow_shots
-from napari_shadowinv._napari.widgets._layers import warnings_of
+from napari_shadowinv._napari.widgets._layers import cautions_of
 from napari_shadowinv.inversion import Inversion
 
 PLUGIN = "napari-shadowinv"
@@ -421,12 +421,12 @@ def test_a_scan_of_film_is_told_and_so_is_its_result(viewer: ViewerModel, tmp_pa
     (record_of_film,) = [
         record for record in notification_manager.records if "film.tif" in record.message
     ]
-    (warning,) = metadata_of(keywords)["warnings"]
+    (warning,) = metadata_of(keywords)["cautions"]
     assert "wrong sign" in warning.text
     assert warning.text in record_of_film.message
     (read_by_napari,) = viewer.open(tmp_path / "film.tif", plugin="napari")
-    assert warnings_of(read_by_napari) == (warning,)
-    assert warnings_of(viewer.add_image(film)) == ()
+    assert cautions_of(read_by_napari) == (warning,)
+    assert cautions_of(viewer.add_image(film)) == ()
 
 
 def test_pradreader_brings_its_source_and_its_mask(

@@ -10,10 +10,10 @@ import pytest
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import (
-    deflection_warnings,
+    deflection_cautions,
     geometry_text,
     number_in_unit,
-    setup_warnings,
+    setup_cautions,
     text_in_unit,
 )
 from napari_shadowinv.physics.setup import SETUPS, OpticalSetup, ProtonSetup, setup_from_dict
@@ -164,8 +164,8 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("values", "words"), WRONG.values(), ids=WRONG)
-def test_setup_warnings_name_a_wrong_unit(values, words):
-    cautions = setup_warnings(setup_from_dict(values), SHAPE)
+def test_setup_cautions_name_a_wrong_unit(values, words):
+    cautions = setup_cautions(setup_from_dict(values), SHAPE)
     assert any(words in caution.text for caution in cautions)
     assert {caution.code for caution in cautions} == {"setup"}
 
@@ -203,18 +203,18 @@ def test_setup_refuses_numbers_beyond_any_experiment(change):
     ],
     ids=str,
 )
-def test_setup_warnings_are_silent_on_real_setups(values):
-    assert setup_warnings(setup_from_dict(values), SHAPE) == ()
+def test_setup_cautions_are_silent_on_real_setups(values):
+    assert setup_cautions(setup_from_dict(values), SHAPE) == ()
 
 
 @pytest.mark.parametrize("shape", [(100, 3000), (3000, 100)])
-def test_setup_warnings_go_by_the_longer_side(shape):
-    (caution,) = setup_warnings(setup_from_dict(FILM), shape)
+def test_setup_cautions_go_by_the_longer_side(shape):
+    (caution,) = setup_cautions(setup_from_dict(FILM), shape)
     assert "field of view of 1.5 cm is wider than the 1 cm" in caution.text
 
 
-def test_setup_warnings_doubt_a_large_pixel_once():
-    cautions = setup_warnings(setup_from_dict({**SCAN, "detector_pixel_size": 0.145}))
+def test_setup_cautions_doubt_a_large_pixel_once():
+    cautions = setup_cautions(setup_from_dict({**SCAN, "detector_pixel_size": 0.145}))
     assert ["a pixel is" in caution.text for caution in cautions] == [True]
 
 
@@ -225,16 +225,16 @@ def test_geometry_text_shows_field_of_view_and_magnification():
     assert "collimated" in geometry_text(OpticalSetup.example())
 
 
-def test_deflection_warnings_begin_at_three_tenths_of_a_radian():
+def test_deflection_cautions_begin_at_three_tenths_of_a_radian():
     setup = ProtonSetup.example()
     pixels = setup.displacement(np.array([[[0.29]], [[0.0]]]))
-    assert deflection_warnings(setup, pixels) == ()
-    assert "small angles" in deflection_warnings(setup, 1.1 * pixels)[0].text
+    assert deflection_cautions(setup, pixels) == ()
+    assert "small angles" in deflection_cautions(setup, 1.1 * pixels)[0].text
 
 
-def test_deflection_warnings_doubt_fields_of_kilotesla_metres():
+def test_deflection_cautions_doubt_fields_of_kilotesla_metres():
     setup = ProtonSetup(
         energy=9e4, source_object_distance=0.01, object_image_distance=0.28, pixel_size=5e-6
     )
     pixels = setup.displacement(np.array([[[0.2]], [[0.0]]]))
-    assert "T m, far more" in deflection_warnings(setup, pixels)[0].text
+    assert "T m, far more" in deflection_cautions(setup, pixels)[0].text

@@ -21,7 +21,7 @@ from napari_shadowinv.film.scans import upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read, read_toml, write
 from napari_shadowinv.pipeline import read_pack, run_film, write_layers
-from napari_shadowinv.pipeline._film import _pixel_warnings
+from napari_shadowinv.pipeline._film import _pixel_cautions
 from napari_shadowinv.pipeline.shot_table import table_rows
 from simulated_pack import Truth, simulate
 
@@ -237,9 +237,9 @@ def test_a_lost_film_is_bridged(truth: Truth, doses, changed) -> None:
 def test_resolution_unlike_a_scanner_is_doubted(changed, numbers, is_doubtful) -> None:
     pack = read_pack(changed())
     for per_inch in numbers:
-        cautions = _pixel_warnings(pack, 25.4e-3 / per_inch)
+        cautions = _pixel_cautions(pack, 25.4e-3 / per_inch)
         assert [caution.code for caution in cautions] == ["film-pixels"] * is_doubtful
-    assert not _pixel_warnings(pack.model_copy(update={"pixel_size": 1e-4}), 1e-4)
+    assert not _pixel_cautions(pack.model_copy(update={"pixel_size": 1e-4}), 1e-4)
 
 
 def test_scans_saved_again_by_a_picture_program_are_doubted(truth: Truth, changed) -> None:

@@ -16,8 +16,8 @@ from napari_shadowinv.preprocessing import (
     Dark,
     Recipe,
     ReferencePair,
+    image_cautions,
     image_checks,
-    image_warnings,
     measure_shift,
 )
 from napari_shadowinv.preprocessing.image_checks import (
@@ -156,8 +156,8 @@ def test_light_up_to_the_limit_of_a_detector_is_no_gap(shot) -> None:
 
 
 def named(image, source, mask=None) -> list[str]:
-    """The names of the warnings."""
-    return [caution.code for caution in image_warnings(image, source, mask)]
+    """The names of the cautions."""
+    return [caution.code for caution in image_cautions(image, source, mask)]
 
 
 def offset_share(*planes: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -176,11 +176,11 @@ def test_a_source_that_shots_share_is_checked_once(shot, faint, monkeypatch):
     monkeypatch.setattr(image_checks, "stray_pixels", note)
     source = shot[1].copy()
     source[40, 50] *= 30
-    alone = [image_warnings(image, source) for image in (shot[0], faint[0])]
+    alone = [image_cautions(image, source) for image in (shot[0], faint[0])]
     assert all("hot-pixels" in [caution.code for caution in cautions] for cautions in alone)
     checked.clear()
     shared = CheckedImage.of(source)
-    assert [image_warnings(image, shared) for image in (shot[0], faint[0])] == alone
+    assert [image_cautions(image, shared) for image in (shot[0], faint[0])] == alone
     assert len(checked) == 3
     plan = plan_sites(source)
     checked.clear()
@@ -198,7 +198,7 @@ def test_a_result_that_is_changed_does_not_change_later_checks(faint):
     assert invert(image, plan=plan).report.cautions == first.report.cautions
 
 
-def test_image_warnings_are_silent_on_a_right_shot(shot):
+def test_image_cautions_are_silent_on_a_right_shot(shot):
     image, source = shot
     assert named(image, source) == []
     assert named(image, None) == []

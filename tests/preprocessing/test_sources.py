@@ -17,8 +17,8 @@ from napari_shadowinv.preprocessing import (
     remove_background,
     remove_hot_pixels,
     total_variation_source,
+    uniform_cautions,
     uniform_source,
-    uniform_warnings,
 )
 from napari_shadowinv.preprocessing.estimates import point_distance
 
@@ -392,15 +392,15 @@ def test_an_isotropic_source_needs_a_point_and_a_finite_centre(shot):
 def test_a_wide_image_of_a_point_source_is_warned_of():
     """The fluence in the corner, r from the middle, falls by 1.5 (r / distance)² if little."""
     for side, warned in ((22, False), (26, True)):  # by 0.8 and 1.2 %
-        cautions = uniform_warnings((side, side), NEAR)
+        cautions = uniform_cautions((side, side), NEAR)
         assert bool(cautions) == warned
     assert "'isotropic'" in cautions[0].text
     # A part of an image, far from the axis.
-    assert uniform_warnings((20, 20), NEAR, centre=(100.0, 9.5))
-    assert not uniform_warnings((20, 20), NEAR, centre=(9.5, 9.5))
-    assert uniform_warnings((500, 500), None) == ()
+    assert uniform_cautions((20, 20), NEAR, centre=(100.0, 9.5))
+    assert not uniform_cautions((20, 20), NEAR, centre=(9.5, 9.5))
+    assert uniform_cautions((500, 500), None) == ()
     collimated = NEAR.model_copy(update={"source_object_distance": np.inf})
-    assert uniform_warnings((500, 500), collimated) == ()
+    assert uniform_cautions((500, 500), collimated) == ()
 
 
 @pytest.fixture(scope="module")

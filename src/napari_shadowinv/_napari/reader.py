@@ -106,7 +106,7 @@ def _read_content(path: Path, array: str) -> list[Any]:
 
     content = read(path)
     if isinstance(content, Shot):
-        for caution in content.warnings:
+        for caution in content.cautions:
             show_caution(f"{path.name}: {caution.text}")
         return layers_of_shot(content, array)
     if content.attrs.get("format") == FRAMES_FORMAT:

@@ -91,7 +91,7 @@ def _facts(shot: Shot, origin: str) -> dict[str, Any]:
     return {
         "setup_origin": None if shot.setup is None else f"{about.CAME_WITH} {origin}",
         "file": dict(shot.metadata) or None,
-        "warnings": list(shot.warnings) or None,
+        "cautions": list(shot.cautions) or None,
         "path": None if shot.path is None else str(shot.path),
     }
 
@@ -106,7 +106,7 @@ def shot_of_layer(layer: Any, image: Any, plane: int | None = None) -> Shot:
     """Return a layer's image or a plane of a stack, perhaps lazy, as a radiograph with its file."""
     metadata = metadata_of(layer)
     path = metadata.get("path") or layer.source.path
-    shot = Shot(image, warnings=tuple(metadata.get("warnings", ())))
+    shot = Shot(image, cautions=tuple(metadata.get("cautions", ())))
     if metadata.get("result") is not None:
         return shot  # processed images differ from their file
     paths = metadata.get("paths", ())
@@ -155,7 +155,7 @@ def stack_layers(paths: Sequence[Path], name: str = "") -> LayerData:
     """Describe a run of shots as a lazy stack; only the first readable shot is read now."""
     # Unreadable shots, or shots of another shape, are zero and give a warning when shown.
     first, index = _first_readable(paths)
-    for caution in first.warnings:
+    for caution in first.cautions:
         show_caution(f"{paths[index].name}: {caution.text}")
     height, width = first.image.shape
     plane_of = partial(_plane_of, shape=(height, width))

@@ -15,7 +15,7 @@ from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import _summary
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.physics.beam import setup_warnings
+from napari_shadowinv.physics.beam import setup_cautions
 from napari_shadowinv.physics.setup import beam_quantities
 from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.results import unpack_result
@@ -78,15 +78,15 @@ def _frame_rows(frames: Shot | xarray.Dataset, array: str | None) -> _summary.Ro
 
 
 def _picture_rows(path: Path, form: Format) -> _summary.Rows:
-    from napari_shadowinv.io.images import film_warnings
+    from napari_shadowinv.io.images import film_cautions
 
     array, metadata = form.read(path)
-    warnings = film_warnings(array, None) if array.ndim == 2 else ()
+    cautions = film_cautions(array, None) if array.ndim == 2 else ()
     rows = [("kind", f"{form.name.upper()} picture, {metadata['bits']} bits per sample")]
     if array.ndim == 3:
         advice = "convert a film scan to dose, or choose one with --channel"
         rows.append(("channels", f"{array.shape[-1]}: {advice}"))
-    return [*rows, *_array_rows(array), *_metadata_rows(metadata, warnings)]
+    return [*rows, *_array_rows(array), *_metadata_rows(metadata, cautions)]
 
 
 def _shot_rows(shot: Shot) -> _summary.Rows:
@@ -98,20 +98,20 @@ def _shot_rows(shot: Shot) -> _summary.Rows:
         "hdf5": f"array {shot.metadata.get('variable')!r} of an HDF5 file",
         "mat": f"array {shot.metadata.get('variable')!r} of a MATLAB file",
     }
-    kind, warnings = str(shot.metadata["kind"]), shot.warnings
+    kind, cautions = str(shot.metadata["kind"]), shot.cautions
     rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image, shot.metadata["dtype"])]
     if shot.source is not None:
         rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
         rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels excluded"))
     if shot.setup is not None:
-        warnings = (*warnings, *setup_warnings(shot.setup, shot.shape))
+        cautions = (*cautions, *setup_cautions(shot.setup, shot.shape))
     rows.append(("setup", _summary.setup_text(shot.setup, shot, shot.shape)))
-    return [*rows, *_metadata_rows(shot.metadata, warnings)]
+    return [*rows, *_metadata_rows(shot.metadata, cautions)]
 
 
-def _metadata_rows(metadata: Mapping[str, Any], warnings: Iterable[Caution]) -> _summary.Rows:
-    """Return the geometry in the metadata of an image, its notes, and the warnings."""
+def _metadata_rows(metadata: Mapping[str, Any], cautions: Iterable[Caution]) -> _summary.Rows:
+    """Return the geometry in the metadata of an image, its notes, and the cautions."""
     quantities = beam_quantities()
     numbers = metadata.get("geometry", {}).items()
     return [
@@ -124,7 +124,7 @@ def _metadata_rows(metadata: Mapping[str, Any], warnings: Iterable[Caution]) -> 
         *(("note", text) for text in metadata.get("notes", ())),
         *(
             ("warning", each.text)
-            for each in dict.fromkeys((*warnings, *metadata.get("warnings", ())))
+            for each in dict.fromkeys((*cautions, *metadata.get("cautions", ())))
         ),
     ]
 

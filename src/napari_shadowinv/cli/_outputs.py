@@ -27,7 +27,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import ResultKind, Verdict, to_figures
 from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES, PNG, PRADFORMAT, RESULT, suffixes_for
-from napari_shadowinv.physics.beam import setup_warnings
+from napari_shadowinv.physics.beam import setup_cautions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -111,7 +111,7 @@ class Outputs:
             caution.text
             for setup, shape in experiments
             if setup is not None
-            for caution in setup_warnings(setup, shape)
+            for caution in setup_cautions(setup, shape)
         )
         for text in texts:
             say_on_stderr(text, "yellow")

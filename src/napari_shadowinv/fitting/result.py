@@ -331,7 +331,7 @@ class Fit(Summarised):
         of_images = tuple(
             caution.about(each.file or f"image {number}")
             for number, each in enumerate(self._origins, 1)
-            for caution in each.warnings
+            for caution in each.cautions
         )
         linearity = self.report.linearity
         if linearity is None or self.report.sampling == "resolve":

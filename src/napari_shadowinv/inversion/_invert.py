@@ -45,7 +45,7 @@ from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOpt
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.alignment import RegisteredSource, register_source
-from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_warnings
+from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_cautions
 from napari_shadowinv.transport.sites import RATIO, Levels, Margin, SitePlan, edge_flux, plan_levels
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
@@ -378,7 +378,7 @@ def _check_image(
     noise()  # before the checks, because the solver waits for it
     recorded = prepared.image * prepared.flux_scale
     beam = _checked_source(plan) if plan.measured else None
-    return image_warnings(recorded, beam, prepared.mask)
+    return image_cautions(recorded, beam, prepared.mask)
 
 
 def _levels_to_solve(
@@ -508,7 +508,7 @@ def _ranked(
         if solution.finest and is_chosen and not cautions:
             why = "with the most sites placed unless more are given"
             by_accuracy = [errors.accuracy_caution(options.accuracy, why)]
-    of_image = (*cautions, *prepared.warnings, *by_accuracy, *problem.checks())
+    of_image = (*cautions, *prepared.cautions, *by_accuracy, *problem.checks())
     registered = inputs.registered.caution
     return tuple(filter(None, (*by_errors, registered, *inputs.unlit, *of_image)))
 

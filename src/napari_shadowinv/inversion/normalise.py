@@ -50,7 +50,7 @@ class Prepared:
     clipped_pixels: int
     floored_pixels: int  # the clipped ones included
     flux_scale: float  # divisor of the image
-    warnings: tuple[Caution, ...]
+    cautions: tuple[Caution, ...]
 
     def in_units(self) -> Prepared:
         """Return the same with image and source also in units of `unit`."""
@@ -117,7 +117,7 @@ def prepare(
         clipped_pixels=negative,
         floored_pixels=below,
         flux_scale=flux_scale,
-        warnings=_warnings(
+        cautions=_cautions(
             ratio if conserved else 1.0, negative, max(below - shadows, 0), usable, options
         ),
     )
@@ -228,7 +228,7 @@ def masked_source(
     return np.where(mask, source, options.floor * source[mask].mean())
 
 
-def _warnings(
+def _cautions(
     ratio: float, clipped: int, floored: int, usable: BoolArray, options: InversionOptions
 ) -> tuple[Caution, ...]:
     cautions = []

@@ -73,7 +73,7 @@ def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[
     `variable` is the ranges and the bin: ``"diameter=4:12 contrast=:40 bin=300"``.
     """
     chosen = {} if variable is None else _parse_ranges(variable)
-    tracks, warnings = _read_scan(path)
+    tracks, cautions = _read_scan(path)
     bin_ = chosen.pop("bin", None)
     counts, _, bin_ = tracks.select(**chosen).image(bin_)
     if not chosen:
@@ -82,13 +82,13 @@ def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[
             "eccentricity, and not all need be of the beam: choose ranges as its variable, such "
             "as 'diameter=4:12 contrast=:40'"
         )
-        warnings = (*warnings, Caution("tracks", text))
+        cautions = (*cautions, Caution("tracks", text))
     metadata: dict[str, Any] = {
         "bits": 32,
         "geometry": {"detector_pixel_size": bin_ * 1e-6},
         "tracks": int(counts.sum()),
         "notes": (f"{counts.sum()} of {len(tracks)} tracks counted in bins of {bin_:.5g} µm",),
-        "warnings": warnings,
+        "cautions": cautions,
     }
     return counts, metadata if variable is None else {**metadata, "variable": variable}
 
@@ -136,7 +136,7 @@ def _read_scan(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:
     diameter = fields["d"] * np.float32(0.01 * pixel)
     width, height = x_right - x_left, y_top - y_bottom
     tracks = Tracks(y, x, diameter, fields["c"], fields["e"], (height, width))
-    return tracks, _pitch_warnings(shape, np.array([width, height]), frame_size)
+    return tracks, _pitch_cautions(shape, np.array([width, height]), frame_size)
 
 
 def _read_header(
@@ -179,7 +179,7 @@ def _read_frames(path: Path, data: bytes, shape: tuple[int, int]) -> AnyArray:
     return frames
 
 
-def _pitch_warnings(
+def _pitch_cautions(
     shape: tuple[int, int], extent: FloatArray, frame_size: FloatArray, tolerance: float = 0.02
 ) -> tuple[Caution, ...]:
     """Warn of frames with gaps between them, or that overlap, by a share of the scanned area."""

@@ -2,8 +2,8 @@
 
 - PNG, BMP and JPEG: `read_picture`
 - what every format of pictures has in common: `check_picture`, `without_pixels`, `geometry_of`,
-  `square_warnings`, `gamma_warning`
-- colour images: reduction to one plane (`to_grey`), signs of a film scan (`film_warnings`)
+  `square_cautions`, `gamma_caution`
+- colour images: reduction to one plane (`to_grey`), signs of a film scan (`film_cautions`)
 - scans of film in colour: `read_scan`
 """
 
@@ -55,7 +55,7 @@ def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> Fl
     return np.ascontiguousarray(array[..., index], dtype=np.float64)
 
 
-def film_warnings(array: AnyArray, channel: str | int | None) -> tuple[Caution, ...]:
+def film_cautions(array: AnyArray, channel: str | int | None) -> tuple[Caution, ...]:
     """Warn of a picture in colour, or with a bright rim: it may be a film, dark with dose."""
     from napari_shadowinv.preprocessing.image_checks import is_lit_around
 
@@ -145,7 +145,7 @@ def geometry_of(
     `is_length` says whether the file means a length and no resolution of printing. `is_drawn` is
     true of this package's own images, whose pixels are those at the object.
     """
-    if not sides or square_warnings(sides):
+    if not sides or square_cautions(sides):
         return {}
     metres = sides[0]
     name = "pixel_size" if is_drawn else "detector_pixel_size"
@@ -153,7 +153,7 @@ def geometry_of(
     return {"stated_pixel_size": metres, **({"geometry": {name: metres}} if is_measured else {})}
 
 
-def square_warnings(sides: tuple[float, ...]) -> tuple[Caution, ...]:
+def square_cautions(sides: tuple[float, ...]) -> tuple[Caution, ...]:
     """Warn of pixels whose width and height (m) differ by their file."""
     if not sides or max(sides) <= 1.01 * min(sides):
         return ()
@@ -165,7 +165,7 @@ def square_warnings(sides: tuple[float, ...]) -> tuple[Caution, ...]:
     return (Caution("file", text),)
 
 
-def gamma_warning(kind: str) -> Caution:
+def gamma_caution(kind: str) -> Caution:
     """Return the caution for pixels that are a power of the light."""
     text = (
         f"the image is {kind}, whose values are not proportional to the light (gamma of about "
@@ -215,7 +215,7 @@ def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
             **gaps,
             "notes": ((TURNED_NOTE,) * is_turned) + gaps.get("notes", ()),
             "bits": 8 * max(1, array.dtype.itemsize),
-            "warnings": _light_warnings(picture.format, picture.info) + square_warnings(sides),
+            "cautions": _light_cautions(picture.format, picture.info) + square_cautions(sides),
             **geometry_of(sides, is_length=False),
         }
     check_picture(path, "picture's", array)
@@ -235,7 +235,7 @@ def _pixels_and_gaps(picture: Any) -> tuple[AnyArray, BoolArray | None]:
     return array, None if colour is None else array == colour
 
 
-def _light_warnings(
+def _light_cautions(
     form: str | None, info: dict[Any, Any], gamma_tolerance: float = 0.01
 ) -> tuple[Caution, ...]:
     """Warn of pixels that are no linear measure of the light by their format."""
@@ -248,7 +248,7 @@ def _light_warnings(
         kind = f"a {form} with a colour profile"
     else:
         return ()
-    return (gamma_warning(kind),)
+    return (gamma_caution(kind),)
 
 
 def _printed_sides(info: dict[Any, Any]) -> tuple[float, ...]:

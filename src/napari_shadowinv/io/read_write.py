@@ -36,7 +36,7 @@ from napari_shadowinv.io.hdf5 import (
     check_hdf5_seal,
     hdf5_in_memory,
 )
-from napari_shadowinv.io.images import film_warnings, to_grey
+from napari_shadowinv.io.images import film_cautions, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.physics.units import refuse_missing
 from napari_shadowinv.shot import Shot
@@ -152,7 +152,7 @@ def _read_file(
     if source is not None:
         source = np.ascontiguousarray(source, dtype=np.float64)
     setup = _complete_setup(path, metadata.get("geometry", {}))
-    doubts = film_warnings(array, channel) if file_format.is_scan else ()
+    doubts = film_cautions(array, channel) if file_format.is_scan else ()
     return Shot(
         image=image,
         metadata=facts,
@@ -161,7 +161,7 @@ def _read_file(
         setup=setup,
         in_file={"source": source, "setup": setup},
         path=path,
-        warnings=(*doubts, *facts.pop("warnings", ())),
+        cautions=(*doubts, *facts.pop("cautions", ())),
     )
 
 

@@ -33,11 +33,11 @@ from napari_shadowinv.io.images import (
     INCH_M,
     TURNED_NOTE,
     check_picture,
-    gamma_warning,
+    gamma_caution,
     gaps_in,
     geometry_of,
     is_linear_profile,
-    square_warnings,
+    square_cautions,
     without_pixels,
 )
 
@@ -178,7 +178,7 @@ def read_tiff(path: Path, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
             **gaps,
             "bits": int(np.max(page.bitspersample)),
             "notes": (*notes, *turned, *gaps.get("notes", ())),
-            "warnings": _warnings(page, layout) + square_warnings(sides),
+            "cautions": _cautions(page, layout) + square_cautions(sides),
             **geometry_of(sides, is_length, is_drawn=page.software.startswith("shadowinv")),
         }
     return array, metadata
@@ -305,15 +305,15 @@ def _turn_upright(array: AnyArray, orientation: Any) -> tuple[AnyArray, tuple[st
     return turned[:: -1 if down else 1, :: -1 if right else 1], (TURNED_NOTE,)
 
 
-def _warnings(page: Any, layout: _Layout) -> tuple[Caution, ...]:
+def _cautions(page: Any, layout: _Layout) -> tuple[Caution, ...]:
     profile = page.tags.valueof(34675)
     cautions = []
     if profile is not None and not is_linear_profile(bytes(profile)):
-        cautions.append(gamma_warning("a TIFF with a colour profile"))
+        cautions.append(gamma_caution("a TIFF with a colour profile"))
     elif page.photometric == PHOTOMETRIC.YCBCR or (
         page.compression in _JPEG and page.dtype == np.uint8
     ):
-        cautions.append(gamma_warning("a JPEG in a TIFF"))
+        cautions.append(gamma_caution("a JPEG in a TIFF"))
     if layout.left_out:
         text = (
             f"pictures of {', '.join(layout.left_out)} pixels in the same file were taken for "

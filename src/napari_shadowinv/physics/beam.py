@@ -1,7 +1,7 @@
 """Beams that probe an object: the base class of all setups, and checks of their numbers.
 
 - how a kind of setup is described: `BeamSetup`, `SIField`, `MainField`, `Deflector`, `BeamQuantity`
-- whether its numbers are plausible: `setup_warnings`, `deflection_warnings`; for people to
+- whether its numbers are plausible: `setup_cautions`, `deflection_cautions`; for people to
   check: `geometry_text`, `field_of_view_text`
 - the gradient of a potential in pixels: `displacement_from_potential`
 - numbers with units in text, such as ``"14.7 MeV"``: `number_in_unit`, `text_in_unit`
@@ -475,7 +475,7 @@ def field_of_view_text(setup: BeamSetup, shape: tuple[int, int]) -> str:
     return f"{sides} {unit}"
 
 
-def setup_warnings(
+def setup_cautions(
     setup: BeamSetup,
     shape: tuple[int, int] | None = None,
     metadata: Mapping[str, Any] = MappingProxyType({}),
@@ -503,7 +503,7 @@ def setup_warnings(
     --------
     >>> from napari_shadowinv.physics.setup import ProtonSetup
     >>> lengths = {"source_object_distance": 0.28, "object_image_distance": 0.01}
-    >>> (caution,) = setup_warnings(ProtonSetup(energy=14.7, pixel_size=1e-6, **lengths))
+    >>> (caution,) = setup_cautions(ProtonSetup(energy=14.7, pixel_size=1e-6, **lengths))
     >>> caution.text[:34]
     'setup: the magnification is 1.04: '
     """
@@ -512,7 +512,7 @@ def setup_warnings(
     return tuple(Caution("setup", f"setup: {doubt}") for doubt in doubts)
 
 
-def deflection_warnings(
+def deflection_cautions(
     setup: BeamSetup, displacement: FloatArray, *, usual: UsualGeometry = UsualGeometry()
 ) -> tuple[Caution, ...]:
     """Warn of a displacement, (2, H, W) in px, that is larger than such an experiment can make."""

@@ -390,7 +390,7 @@ def run_film(
         energies=spectra.energies,
         bands=np.array([(band.peak, band.low, band.high) for band in response.bands]),
         provenance=Provenance(kind="film pack", pack=pack, images=origins),
-        cautions=(*_warnings(aligned, doses, poses, pack), *_pixel_warnings(pack, pixel)),
+        cautions=(*_cautions(aligned, doses, poses, pack), *_pixel_cautions(pack, pixel)),
         pixel_size=pixel,
         setups=pack.setups(spectra.energies, pixel),
     )
@@ -426,7 +426,7 @@ def _pixel_size(pack: Pack, scans: list[Scan]) -> float | None:
     return sizes[0]
 
 
-def _pixel_warnings(pack: Pack, pixel: float | None) -> tuple[Caution, ...]:
+def _pixel_cautions(pack: Pack, pixel: float | None) -> tuple[Caution, ...]:
     if pixel is None or pack.pixel_size is not None:
         return ()
     per_inch = INCH_M / pixel
@@ -508,7 +508,7 @@ def _align_films(films: list[Film], doses: list[_Doses], pack: Pack, report: Rep
     return Poses.by_edges(len(films))
 
 
-def _warnings(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[Caution]:
+def _cautions(films: list[Film], doses: list[_Doses], poses: Poses, pack: Pack) -> list[Caution]:
     cautions = [
         Caution(
             "film-range",

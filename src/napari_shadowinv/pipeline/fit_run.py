@@ -36,7 +36,7 @@ from napari_shadowinv.inversion.normalise import mask_unlit
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.io.files import name_of, sha256, text_of
 from napari_shadowinv.options import BeamPrior, FitChoices, FitOptions, Instrument
-from napari_shadowinv.physics.beam import setup_warnings
+from napari_shadowinv.physics.beam import setup_cautions
 from napari_shadowinv.physics.projection import default_deflector
 from napari_shadowinv.physics.setup import Setup, beam_quantities, deflector_titles, setup_from_dict
 from napari_shadowinv.pipeline.files import setup_from
@@ -44,7 +44,7 @@ from napari_shadowinv.pipeline.inversion_run import AnyShot, Inputs, collect_inp
 from napari_shadowinv.pipeline.shot_table import ShotRow, fiducials_from
 from napari_shadowinv.preprocessing import FIT_STEPS, Recipe, UniformEstimate, estimate_source
 from napari_shadowinv.preprocessing.alignment import measure_shift
-from napari_shadowinv.preprocessing.image_checks import image_warnings
+from napari_shadowinv.preprocessing.image_checks import image_cautions
 from napari_shadowinv.provenance import Origin, Provenance, index_masks
 from napari_shadowinv.shot import Shot
 
@@ -375,18 +375,18 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
         source = shot.source
         mask, doubts = mask_unlit(shot.image, source, shot.mask)
         shot = replace(shot, mask=mask)
-        doubts += image_warnings(shot.image, source, shot.mask)
+        doubts += image_cautions(shot.image, source, shot.mask)
         if source is not None:
             shift = measure_shift(shot.image, source, shot.mask)
             if shift.is_significant.any():
                 text = f"register: the source must be moved by {shift.text}: align it before a fit"
                 doubts.append(Caution("register", text))
         if shot.setup is not None:
-            doubts += setup_warnings(shot.setup, shot.shape, shot.metadata)
+            doubts += setup_cautions(shot.setup, shot.shape, shot.metadata)
         estimate = inputs.estimate_for(shot)
         if estimate is not None and not isinstance(estimate, UniformEstimate):
             source = estimate_source(estimate, shot, should_stop, doubts.append)
-        return replace(shot, source=source, warnings=(*shot.warnings, *doubts))
+        return replace(shot, source=source, cautions=(*shot.cautions, *doubts))
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
 
@@ -428,7 +428,7 @@ def _image_origins(
         before = inputs.provenance
         entries: dict[str, Any] = {name: getattr(row, name) for name in (*NUMBERS, "measured")}
         entries["setup"] = inputs.shot.setup
-        entries |= {"notes": shot.notes, "warnings": shot.warnings}
+        entries |= {"notes": shot.notes, "cautions": shot.cautions}
         origins.append(before.image.model_copy(update=entries))
         masks.append(list(map(before.mask_of, (before.image.mask, before.image.source_mask))))
     return index_masks(origins, masks)

@@ -39,7 +39,7 @@ from napari_shadowinv.inversion.normalise import check_source, mask_unlit, prepa
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.io.files import join_address, sha256, split_address, text_of
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.beam import deflection_warnings, setup_warnings
+from napari_shadowinv.physics.beam import deflection_cautions, setup_cautions
 from napari_shadowinv.pipeline.remaining_beam import after_steps
 from napari_shadowinv.preprocessing import (
     Estimate,
@@ -47,7 +47,7 @@ from napari_shadowinv.preprocessing import (
     Recipe,
     UniformEstimate,
     estimate_source,
-    uniform_warnings,
+    uniform_cautions,
     with_prior_of,
 )
 from napari_shadowinv.preprocessing.estimates import IsotropicEstimate, centre_within
@@ -256,8 +256,8 @@ def run(
         of_fits = ("strength", "psf", "noise", "fiducials", "start")
         if unused := [name for name in of_fits if getattr(inputs.shot, name) is not None]:
             text = f"the shot has {', '.join(unused)}, which only fits use: fit the image to use it"
-            warnings = (*inputs.shot.warnings, Caution("file", text))
-            inputs = replace(inputs, shot=replace(inputs.shot, warnings=warnings))
+            cautions = (*inputs.shot.cautions, Caution("file", text))
+            inputs = replace(inputs, shot=replace(inputs.shot, cautions=cautions))
         return run_prepared(
             inputs,
             inputs.recipe.prepare(inputs.shot, should_stop),
@@ -346,9 +346,9 @@ def run_prepared(
     report_in_all = replace(inversion.report, seconds=seconds)
     inversion = replace(inversion, report=report_in_all, setup=shot.setup, provenance=provenance)
     if shot.setup is not None:
-        doubts += setup_warnings(shot.setup, shot.shape, shot.metadata)
-        doubts += deflection_warnings(shot.setup, inversion.displacement)
-    return inversion.with_cautions(dict.fromkeys((*doubts, *shot.warnings)))
+        doubts += setup_cautions(shot.setup, shot.shape, shot.metadata)
+        doubts += deflection_cautions(shot.setup, inversion.displacement)
+    return inversion.with_cautions(dict.fromkeys((*doubts, *shot.cautions)))
 
 
 def _source(
@@ -363,7 +363,7 @@ def _source(
     if isinstance(inputs.recipe.estimate, UniformEstimate):
         recorded = inputs.shot.shape
         centre = centre_within(recorded, inputs.recipe.matrix(recorded))
-        doubts.extend(uniform_warnings(shot.shape, shot.setup, centre=centre))
+        doubts.extend(uniform_cautions(shot.shape, shot.setup, centre=centre))
     if shot.source is not None:
         usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
         return check_source(shot.source, usable)
@@ -429,7 +429,7 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
         brightness=None,
         source=None if beam is None else beam.image,
         setup=resolved.setup,
-        warnings=(*loaded.warnings, *(() if beam is None else beam.warnings)),
+        cautions=(*loaded.cautions, *(() if beam is None else beam.cautions)),
         mask=None if usable is None else usable.pixels,
         source_mask=None if bare is None else bare.pixels,
         dark=None if dark is None else dark.image,

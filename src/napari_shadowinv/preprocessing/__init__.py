@@ -1,7 +1,7 @@
 """Preparation of a shot for its inversion, and the recipe of it.
 
 - the shot: `Shot`; the recipe: `Recipe`
-- whether image and source look right: `image_warnings`, `ReferencePair`; a source in register with
+- whether image and source look right: `image_cautions`, `ReferencePair`; a source in register with
   its image: `register_source`
 - steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
   `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`

@@ -14,8 +14,8 @@ from .estimates import (
     low_pass_source,
     polynomial_source,
     total_variation_source,
+    uniform_cautions,
     uniform_source,
-    uniform_warnings,
 )
 from .filters import (
     BackgroundFilter,
@@ -30,7 +30,7 @@ from .filters import (
     remove_background,
     remove_hot_pixels,
 )
-from .image_checks import ReferencePair, image_warnings
+from .image_checks import ReferencePair, image_cautions
 from .kriging import kriged_source
 from .pixels import fit_polynomial, interpolated_source
 from .recipe import (
@@ -82,7 +82,7 @@ __all__ = [
     "fit_polynomial",
     "gaussian_source",
     "high_pass",
-    "image_warnings",
+    "image_cautions",
     "interpolated_source",
     "isotropic_source",
     "kriged_source",
@@ -95,7 +95,7 @@ __all__ = [
     "remove_background",
     "remove_hot_pixels",
     "total_variation_source",
+    "uniform_cautions",
     "uniform_source",
-    "uniform_warnings",
     "with_prior_of",
 ]

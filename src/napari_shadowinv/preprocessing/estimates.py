@@ -3,7 +3,7 @@
 An inversion needs the source: the image that the beam would make without the object. Where
 none was recorded, or the beam changes from shot to shot, it must be estimated from the shot.
 
-- the beam is flat, or nothing is known: `uniform_source`; whether it can be: `uniform_warnings`
+- the beam is flat, or nothing is known: `uniform_source`; whether it can be: `uniform_cautions`
 - a point shines evenly in all directions: `isotropic_source`; how far away: `point_distance`
 - the beam is a Gaussian spot: `gaussian_source`
 - the beam varies slowly, in no known way: `polynomial_source`, `low_pass_source`
@@ -496,7 +496,7 @@ def centre_within(
     return recorded[0], recorded[1]
 
 
-def uniform_warnings(
+def uniform_cautions(
     shape: tuple[int, int],
     setup: Setup | None,
     *,

@@ -1,6 +1,6 @@
 """Checks of an image and its reference for violated assumptions of an inversion.
 
-- all of them, as cautions: `image_warnings`
+- all of them, as cautions: `image_cautions`
 - of one image: `CheckedImage`, `stray_pixels`
 - of an image and its reference: `dark_level`, `ReferencePair`
 - pixels that carry no light, and are masked: `mask_gaps`, `mask_dark`
@@ -355,7 +355,7 @@ def _is_dark_region(
     return check.sharply_lit[0] < at_edge < check.sharply_lit[1] and bool(is_rim)
 
 
-def image_warnings(
+def image_cautions(
     image: FloatArray,
     source: FloatArray | CheckedImage | None = None,
     mask: BoolArray | None = None,
@@ -381,10 +381,10 @@ def image_warnings(
         source = CheckedImage.of(source, mask)
     if source is not None and source.is_uniform:
         source = None  # an assumed beam
-    return tuple(_warnings(CheckedImage.of(image, mask), source))
+    return tuple(_cautions(CheckedImage.of(image, mask), source))
 
 
-def _warnings(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caution]:
+def _cautions(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caution]:
     planes = {"image": image} if source is None else {"image": image, "source": source}
     if dark := dark_level(list(planes.values())):
         yield Caution(

@@ -205,7 +205,7 @@ class Recipe(CheckedModel):
         for plane, name in ((shot.image, "image"), (shot.source, "source")):
             if plane is not None:
                 mask, doubts = mask_gaps(plane, shot.mask, name)
-                shot = replace(shot, mask=mask, warnings=(*shot.warnings, *doubts))
+                shot = replace(shot, mask=mask, cautions=(*shot.cautions, *doubts))
         for step in self.steps:
             shot = step.apply(shot, should_stop)
         return shot

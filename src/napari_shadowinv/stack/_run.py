@@ -78,7 +78,7 @@ class RunStatus:
     total, done, failed : int
         Numbers of shots, including earlier runs.
     doubtful : int
-        Shots that are done, with warnings.
+        Shots that are done, with cautions.
     skipped : int
         Files of a watched folder that came while newer ones were inverted, and are in no store.
     waiting : int
@@ -375,7 +375,7 @@ class StoreRun:
                 for outcome in outcomes:
                     self._ended += 1
                     self._seconds = time.monotonic() - began
-                    self._note(outcome.index, outcome.status, outcome.reason, outcome.warnings)
+                    self._note(outcome.index, outcome.status, outcome.reason, outcome.cautions)
                     on_end(outcome, None if results is None else results.pop(outcome.index))
 
 

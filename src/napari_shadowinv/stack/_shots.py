@@ -65,7 +65,7 @@ class Exposure:
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         """Return the images with all that is known of each, and metadata for the shot's report.
 
-        Of a single image these are ``sha256``, and ``warnings`` if there are any.
+        Of a single image these are ``sha256``, and ``cautions`` if there are any.
         """
         raise NotImplementedError
 
@@ -133,14 +133,14 @@ class FileExposure(Exposure):
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         parts = {"page": self.page, "variable": self.variable}
         options: dict[str, Any] = {name: part for name, part in parts.items() if part is not None}
-        warnings: list[Caution] = []
+        cautions: list[Caution] = []
         digest = sha256(self.path) if self.page is None else ""
-        if "warnings" in inspect.signature(self.reader).parameters:
-            options["warnings"] = warnings
+        if "cautions" in inspect.signature(self.reader).parameters:
+            options["cautions"] = cautions
         image, usable = unpack_array(self.reader(self.path, **options), "the shot")
         metadata = {
             "sha256": digest or checksum(image),
-            **({"warnings": warnings} if warnings else {}),
+            **({"cautions": cautions} if cautions else {}),
         }
         return (Shot(image, mask=usable),), metadata
 
@@ -169,11 +169,11 @@ class RowsExposure(Exposure):
         if self.recipe.fit is not None:
             return images, origin
         (image,) = images
-        warnings = file_doubts(image)
+        cautions = file_cautions(image)
         if unused := [name for name in _OF_FITS if getattr(image, name) is not None]:
             text = f"the row has {', '.join(unused)}, which only fits use: fit the image to use it"
-            warnings.append(Caution("file", text))
-        metadata = {**files["file 1"], **origin, "warnings": warnings}
+            cautions.append(Caution("file", text))
+        metadata = {**files["file 1"], **origin, "cautions": cautions}
         return (replace(image, setup=self.setup),), metadata
 
     def shape(self) -> tuple[int, ...]:
@@ -253,7 +253,7 @@ def read_pixels(
     page: int | None = None,
     channel: str | int | None = None,
     variable: str | None = None,
-    warnings: list[Caution] | None = None,
+    cautions: list[Caution] | None = None,
 ) -> ArrayLike:
     """Read the image of a shot; this is the default reader.
 
@@ -263,7 +263,7 @@ def read_pixels(
         As for `napari_shadowinv.io.read_shot`, whose errors this raises.
     page : int, optional
         Of a TIFF with many pages, or frame of the array `variable` in an HDF5 file, from 0.
-    warnings : list of Caution, optional
+    cautions : list of Caution, optional
         Receives the reasons to doubt the image.
 
     Returns
@@ -272,17 +272,17 @@ def read_pixels(
         Masked where the file says that pixels do not count.
     """
     shot = read_frame(FileFrame(path, str(path), page, variable), channel=channel)
-    if warnings is not None:
-        warnings.extend(file_doubts(shot))
+    if cautions is not None:
+        cautions.extend(file_cautions(shot))
     return shot.image if shot.mask is None else np.ma.MaskedArray(shot.image, ~shot.mask)
 
 
-def file_doubts(shot: Shot) -> list[Caution]:
+def file_cautions(shot: Shot) -> list[Caution]:
     """Return the reasons to doubt the image of a file in a stack."""
     if not shot.has_own_source:
-        return list(shot.warnings)
+        return list(shot.cautions)
     text = "the file contains its own source, which a stack ignores: pass one for the whole stack"
-    return [*shot.warnings, Caution("file", text)]
+    return [*shot.cautions, Caution("file", text)]
 
 
 def _plain_image(image: Any) -> AnyArray:

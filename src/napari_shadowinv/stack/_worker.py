@@ -188,7 +188,7 @@ class InvertTask(Task):
         if self.by_row:
             self._check_kind(image.setup)
         # Doubts about the file are in the report of the shot.
-        shot = self.completed(replace(image, warnings=()), source)
+        shot = self.completed(replace(image, cautions=()), source)
         setup = image.setup if self.by_row else self.requested.setup
         inputs = collect_inputs(self.of_shot(setup=setup), shot)
         if shot.source is common.source:
@@ -355,8 +355,8 @@ class ShotOutcome:
         Time that its worker spent on it, reading and writing included.
     reason, converged : str and bool
         Why it failed, and whether the solver reached its tolerance, or the fit its end.
-    warnings : int
-        Number of warnings about its result.
+    cautions : int
+        Number of cautions about its result.
     """
 
     index: int
@@ -364,7 +364,7 @@ class ShotOutcome:
     seconds: float
     reason: str = ""
     converged: bool = True
-    warnings: int = 0
+    cautions: int = 0
 
 
 @dataclass(frozen=True)
@@ -411,7 +411,7 @@ def run_shot(
         failure = failure_text(error)
         entries = {"reason": failure}
     cautions = () if result is None else result.cautions
-    warnings = list(map(dataclasses.asdict, (*cautions, *origin.get("warnings", ()))))
+    warnings = list(map(dataclasses.asdict, (*cautions, *origin.pop("cautions", ()))))
     seconds = time.perf_counter() - began
     report = {**entries, "seconds": seconds, **origin, "warnings": warnings}
     if context.results is not None:
@@ -422,7 +422,7 @@ def run_shot(
     context.writer.write(index, task.arrays(result), report)
     spent = time.perf_counter() - began
     return ShotOutcome(
-        index, DONE, spent, converged=result.report.converged, warnings=len(warnings)
+        index, DONE, spent, converged=result.report.converged, cautions=len(warnings)
     )
 
 

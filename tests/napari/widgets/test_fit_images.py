@@ -334,7 +334,7 @@ def test_what_other_widgets_change_is_followed(window: Any, tool: Any, qtbot: An
 
 def test_doubts_of_the_reader_are_told(window: Any, tool: Any) -> None:
     window.layers[1].metadata = metadata_for(
-        "shot", "", SETUPS[1], warnings=[Caution("film-scan", "it may be film")]
+        "shot", "", SETUPS[1], cautions=[Caution("film-scan", "it may be film")]
     )
     assert tool.request().origins["Warning"] == "'6.0 MeV': it may be film"
 

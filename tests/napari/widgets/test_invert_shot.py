@@ -202,7 +202,7 @@ def test_what_a_file_brings_is_used_and_told(window: Any, tool: Any, shot: Array
     mask[:, :5] = 1
     window.add_labels(mask, metadata=metadata_for("mask", "", path="a.txt"))
     metadata = metadata_for(
-        "shot", "", path="a.txt", warnings=[Caution("film-scan", "it may be film")]
+        "shot", "", path="a.txt", cautions=[Caution("film-scan", "it may be film")]
     )
     tool.masks.painted_is_unusable.setChecked(False)
     tool.image.layer = window.add_image(shot, name="other", metadata=metadata)

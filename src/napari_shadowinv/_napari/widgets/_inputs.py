@@ -36,7 +36,7 @@ from napari_shadowinv.options import (
     REFERENCE_BEAM,
     Instrument,
 )
-from napari_shadowinv.physics.beam import geometry_text, setup_warnings, text_in_unit, unit_in_title
+from napari_shadowinv.physics.beam import geometry_text, setup_cautions, text_in_unit, unit_in_title
 from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
 from napari_shadowinv.pipeline.files import complete_setup
 from napari_shadowinv.shot import Shot
@@ -281,7 +281,7 @@ class SetupPicker(QWidget):
         if self._layer is not None and not getattr(self._layer, "rgb", False):
             height, width = self._layer.data.shape[-2:]
             shape = height, width
-        cautions = () if setup is None else setup_warnings(setup, shape)
+        cautions = () if setup is None else setup_cautions(setup, shape)
         self.geometry_label.show_text("" if setup is None else geometry_text(setup, shape))
         self.warning_label.show_text("\n".join(caution.text for caution in cautions))
 
@@ -412,7 +412,7 @@ class SourcePicker(forms.ModelPicker):
             layer = self._selected_layer()
             data = layers.image_of(layer, "source image")
             beam = source_of_shot(layer, data, image)
-            return replace(beam, warnings=layers.warnings_of(layer))
+            return replace(beam, cautions=layers.cautions_of(layer))
         if not self.is_supplied:
             return None
         supplied = about.source_of(image)

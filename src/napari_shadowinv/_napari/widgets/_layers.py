@@ -23,7 +23,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.io.formats import SCAN_SUFFIXES
-from napari_shadowinv.io.images import film_warnings
+from napari_shadowinv.io.images import film_cautions
 from napari_shadowinv.preprocessing import Crop
 
 
@@ -89,15 +89,15 @@ def _grey(layer: Any | None, role: str) -> Any:
     return _data_of(layer)
 
 
-def warnings_of(layer: Any) -> tuple[Caution, ...]:
+def cautions_of(layer: Any) -> tuple[Caution, ...]:
     """Return the warnings of a grey image's reader, or that it looks like scanned film."""
     metadata = about.metadata_of(layer)
     path = str(layer.source.path or "").lower()
     may_be_scan = path.endswith(tuple(SCAN_SUFFIXES)) and isinstance(layer.data, np.ndarray)
     # Other metadata, such as a setup, may come from the user.
     if about.role_of(layer) or not may_be_scan:
-        return tuple(metadata.get("warnings", ()))
-    return film_warnings(layer.data, None)
+        return tuple(metadata.get("cautions", ()))
+    return film_cautions(layer.data, None)
 
 
 def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArray | None:

@@ -32,13 +32,13 @@ from napari_shadowinv.preprocessing import FIT_STEPS, MeasuredSource, Recipe, Un
 from napari_shadowinv.shot import Shot
 
 
-def _warnings_of(rows: list[ImageRow]) -> dict[str, str]:
+def _cautions_of(rows: list[ImageRow]) -> dict[str, str]:
     """Return the warnings of the images' readers as a row of the report."""
     unique = {id(row.layer): row.layer for row in rows}.values()
     texts = [
         f"'{layer.name}': {caution.text}"
         for layer in unique
-        for caution in layers.warnings_of(layer)
+        for caution in layers.cautions_of(layer)
     ]
     return {"Warning": "; ".join(texts)} if texts else {}
 
@@ -217,7 +217,7 @@ class FitImages(inputs.ImagePanel):
         steps = "; ".join(step.summary for step in recipe.steps)
         used_layers = (*(row.layer for row in rows), self.masks.layer)
         described = self.describe(first.layer, recipe, used_layers, steps=steps)
-        described["origins"] |= _warnings_of(rows)
+        described["origins"] |= _cautions_of(rows)
         return FitJob(
             shots=shots,
             name=f"{first.layer.name} fit",

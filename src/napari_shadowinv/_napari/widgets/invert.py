@@ -242,7 +242,7 @@ class Invert(ImagePanel):
             )
         shot = replace(
             shot_of_layer(layer, image),
-            warnings=layers.warnings_of(layer),
+            cautions=layers.cautions_of(layer),
             mask=mask,
             source_mask=hidden,
             source=source,
