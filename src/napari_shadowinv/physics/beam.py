@@ -320,10 +320,6 @@ class BeamSetup(CheckedModel):
         """Potential φ = Φ L / (p² M) in px², from Φ in m."""
         return scale_by(potential, 1 / (self.object_pixel_size * self._angle_per_pixel))
 
-    def displacement_from_potential(self, potential: ArrayLike) -> FloatArray:
-        """Displacement (px) of a potential in SI units (m); see the function of this name."""
-        return displacement_from_potential(self.normalized_potential(potential))
-
     def field_in_si(self, name: str, values: ArrayLike) -> FloatArray:
         """One of `si_fields`, of the displacement (px) or the normalised potential (px²)."""
         (method,) = (field.method or name for field in self.si_fields if field.name == name)
