@@ -27,11 +27,11 @@ from napari_shadowinv.physics.forward import checked_displacement, synthetic_ima
 from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.projection import default_deflector, displacement_ratio
-from napari_shadowinv.physics.setup import Setup, deflector_titles
+from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
 from napari_shadowinv.physics.tracing import traced_displacement
 from napari_shadowinv.results import unpack_result
 
-_FINER = 3  # samples of a phantom along a side of a pixel
+FINER = 3  # samples of a phantom, and of a simulated image, along a side of a pixel
 _TILES = 9  # of rays, in each sample of a grid
 
 
@@ -188,16 +188,16 @@ def object_of_phantom(
 
     Its parameters belong to the setup, or without one to pixels or shares of the image, (H, W).
     """
-    fine_shape = _FINER * shape[0], _FINER * shape[1]
-    fine_setup = None if setup is None else finer_setup(setup, _FINER)
-    fine = recipe.in_finer_pixels(_FINER)
+    fine_shape = FINER * shape[0], FINER * shape[1]
+    fine_setup = None if setup is None else finer_setup(setup, FINER)
+    fine = recipe.in_finer_pixels(FINER)
     shadow = fine.shadow(fine_shape, fine_setup)
     return PlannedObject(
-        fine.phantom(fine_shape, fine_setup).displacement / _FINER,
+        fine.phantom(fine_shape, fine_setup).displacement / FINER,
         title=recipe.title,
         setup=setup,
-        deflector=_DEFLECTORS.get(recipe.probe),
-        finer=_FINER,
+        deflector=SETUPS[recipe.probe].deflectors[0].title if recipe.probe else None,
+        finer=FINER,
         shadow=shadow,
     )
 
@@ -245,9 +245,6 @@ def setups_of_text(setup: Setup | None, text: str, name: str) -> list[Setup] | N
     values = numbers_in_unit(text, quantity.unit, name)
     changes = [{**setup.model_dump(), quantity.name: value} for value in values]
     return [validate(type(setup), each, name) for each in changes]
-
-
-_DEFLECTORS = {"proton": "magnetic field", "optical": "plasma"}
 
 
 def finer_setup(setup: Setup, factor: int) -> Setup:

@@ -214,6 +214,12 @@ class ExperimentPlan(Summarised):
         }
         return dict(sorted(medians.items(), key=lambda part: -part[1]))
 
+    @property
+    def ranking(self) -> list[tuple[str, float]]:
+        """Titles and sizes of the parts that matter, the largest first."""
+        least = _LEAST_PART * max(self.parts.values(), default=0.0)
+        return [(self._title(name), share) for name, share in self.parts.items() if share >= least]
+
     @cached_property
     def gains(self) -> tuple[Gain, ...]:
         """Gains by a change of each stated number, the largest first.
@@ -268,10 +274,10 @@ class ExperimentPlan(Summarised):
             f"the field {would} be determined: {determined} of {count} simulated shots",
             f"error made {self.error.text}",
         ]
-        if self.parts:
-            cause, share = next(iter(self.parts.items()))
-            texts.append(f"limited by {self._title(cause)} {percent(share)}")
-            if cause == "beam" and self.instrument.beam_rms is None:
+        if self.ranking:
+            title, share = self.ranking[0]
+            texts.append(f"limited by {title} {percent(share)}")
+            if title == "beam" and self.instrument.beam_rms is None:
                 rms = self.instrument.beam_of(measured=self.options.is_recorded).rms
                 texts.append(f"its unevenness of {percent(rms)} is assumed: record a reference")
         if self.silent:
@@ -304,13 +310,7 @@ class ExperimentPlan(Summarised):
         if not math.isnan(self.ratio):
             total += f"; the error made is {to_figures(self.ratio)} times that (r.m.s.)"
         yield Fact("total", "Error reported", total)
-        if self.parts:
-            least = _LEAST_PART * next(iter(self.parts.values()))
-            ranking = ", ".join(
-                f"{self._title(name)} {percent(share)}"
-                for name, share in self.parts.items()
-                if share >= least
-            )
+        if ranking := ", ".join(f"{title} {percent(share)}" for title, share in self.ranking):
             yield Fact("limits", "Limited by", ranking)
         yield from self._caveat_facts()
         yield time_fact(self.seconds)

@@ -28,10 +28,9 @@ from napari_shadowinv.instrument.shapes import Shapes
 from napari_shadowinv.options import BeamPrior, Instrument
 from napari_shadowinv.physics.projection import displacement_ratio
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.pipeline.experiment_object import Grid, PlannedObject
+from napari_shadowinv.pipeline.experiment_object import FINER, Grid, PlannedObject
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 
-_FINER = 3  # samples along a side of a pixel
 _BEYOND_PX = 4  # more than rays are displaced
 _DIMMEST = 0.02  # of the mean, for a beam or a transmission
 _EDGE = 0.1  # of the largest displacement, where the object ends
@@ -103,7 +102,7 @@ class ShotSimulator:
         coarse = [self._object.displacement(setup, Grid(shape)) for setup in self._setups]
         reach = max(float(np.abs(moved).max()) for moved in coarse)
         margin = min(math.ceil(reach) + _BEYOND_PX, max(shape) // 2)
-        self._grid = Grid(shape, _FINER, margin)
+        self._grid = Grid(shape, FINER, margin)
         self._nominal = [self._object.displacement(setup, self._grid) for setup in self._setups]
         self.truth = coarse[0]
         passed = self._object.transmission(self._setups[0], self._grid)

@@ -119,12 +119,12 @@ def _draw_draws(axes: Axes, plan: ExperimentPlan, ink: str) -> None:
 
 
 def _draw_parts(axes: Axes, plan: ExperimentPlan) -> None:
-    least = 0.01 * max(plan.parts.values(), default=0.0)
-    parts = [part for part in plan.parts.items() if part[1] >= least][:8]
+    parts = plan.ranking[7::-1]
     if not parts:
         axes.axis("off")
         return
-    names = [name.replace("_", " ") for name, _ in parts]
-    axes.barh(names[::-1], [100 * share for _, share in parts[::-1]], color=QUIET_COLOUR)
+    axes.barh(
+        [title for title, _ in parts], [100 * share for _, share in parts], color=QUIET_COLOUR
+    )
     axes.set_xlabel("share of the field (%)")
     axes.set_title(f"Error reported: {percent(plan.total.median)}")
