@@ -71,74 +71,37 @@ class MaskOrigin(Origin):
 class ImageOrigin(Origin):
     """Origin of an image of a result, with its source, masks, setup and numbers.
 
-    Attributes
-    ----------
-    source, dark : Origin or None
-        Undisturbed beam and dark frame, if they were measured.
-    mask, source_mask : int or None
-        Indices of the masks in `Provenance.masks`.
-    setup : Setup or None
-        The experiment, with the pixels as recorded; None where the recipe's applies.
-    strength, brightness, psf, noise
-        Values of this image; None where the recipe counts. An image to invert was divided by its
-        brightness.
-    measured : bool
-        Whether the source of an image of a fit was recorded, as `Shot.measured`.
-    notes : tuple of str
-        Notes of the steps, for people.
-    cautions : tuple of Caution
-        Reasons to doubt an image of a fit, its source or its setup.
+    A number of None is the recipe's.
     """
 
-    source: Origin | None = None
+    source: Origin | None = None  # undisturbed beam, if it was measured
     dark: Origin | None = None
-    mask: int | None = None
+    mask: int | None = None  # like the next, its index in `Provenance.masks`
     source_mask: int | None = None
-    setup: Setup | None = None
+    setup: Setup | None = None  # with the pixels as recorded; None where the recipe's applies
     strength: tuple[float, ...] | None = None
-    brightness: float | None = None
+    brightness: float | None = None  # an image to invert was divided by it
     psf: float | None = None
     noise: Noise | None = None
-    measured: bool = True
-    notes: tuple[str, ...] = ()
+    measured: bool = True  # whether the source of an image of a fit was recorded
+    notes: tuple[str, ...] = ()  # of the steps, for people
+    # Reasons to doubt an image of a fit, its source or its setup.
     cautions: tuple[Annotated[Caution, BeforeValidator(Caution.from_json)], ...] = ()
 
 
 class Provenance(CheckedModel):
-    """Provenance of a result, by which it can be repeated.
-
-    Attributes
-    ----------
-    kind : {"inversion", "fit", "film pack"}
-        Kind of the result.
-    version : str
-        Version of the package.
-    recipe : Recipe
-        Steps, estimate of the source and options; masks are the images'.
-    images : tuple of ImageOrigin
-        The images, in their order; the scans of a film pack.
-    masks : tuple of MaskOrigin
-        All masks of images and sources, each once; their pixels are variables of the dataset.
-    setup : Setup or None
-        Geometry of the pixels of an inversion.
-    fiducials : Origin or None
-        The table of known displacements.
-    fiducial_rows : tuple or None
-        Its rows.
-    start : Provenance or None
-        The inversion that a fit refines, with the same image, source and masks.
-    pack : Pack or None
-        The film pack.
-    """
+    """Provenance of a result, by which it can be repeated."""
 
     kind: Literal["inversion", "fit", "film pack"]
-    version: str = __version__
-    recipe: Recipe = Recipe()
-    images: tuple[ImageOrigin, ...] = ()
+    version: str = __version__  # of the package
+    recipe: Recipe = Recipe()  # steps, estimate of the source and options; masks are the images'
+    images: tuple[ImageOrigin, ...] = ()  # in their order; the scans of a film pack
+    # Of all images and sources, each once; their pixels are variables of the dataset.
     masks: tuple[MaskOrigin, ...] = ()
-    setup: Setup | None = None
-    fiducials: Origin | None = None
+    setup: Setup | None = None  # geometry of the pixels of an inversion
+    fiducials: Origin | None = None  # the table of known displacements, and its rows
     fiducial_rows: tuple[tuple[float, float, float, float, float], ...] | None = None
+    # The inversion that a fit refines, with the same image, source and masks.
     start: Provenance | None = None
     pack: Pack | None = None
 

@@ -68,40 +68,18 @@ class Spread:
 
 @dataclass(frozen=True)
 class PlannedShot:
-    """A simulated shot and its inversion or fit.
+    """A simulated shot and its inversion or fit; errors are shares of the field (r.m.s.)."""
 
-    Attributes
-    ----------
-    number : int
-        Of the draw.
-    verdict : Verdict
-        Of the inversion or fit.
-    reason : str
-        The verdict's reason.
-    error : float
-        Error made: of the field, r.m.s. over the image, as a share of the r.m.s. field; it
-        includes a wrong energy.
-    peak_error : float
-        Of the largest magnitude of the field, as a share of it, with its sign.
-    total : float
-        Reported error as a share of the field (r.m.s.).
-    parts : dict of str to float
-        What the reported error is made of, as shares of the field (r.m.s.), by causes.
-    scales : dict of str to float
-        Standard deviations of the instrument's numbers after a fit over those before.
-    is_searched : bool
-        Whether a fit looked for alternative solutions and has error bars of its own.
-    """
-
-    number: int
-    verdict: Verdict
+    number: int  # of the draw
+    verdict: Verdict  # of the inversion or fit, with its reason
     reason: str
-    error: float
-    peak_error: float
-    total: float
-    parts: dict[str, float] = field(default_factory=dict)
+    error: float  # made, over the image; it includes a wrong energy
+    peak_error: float  # made in the largest magnitude, as a share of it, with its sign
+    total: float  # reported
+    parts: dict[str, float] = field(default_factory=dict)  # of the reported error, by causes
+    # Standard deviations of the instrument's numbers after a fit over those before.
     scales: dict[str, float] = field(default_factory=dict)
-    is_searched: bool = True
+    is_searched: bool = True  # whether a fit looked for alternatives and has error bars of its own
 
     @property
     def is_determined(self) -> bool:
