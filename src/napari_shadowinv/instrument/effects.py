@@ -100,27 +100,13 @@ Removal = Callable[[RecordedShot, FloatArray], RecordedShot]
 
 
 class Effect:
-    """A quantity of the instrument that is known to a standard deviation only.
+    """A quantity of the instrument that is known to a standard deviation only."""
 
-    Attributes
-    ----------
-    key : str
-        Name in `Instrument`, and in texts.
-    unit : str
-        Unit of the standard deviation in texts.
-    tested : float
-        Standard deviation whose effect every budget states; 0 if it takes too long.
-    is_even : bool
-        Whether the effect grows with the square of its number.
-    count : int
-        Number of normal numbers that draw it, unless `removal` is another.
-    """
-
-    key: str
-    unit: str = "%"
-    tested: float = 0.0
-    is_even: bool = False
-    count: int = 1
+    key: str  # name in `Instrument`, and in texts
+    unit: str = "%"  # of the standard deviation in texts
+    tested: float = 0.0  # deviation whose effect every budget states; 0 if it takes too long
+    is_even: bool = False  # whether the effect grows with the square of its number
+    count: int = 1  # of normal numbers that draw it, unless `removal` has another
 
     def pattern(self, shot: SolvedShot, size: float) -> FloatArray:
         """Return k independent changes of the cells' flux for a standard deviation, (k, n).

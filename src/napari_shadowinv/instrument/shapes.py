@@ -30,31 +30,15 @@ class Shapes:
     """Relative changes of a beam by one standard deviation of each number.
 
     The first numbers change planes, the others products (a_i(y) b_j(x) - c) e(y, x).
-
-    Attributes
-    ----------
-    key : str
-        Name of their cause.
-    planes : ndarray, shape (n, H, W)
-    modes : tuple of ndarray
-        The functions a (n, H) and b (m, W).
-    places : ndarray of int, shape (2, k)
-        Their numbers i and j for each shape.
-    means : ndarray, shape (k,)
-        The constants c.
-    envelope : ndarray, shape (H, W), or None
-        The factor e; None for 1.
-    is_common : bool
-        Whether the change of the beams of all images is common, or each has its own.
     """
 
-    key: str
-    planes: FloatArray
-    modes: tuple[FloatArray, FloatArray]
-    places: IntArray
-    means: FloatArray
-    envelope: FloatArray | None = None
-    is_common: bool = True
+    key: str  # name of their cause
+    planes: FloatArray  # (n, H, W)
+    modes: tuple[FloatArray, FloatArray]  # the functions a (n, H) and b (m, W)
+    places: IntArray  # (2, k), their numbers i and j for each shape
+    means: FloatArray  # (k,), the constants c
+    envelope: FloatArray | None = None  # (H, W), the factor e; None for 1
+    is_common: bool = True  # to the beams of all images, or each has its own change
 
     @classmethod
     def of_planes(cls, key: str, planes: FloatArray, *, is_common: bool = True) -> Shapes:
