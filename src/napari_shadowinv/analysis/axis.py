@@ -101,9 +101,9 @@ def find_axis(
 
     It is refined from a start, by default the best of all positions along a direction, "vertical"
     or "horizontal". With `find_tilt` it may be inclined, by `most_tilt` degrees. The radius is a
-    share of the largest, so that a shifted axis stays inside; of a long axis no more places than
-    `places` or twice that are compared, as neighbours share their noise. It is so long that all of
-    its both sides are inside the image; of a start, as long as that.
+    share of the largest, so that a shifted axis stays inside; of a long axis, not fewer than
+    `places` places are compared, as neighbours share their noise. The axis is so long that all of
+    its both sides are inside the image; from a start, as long as that.
     """
     shape = displacement.shape[1:]
     is_free = start is None

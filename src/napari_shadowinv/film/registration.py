@@ -493,11 +493,10 @@ def poses_by_fiducials(
     One mark on a film determines its shift, two or more also its turn. A film without marks is
     aligned by its edges. Films are aligned to the mean of all, so a mark on one film has no effect.
 
-    For each film there are its marks by name, (y, x) in px of its scan, its corners, (4, 2), and
-    its scale: its px in a px of the images, which magnify with the depth in the pack. The least
-    error of a mark in px is how marks are read off a scan. An `InputError` if no mark is on two
-    films, or one is further than `max_misfit` px from its place by the other marks of its film: it
-    has a wrong name.
+    Each film has its marks by name, (y, x) in px of its scan, its corners, (4, 2), and a scale: px
+    of its scan in a px of the images, which magnify with the depth in the pack. As marks are read
+    off a scan, they err by `mark_error` px at least; further than `max_misfit` px from its place by
+    the other marks, a mark has a wrong name. This is an `InputError`, as is no mark on two films.
     """
     film_marks = []  # px down and right from the film's middle
     for marks, film in zip(points, np.asarray(corners, np.float64), strict=True):
