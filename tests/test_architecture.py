@@ -172,10 +172,9 @@ def classes_by_field() -> dict[str, list[str]]:
 
 
 # Names for the same thing in a fit, where values and defaults differ.
-OPTIONS_OF_FITS = {"boundary", "decay_length", "margin", "max_iterations", "seed", "threads"}
-OPTIONS_OF_DRAWS = {"seed", "threads"}  # of plans and traces, not of an inversion
-# One annotation for inversions and fits, in a module of its own.
-SHARED_OPTIONS = {"max_error"}
+OPTIONS_OF_FITS = {"boundary", "decay_length", "margin", "max_iterations"}
+# One annotation for all models that have it.
+SHARED_OPTIONS = {"max_error", "seed", "threads"}
 
 
 @pytest.mark.parametrize("option", InversionOptions.model_fields)
@@ -185,8 +184,7 @@ def test_an_option_is_declared_once(option):
     }
     assert option not in step_parameters  # its flag would be that of a step
     of_fits = ["FitOptions"] if option in OPTIONS_OF_FITS else []
-    of_draws = ["ExperimentOptions", "TraceOptions"] if option in OPTIONS_OF_DRAWS else []
-    expected = [] if option in SHARED_OPTIONS else [*of_fits, *of_draws, "InversionOptions"]
+    expected = [] if option in SHARED_OPTIONS else [*of_fits, "InversionOptions"]
     assert sorted(classes_by_field().get(option, [])) == sorted(expected)
 
 

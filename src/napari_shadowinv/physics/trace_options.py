@@ -72,7 +72,7 @@ class TraceOptions(CheckedModel):
         default=False,
         description="Also return start, landing point and deflection of each particle; for counts.",
     )
-    seed: Seed = Field(default=0, description="Seed of all random choices; for counts.")
+    seed: Seed = 0
     threads: Threads = None
 
 
