@@ -480,20 +480,8 @@ def setup_cautions(
 ) -> tuple[Caution, ...]:
     """Return a sentence for everything about a setup that no common experiment has.
 
-    Parameters
-    ----------
-    setup : BeamSetup
-    shape : tuple of int, optional
-        Height and width of the image in px; without it the field of view is not checked.
-    metadata : mapping, optional
-        Of the image, with the ``geometry`` in its file and the factor of its ``bin``.
-    usual : UsualGeometry, optional
-        Limits of common experiments.
-
-    Returns
-    -------
-    tuple of Caution
-        Empty if nothing is doubtful.
+    Without the shape of the image in px, the field of view is not checked. Its metadata may have
+    the ``geometry`` in its file and the factor of its ``bin``.
 
     Examples
     --------

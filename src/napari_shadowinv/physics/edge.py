@@ -27,6 +27,10 @@ def edge_changes(
 ) -> FloatArray:
     """Independent changes of a field, of one standard deviation each, by objects beyond its edge.
 
+    Of potential, (H, W) in px², of at least 4 by 4 points with a spacing in px, and displacement,
+    its negative gradient, (2, H, W) in px. Returns changes of the potential and of the
+    displacement's components, (8, 3, H, W).
+
     Opposite assumptions are made of it. The first lets no flux cross the edge, as if the object
     went on as its mirror image; the others make the potential constant along one edge, or the mean
     of it alike along opposite edges, as if it went on there as its mirror image of opposite sign. A
@@ -38,20 +42,6 @@ def edge_changes(
     The last change is by flux that leaves on all sides, which looks like another exposure: along
     the edge the image is then brighter or darker than its source. It is at most as large as the
     field.
-
-    Parameters
-    ----------
-    potential : ndarray, shape (H, W)
-        In px², of at least 4 by 4 points.
-    displacement : ndarray, shape (2, H, W)
-        Its negative gradient, px.
-    spacing : float, default 1
-        Distance between the points, px.
-
-    Returns
-    -------
-    ndarray of float64, shape (8, 3, H, W)
-        The changes of the potential, px², and of the displacement's components, px.
     """
     outflow, opposite = np.zeros(potential.shape), np.zeros((6, *potential.shape))
     shares = []

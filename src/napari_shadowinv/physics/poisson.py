@@ -78,18 +78,10 @@ def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> Floa
 
 
 def potential_from_displacement(displacement: FloatArray) -> FloatArray:
-    """Potential whose negative gradient is closest to a displacement, by least squares.
+    """Potential, in px², whose negative gradient is closest to a displacement, in px.
 
-    Parameters
-    ----------
-    displacement : ndarray, shape (2, H, W)
-        In px, axis order (y, x).
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        In px²; its mean over the image's border is 0. Between neighbouring pixels it falls by the
-        mean of their displacements.
+    By least squares, (H, W) of (2, H, W): between neighbouring pixels it falls by the mean of their
+    displacements. Its mean over the image's border is 0.
 
     Examples
     --------

@@ -51,21 +51,12 @@ def deviation_along(displacement: FloatArray, std: FloatArray) -> FloatArray:
 
 
 def significance(displacement: FloatArray, std: FloatArray) -> FloatArray:
-    """Return how many standard deviations a displacement is away from zero, |d|/σ.
+    """Return how many standard deviations a displacement, (2, ...), is away from zero, |d|/σ.
 
     For errors alone, with independent normal components, it exceeds u with a probability of at most
-    exp(-u²/2): 14 % for 2, for which a component alone would have 5 %.
-
-    Parameters
-    ----------
-    displacement, std : ndarray, shape (2, ...)
-        As of `deviation_along`.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        0 where the displacement is 0; infinite where it is not, but has no error; NaN where it, or
-        its error, is NaN.
+    exp(-u²/2): 14 % for 2, for which a component alone would have 5 %. It is 0 where the
+    displacement is 0; infinite where it is not, but has no error; NaN where it, or its error, is
+    NaN.
 
     Examples
     --------
