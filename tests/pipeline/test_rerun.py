@@ -29,10 +29,9 @@ from napari_shadowinv.pipeline import (
     run_film,
     run_fit,
     run_leave_one_out,
-    run_refinement,
     write_layers,
 )
-from napari_shadowinv.pipeline.fit_run import read_row_images, refinement_choices
+from napari_shadowinv.pipeline.fit_run import read_row_images, refinement_choices, run_refinement
 from napari_shadowinv.pipeline.rerun import provenance_of
 from napari_shadowinv.pipeline.shot_table import shot_rows
 from napari_shadowinv.preprocessing import Crop, Dark, LowPassFilter, Recipe
