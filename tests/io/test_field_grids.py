@@ -152,6 +152,15 @@ def test_grid_without_units_is_refused(tmp_path, place, name, sentence):
         read_field_grid(path)
 
 
+def test_files_without_fields_are_refused(tmp_path):
+    np.save(tmp_path / "plane.npy", np.ones((4, 4)))
+    with pytest.raises(FileFormatError, match="no HDF5 file: expected an openPMD file or a NetCDF"):
+        read_field_grid(tmp_path / "plane.npy")
+    xr.Dataset({"rho": ("x", np.ones(3))}).to_netcdf(tmp_path / "rho.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match=r"rho\.nc"):
+        read_field_grid(tmp_path / "rho.nc")
+
+
 def test_damaged_file_is_refused(tmp_path):
     path = write_openpmd(tmp_path / "b.h5")
     content = path.read_bytes()
