@@ -1,7 +1,7 @@
 """Shots of a stack, each read on demand: `Exposure`, and where they come from.
 
 - in an array, in a file, in rows of a table: `ArrayExposure`, `FileExposure`, `RowsExposure`
-- all shots of an array or of files: `find_shots`; of a table: `table_shots`
+- all shots of an array, of files or of a list: `find_shots`; of a table: `table_shots`
 - their sources: `find_source`
 """
 
@@ -330,7 +330,7 @@ class Shots:
 def find_shots(
     shots: Any, *, reader: Reader = read_pixels, shape: tuple[int, int] | None = None
 ) -> Shots:
-    """Return references to the shots of an array or of files."""
+    """Return references to the shots of an array, of files or of a list."""
     if isinstance(shots, Shots):
         return replace(shots, shape=shape or usual_shape(shots.items))
     if isinstance(shots, (str, Path)):
@@ -341,11 +341,21 @@ def find_shots(
     if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
         items = _shots_of_files(shots, reader)
         return Shots(items, shape or usual_shape(items))
+    if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
+        shapes = {np.shape(item) for item in shots}
+        if len(shapes) > 1:
+            raise InputError(
+                f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected the same "
+                "shape for all"
+            )
+        planes = [unpack_array(item, f"shots[{k}]") for k, item in enumerate(shots)]
+        shots = np.ma.stack(
+            [np.ma.MaskedArray(values, usable is not None and ~usable) for values, usable in planes]
+        )
     if not hasattr(shots, "ndim"):
         raise InputError(
-            f"shots are a {type(shots).__name__}: expected an array (shot, y, x), such as "
-            "numpy.stack(images), an xarray object, paths, a glob such as 'shots/*.tif', or a file "
-            "with many frames"
+            f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
+            "object, paths, a glob such as 'shots/*.tif', or a file with many frames"
         )
     return _from_array(shots)
 
