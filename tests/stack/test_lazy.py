@@ -225,7 +225,6 @@ class TestInputs:
             ([], "empty list"),
             (np.ones((5, 6)), r"shape \(5, 6\), expected \(shot, y, x\)"),
             (7, "are a int: expected an array"),
-            ([np.ones((5, 6))], "are a list: expected an array .*, such as numpy.stack"),
         ],
     )
     def test_input_without_shots_is_refused(self, shots, words):

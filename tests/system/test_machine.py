@@ -90,6 +90,25 @@ def test_functions_side_by_side_share_the_threads_of_their_kernels():
     assert available_threads(4) == 4
 
 
+@pytest.mark.parametrize("threads", [1, 2])
+def test_of_several_errors_the_first_is_raised(threads):
+    """Whichever comes earlier: the same input has the same message on any number of threads."""
+    later = threading.Event()
+    if threads == 1:
+        later.set()
+
+    def first():
+        later.wait(10)
+        raise ValueError("first")
+
+    def second():
+        later.set()
+        raise ValueError("second")
+
+    with pytest.raises(ValueError, match="first"):
+        results_of([first, second], threads)
+
+
 def test_a_crew_within_a_crew_gives_the_thread_back():
     def threads_around():
         inside = Crew(1, 1).call(available_threads, 4)

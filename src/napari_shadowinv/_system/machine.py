@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
@@ -143,12 +144,20 @@ def in_ranges(
 
 
 def run_together(works: Sequence[Callable[[], _T]], threads: int) -> list[_T]:
-    """Call functions that release the GIL and write nothing in common, and return their results."""
+    """Call functions that release the GIL and write nothing in common, and return their results.
+
+    Of several errors, the first function's is raised.
+    """
     remaining, results = iter(enumerate(works)), dict[int, _T]()
+    errors: dict[int, Exception] = {}
 
     def run() -> None:
         for number, work in remaining:
-            results[number] = work()
+            try:
+                results[number] = work()
+            except Exception as error:
+                errors[number] = error
+                deque(remaining, maxlen=0)  # no other begins
 
     futures = [_kernel_pool().submit(run) for _ in range(min(threads, len(works)) - 1)]
     try:
@@ -158,6 +167,8 @@ def run_together(works: Sequence[Callable[[], _T]], threads: int) -> list[_T]:
         wait(begun)
     for future in begun:
         future.result()
+    if errors:
+        raise errors[min(errors)]
     return [results[number] for number in range(len(works))]
 
 
