@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 # Others come from the user, and precede those of the image's file.
-_OF_FILE = ("image", "path", "metadata", "warnings", "in_file")
+_OF_FILE = ("image", "path", "metadata", "cautions", "in_file")
 
 
 @dataclass(frozen=True, eq=False, repr=False)

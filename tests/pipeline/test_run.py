@@ -21,6 +21,7 @@ from napari_shadowinv import (
     invert_stack,
 )
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli._settings import (
     INVERSION_SECTIONS,
     settings_of,
@@ -378,6 +379,22 @@ def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: Fl
         invert_stack(np.stack([image, image]), recipe)
     stack = invert_stack(Shot(np.stack([image, image]), source=beam), recipe)
     np.testing.assert_array_equal(stack.displacement[1], run(recipe, shot).displacement)
+
+
+def test_a_shot_keeps_the_doubts_about_its_file(tmp_path: Path, image: FloatArray) -> None:
+    """What was given with it precedes what the file says, but not what its reader doubts."""
+    path = tmp_path / "shot.jpg"
+    grey = (200 * image / image.max()).astype(np.uint8)
+    iio.imwrite(path, grey)
+    assert {caution.code for caution in read_shot(path).cautions} == {"gamma"}
+    inversion = run(Recipe(options=OPTIONS), Shot(path))
+    assert "gamma" in {caution.code for caution in inversion.cautions}
+    doubts = (Caution("gamma", "not linear"),)
+    recorded = Shot(image, name="stored", path=path, cautions=doubts, in_file={"psf": 1.0})
+    known = Shot(path, name="given").completed_by(recorded)
+    of_file = ("image", "path", "metadata", "cautions", "in_file")
+    assert all(getattr(known, name) is getattr(recorded, name) for name in of_file)
+    assert known.name == "given"
 
 
 def test_provenance_says_all_that_is_needed(image: FloatArray) -> None:
