@@ -350,7 +350,7 @@ class ErrorBudget:
         """
         if not self.rms > 0:
             return ""
-        parts = dict(self.parts)
+        parts = self.parts
         # Smaller errors elsewhere do not reduce the edge's, which they hide.
         edge = 0.0 if self.edge is None else self.edge.rms**2
         wanted, rest = (share * self.rms) ** 2, self.total.rms**2
