@@ -61,7 +61,7 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
     looks: dict[str, dict[str, Any]] = state.get("looks", {})
     content = result_from_dataset(dataset)
     setup = content.setup
-    result = Result(content, setup, state.get("origins", {}))
+    result = Result(content, setup, dict(state.get("origins", {})))
     placement = next(iter(looks.values()), {})
     shape = dataset.sizes["y"], dataset.sizes["x"]
     places = {key: placement.get(key) for key in _PLACEMENT}
