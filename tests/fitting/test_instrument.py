@@ -247,7 +247,7 @@ def test_effects_of_noise_and_instrument_add_to_each_sample() -> None:
     scene = coarser(data.scene, 2)
     posterior = Posterior(scene, scene.nothing(), np.random.default_rng(0))
     sample = posterior.draw_samples(1)[0]
-    effects = posterior.effects(sample)
+    [effects] = posterior.effects([sample])
     assert effects.keys() == {"noise", "gamma", "background", "beam"}
     total = sum(effect.potentials for effect in effects.values())
     np.testing.assert_allclose(total, sample.change.potentials, atol=1e-12)

@@ -177,7 +177,7 @@ def test_a_solved_sample_explains_its_noise_and_its_force_in_full() -> None:
     unknowns, *_ = settle(scene, unknowns, steps=40, least_gain=1e-6)
     posterior = Posterior(scene, unknowns, np.random.default_rng(3))
     linear = posterior.draw_samples(4)
-    solved = posterior.solve(linear)
+    solved = posterior.solve(linear, 20)
     pairs = compare_samples(scene, linear, solved)
     assert 0.01 < pairs.linearity.nonlinearity < 0.5
     assert pairs.linearity.spread_ratio == pytest.approx(1, abs=0.2)

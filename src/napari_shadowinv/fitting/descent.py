@@ -249,7 +249,7 @@ def settle(
     -------
     unknowns : Unknowns
     value : float
-        The objective.
+        The objective; of a rough end, by the numbers of rays of its start.
     steps : int
     ended : bool
         Whether steps were left.
@@ -297,7 +297,7 @@ def settle(
         now, value, slope = trial, trial_value, trial_slope
         is_as_expected = abs(gain - expected_gain) < limits.as_expected * expected_gain
         if limits.is_rough and is_as_expected:
-            return now, scene.value(now), taken, True
+            return now, value, taken, True
         # What the next step would gain is about the preconditioned square of the slope.
         after = scales.transpose_times(slope).flat()
         next_gain = product(after, modes.precondition(after)) / 2

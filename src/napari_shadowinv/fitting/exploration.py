@@ -41,13 +41,15 @@ from napari_shadowinv.inversion.samples import Pairs
 class PosteriorSummary:
     """How far the images leave the best unknowns open, and how far an instrument would move them.
 
-    There is a `posterior` for counts alone; `pairs` compares samples with those that are solved in
-    full; `errors`, `by_part` and `by_beam` are displacements, `sensitivities` shares of each
-    field's, (M,). `assumed` are the likely changes by a detector of which nothing was stated.
+    There is a `posterior` for counts alone; `sampling` is how samples were found, as in
+    `FitOptions`; `pairs` compares some to first order with those that are solved in full;
+    `errors`, `by_part` and `by_beam` are displacements, `sensitivities` shares of each field's,
+    (M,). `assumed` are the likely changes by a detector of which nothing was stated.
     """
 
     posterior: Posterior | None
     samples: list[Sample]
+    sampling: str
     pairs: Pairs | None
     errors: FloatArray | None
     by_part: dict[str, FloatArray]
@@ -89,13 +91,14 @@ def explore(
     *,
     spacing: float = 1 / 3,
     checked: int = 2,
-    least_of_beams: int = 24,
+    least_of_beams: int = 16,
+    steps_of_beams: int = 8,
 ) -> PosteriorSummary:
     """Draw samples around the best unknowns, and respond to a detector that nobody stated.
 
     Rays are `spacing` px apart. Of samples of an instrument, `checked` are solved, too. Where each
-    image has a beam of its own, a few directions hold most of the error, so that there are at least
-    `least_of_beams` samples.
+    image has a beam of its own, a few directions hold most of the error, along which images are not
+    linear: there are at least `least_of_beams` samples, each solved in `steps_of_beams` at most.
     """
 
     def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:
@@ -108,16 +111,14 @@ def explore(
     posterior = posterior_with(scene, best, None if data.single else copy(best.modes))
     options = data.options
     count = options.samples if options.samples > 1 else 0
+    steps = 20 if options.sampling == "resolve" else 0
     if count and "beam_between" in scene.imperfect.keys:
-        count = max(count, least_of_beams)
+        count, steps = max(count, least_of_beams), max(steps, steps_of_beams)
     samples = posterior.draw_samples(count)
-    if options.sampling == "resolve":
-        linear, solved = samples, posterior.solve(samples)
-    else:
-        linear = samples[: checked if scene.imperfect.of_response else 0]
-        solved = posterior.solve(linear, steps=1)
+    linear = samples if steps else samples[: checked if scene.imperfect.of_response else 0]
+    solved = posterior.solve(linear, steps=steps or 1)
     pairs = compare_samples(posterior.scene, linear, solved) if solved else None
-    samples = solved if options.sampling == "resolve" else samples
+    samples = solved if steps else samples
     changes = [sample.change for sample in samples]
     errors = displacement_errors(scene, changes, data.size) if changes else None
     by_part = errors_by_part(scene, posterior, samples, data.size)
@@ -142,6 +143,7 @@ def explore(
     return PosteriorSummary(
         posterior if data.counted else None,  # its Jacobians are large
         samples,
+        "resolve" if steps else "linear",
         pairs,
         errors=errors,
         by_part=by_part,

@@ -126,7 +126,7 @@ class Scene(PriorTerms):
     def potentials(self, unknowns: Unknowns) -> FloatArray:
         """Return the coefficients of each image's own potential, shape (L, …)."""
         strengths = self.strengths_with(unknowns)
-        return np.asarray(np.einsum("lm,myx->lyx", strengths, unknowns.potentials))
+        return _sums_of_fields(strengths, unknowns.potentials)
 
     def displacement(self, unknowns: Unknowns) -> FloatArray:
         """Return each field's displacement at the pixels, recorded px, shape (M, 2, H, W)."""
@@ -526,13 +526,12 @@ class Linear:
 
     def _potential_changes(self, change: Unknowns) -> FloatArray:
         imperfect = self.scene.imperfect
-        changes = np.einsum(
-            "lm,myx->lyx", self.scene.strengths_with(self.unknowns), change.potentials
-        )
+        strengths = self.scene.strengths_with(self.unknowns)
+        changes = _sums_of_fields(strengths, change.potentials)
         if imperfect.other_strengths is not None:
             other = change.common[imperfect.place("other_field")] * imperfect.other_strengths
-            changes += np.einsum("lm,myx->lyx", other, self.unknowns.potentials)
-        return np.asarray(changes)
+            changes += _sums_of_fields(other, self.unknowns.potentials)
+        return changes
 
     @property
     def _has_others(self) -> bool:
@@ -567,6 +566,14 @@ class Linear:
     def _roots(self) -> FloatArray:
         """The brightness over the standard deviation of the noise, shape (L, H, W)."""
         return np.sqrt(self.scene.weights) * np.exp(self.unknowns.brightness)[:, None, None]
+
+
+def _sums_of_fields(strengths: FloatArray, fields: FloatArray) -> FloatArray:
+    """Σ_m A_lm φ_m, (L, …); of one field in a fifth of the time of `einsum`."""
+    sums = np.multiply.outer(strengths[:, 0], fields[0])
+    for m in range(1, len(fields)):
+        sums += np.multiply.outer(strengths[:, m], fields[m])
+    return np.asarray(sums)
 
 
 def blurred(image: FloatArray, width: float) -> FloatArray:

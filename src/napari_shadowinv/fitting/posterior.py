@@ -193,7 +193,7 @@ class Posterior:
         return first + run_in_parallel(works, threads, self._after_step)
 
     def solve(
-        self, samples: Sequence[Sample], steps: int = 20, least_gain: float = 0.05
+        self, samples: Sequence[Sample], steps: int, least_gain: float = 0.05
     ) -> list[Sample]:
         """Return samples with the change that explains their images and prior in full.
 
@@ -212,6 +212,7 @@ class Posterior:
                 least_gain=least_gain,
                 after_step=lambda _: self._after_step(),
                 modes=self._modes,
+                linear=replace(self._linear, scene=scene),
             )
             return end
 
@@ -282,8 +283,10 @@ class Posterior:
             curvature=np.einsum("ix,jx->ij", pushed, pushed),
         )
 
-    def effects(self, sample: Sample, tolerance: float = 0.02) -> dict[str, Unknowns]:
-        """Return a sample's change by each imperfection of the instrument, and by the noise.
+    def effects(
+        self, samples: Sequence[Sample], tolerance: float = 0.02
+    ) -> list[dict[str, Unknowns]]:
+        """Return the change of samples by each imperfection of the instrument, and by the noise.
 
         Common and separate changes of the beams are one.
 
@@ -291,19 +294,22 @@ class Posterior:
         imperfection, and H the Hessian of the fields, it causes -H⁻¹JᵀBθ; noise causes the rest.
         """
         held = self._held
-        numbers: dict[str, Unknowns] = {}
-        for part in self.scene.imperfect.parts:
-            # A change of all beams is common, or one of each.
-            key = "beam" if part.key == "beam_between" else part.key
-            moved = numbers.setdefault(key, sample.change.zeros())
-            change = part.of(sample.change.common, sample.change.separate)
-            part.of(moved.common, moved.separate)[...] = change
-        rest, effects = sample.change, {}
-        for key, moved in numbers.items():
-            pull = self._linear.pull(-self._linear.push(moved))
-            effects[key] = held._change(pull, tolerance)
-            rest = rest.plus(effects[key], -1)
-        return {"noise": rest, **effects}
+
+        def effects_in(change: Unknowns) -> dict[str, Unknowns]:
+            numbers: dict[str, Unknowns] = {}
+            for part in self.scene.imperfect.parts:
+                # A change of all beams is common, or one of each.
+                key = "beam" if part.key == "beam_between" else part.key
+                moved = numbers.setdefault(key, change.zeros())
+                part.of(moved.common, moved.separate)[...] = part.of(change.common, change.separate)
+            rest, effects = change, {}
+            for key, moved in numbers.items():
+                pull = self._linear.pull(-self._linear.push(moved))
+                effects[key] = held._change(pull, tolerance)
+                rest = rest.plus(effects[key], -1)
+            return {"noise": rest, **effects}
+
+        return [effects_in(sample.change) for sample in samples]
 
     def responses(
         self, rng: np.random.Generator, *, asked: bool = False, tolerance: float = 0.01
@@ -507,7 +513,7 @@ def errors_by_part(
     """
     if not scene.imperfect.parts:
         return {}
-    effects = [posterior.effects(sample) for sample in samples[:most]]
+    effects = posterior.effects(samples[:most])
     return {
         key: displacement_errors(scene, [each[key] for each in effects], size)
         for key in (effects[0] if effects else ())

@@ -176,7 +176,7 @@ def report_of(
             instrument.adapt(unknowns, refined.scene.imperfect),
             [sample.change for sample in summary.samples],
         ),
-        sampling=data.options.sampling,
+        sampling=summary.sampling,
         linearity=None if pairs is None else pairs.linearity,
     )
 

@@ -92,7 +92,9 @@ class Shapes:
         lines = np.einsum("nm,mx->nx", strengths, along_x)
         total = np.einsum("ny,nx->yx", along_y, lines) - np.einsum("k,k", self.means, of_modes)
         total = total if self.envelope is None else self.envelope * total
-        return np.asarray(total + np.einsum("k,kyx->yx", of_planes, self.planes))
+        if len(of_planes):  # a sum of none takes its time, too
+            total += np.einsum("k,kyx->yx", of_planes, self.planes)
+        return np.asarray(total)
 
     def pull(self, image: FloatArray) -> FloatArray:
         """Return the transpose of `sum` times an image."""
