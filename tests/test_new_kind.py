@@ -22,7 +22,7 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import read_recipe, run_fit, write_recipe
 from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.pipeline.fit_run import compared_fields, refinement_choices, run_refinement
-from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows, write_table
+from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot, shots_of
 from napari_shadowinv.stack import stack_statistics
@@ -158,9 +158,6 @@ def test_rows_keep_the_quantity_of_a_new_kind(table):
     rows = table_rows(table)
     assert [row.beam for row in rows] == [{"photon_energy": 8.0}, {"photon_energy": 12.0}]
     assert rows[1].beam_text == "12 keV"
-    write_table(Path("copy.csv"), rows)
-    assert Path("copy.csv").read_text().splitlines()[0] == "file,photon_energy"
-    assert table_rows(Path("copy.csv")) == rows
 
 
 def test_table_without_a_kind_refuses_its_quantity(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from helpers.command_line import flat, shadowinv
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.pipeline import read_pack
-from napari_shadowinv.pipeline.film_files import NewPack, draft_pack, write_new_pack
+from napari_shadowinv.pipeline.film_files import draft_pack, write_new_pack
 
 TABLE = "Dose,Red,Green,Blue\n1,30000,31000,29000\n10,20000,24000,26000\n100,8000,12000,20000\n"
 
@@ -36,12 +36,9 @@ def test_draft_has_the_scans_in_order(scans: Path) -> None:
 
 
 def test_draft_is_read_as_a_pack(scans: Path) -> None:
-    facts = NewPack(seen_from="detector", source_object_distance=0.01, object_image_distance=0.1)
-    entries = draft_pack(scans, facts)
+    entries = draft_pack(scans)
     entries["layers"][1]["filters"] = ["13 um Al", "25 um Fe"]
     pack = read_pack(write_new_pack(scans, entries))
-    assert pack.seen_from == "detector"
-    assert pack.setup == {"source_object_distance": 0.01, "object_image_distance": 0.1}
     assert [slab.material for slab in pack.layers[1].filters] == ["Al", "Fe"]
     assert pack.films["HDV2"].calibration == scans / "HDV2_table.csv"
     with pytest.raises(FileFormatError, match=r"pack.toml exists"):
@@ -53,11 +50,6 @@ def test_other_folders_are_refused(tmp_path: Path) -> None:
         draft_pack(tmp_path)
     with pytest.raises(FileFormatError, match="cannot be read as a folder"):
         draft_pack(tmp_path / "missing")
-
-
-def test_one_distance_alone_is_refused(scans: Path) -> None:
-    with pytest.raises(InputError, match="only one of two distances"):
-        draft_pack(scans, NewPack(source_object_distance=0.01))
 
 
 def test_film_command_writes_a_new_pack(scans: Path) -> None:

@@ -118,20 +118,17 @@ def shot_of_layer(layer: Any, image: Any, plane: int | None = None) -> Shot:
     return replace(shot, path=Path(path), metadata=metadata.get("file") or {})
 
 
-def source_of_shot(
-    layer: Any, data: Any, image: Any, *, plane: int | None = None, of: int | None = None
-) -> Shot:
-    """Return a layer's data as the source of an image layer, or of files (None).
+def source_of_shot(layer: Any, data: Any, image: Any, plane: int | None = None) -> Shot:
+    """Return a layer's data, or a plane's of its stack, as the source of an image layer, or None.
 
-    `plane` is the image's in its stack, `of` the source's. A file of another shot, or of more
-    pixels than the image has, is not the source's.
+    A file of another shot, or of more pixels than the image has, is not the source's.
     """
-    beam = shot_of_layer(layer, data, of)
+    beam = shot_of_layer(layer, data, plane)
     if image is None:
         return beam
     on_image = source_on(layer, data, image)
     is_whole = tuple(on_image.shape) == tuple(data.shape)
-    with_shot = shot_of_layer(image, image.data, plane).path
+    with_shot = shot_of_layer(image, image.data).path
     is_own_file = about.role_of(layer) != about.SOURCE or beam.path == with_shot
     if is_whole and is_own_file:
         return beam

@@ -10,17 +10,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from napari_shadowinv._system.tables import read_rows, write_cells
 from napari_shadowinv._system.validation import map_paths, validate
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Calibration, Pack, PackLayer
+from napari_shadowinv.film.pack import FILM_TYPES
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_toml, replacing, write
 from napari_shadowinv.io.files import in_counting_order, make_folder, write_toml
@@ -128,45 +128,18 @@ def write_layers(
 
 
 PACK_FILE = "pack.toml"
+_USUAL_FILM = "HDV2"
 _UNEXPOSED_NAME = re.compile("unexposed|blank|background", re.IGNORECASE)
 
 
-class NewPack(BaseModel, frozen=True, extra="forbid"):
-    """Facts about a pack that its scans do not show."""
+def draft_pack(folder: Path) -> dict[str, Any]:
+    """Return the entries of a pack file for the scans of a folder.
 
-    film: Literal["HDV2", "EBT3", "MDV3"] = Field(
-        default="HDV2",
-        title="Film type",
-        description="Type of films whose file name does not contain another one.",
-    )
-    seen_from: Literal["source", "detector"] | None = Field(
-        default=None,
-        title="Films seen from",
-        description="Side from which the upright films are seen; decides the sign of B.",
-    )
-    source_object_distance: float | None = Field(
-        default=None,
-        gt=0,
-        title="Source to object (m)",
-        description="Without distances, results are in px.",
-    )
-    object_image_distance: float | None = Field(
-        default=None, gt=0, title="Object to first film (m)", description="Along the beam."
-    )
-
-
-def draft_pack(
-    folder: Path, facts: NewPack | None = None, layers: Sequence[Mapping[str, Any]] | None = None
-) -> dict[str, Any]:
-    """Return the entries of a pack file for the scans of a folder, or for `layers` of them.
-
-    Without layers, each scan is one, in the order of the names (film_2 before film_10), without
-    filters. A scan that is named after a film type, or with "unexposed" or "blank", shows unexposed
-    film. A table (.csv) that can be read as a calibration belongs to the type in its name, or to
-    all types. A `FileFormatError` if the folder cannot be read; an `InputError` if it has no scans,
-    or only one of two distances is given.
+    Each scan is a layer, in the order of the names (film_2 before film_10), without filters. A scan
+    that is named after a film type, or with "unexposed" or "blank", shows unexposed film. A table
+    (.csv) that can be read as a calibration belongs to the type in its name, or to all types. A
+    `FileFormatError` if the folder cannot be read; an `InputError` if it has no scans.
     """
-    facts = facts or NewPack()
     folder = Path(folder)
     try:
         files = in_counting_order(path for path in folder.iterdir() if path.is_file())
@@ -175,34 +148,26 @@ def draft_pack(
             f"{folder} cannot be read as a folder ({error.strerror}): choose the folder of the "
             "scans"
         ) from None
-    types = NewPack.model_fields["film"].annotation.__args__  # type: ignore[union-attr]
     scans = [path for path in files if path.suffix.lower() in SCAN_SUFFIXES]
-    unexposed = [p for p in scans if p.stem in types or _UNEXPOSED_NAME.search(p.stem)]
+    unexposed = [p for p in scans if p.stem in FILM_TYPES or _UNEXPOSED_NAME.search(p.stem)]
     scans = [path for path in scans if path not in unexposed]
     if not scans:
         raise InputError(f"{folder} has no scans of films: expected images in colour, such as TIFF")
     tables = [path for path in files if path.suffix.lower() in SITES.suffixes]
     calibrations = [path for path in tables if _is_calibration(path)]
-    layer_entries = layers or [
-        {"film": _film_type_of(path, types) or facts.film, "filters": [], "file": path.name}
+    layers: list[dict[str, Any]] = [
+        {"film": _film_type_of(path) or _USUAL_FILM, "filters": [], "file": path.name}
         for path in scans
     ]
     films: dict[str, dict[str, str]] = {}
-    for kind in sorted({str(layer["film"]) for layer in layer_entries}):
+    for kind in sorted({layer["film"] for layer in layers}):
         for part, candidates in (("calibration", calibrations), ("unexposed", unexposed)):
-            by_type = {path: _film_type_of(path, types) for path in candidates}
+            by_type = {path: _film_type_of(path) for path in candidates}
             of_kind = [path for path, film_type in by_type.items() if film_type == kind]
             of_any = [path for path, film_type in by_type.items() if film_type is None]
             if matching := of_kind or of_any:
                 films.setdefault(kind, {})[part] = matching[0].name
-    entries = facts.model_dump(exclude={"film"}, exclude_none=True)
-    names = ("source_object_distance", "object_image_distance")
-    distances = {name: entries.pop(name) for name in names if name in entries}
-    if len(distances) == 1:
-        raise InputError("only one of two distances is given: give both, or none")
-    if distances:
-        entries["setup"] = distances
-    return {**entries, "films": films, "layers": [dict(layer) for layer in layer_entries]}
+    return {"films": films, "layers": layers}
 
 
 def missing_entries(entries: Mapping[str, Any]) -> list[str]:
@@ -232,8 +197,8 @@ def write_new_pack(folder: Path, entries: Mapping[str, Any], *, overwrite: bool 
     return path
 
 
-def _film_type_of(path: Path, types: tuple[str, ...]) -> str | None:
-    return next((kind for kind in types if kind.lower() in path.stem.lower()), None)
+def _film_type_of(path: Path) -> str | None:
+    return next((kind for kind in FILM_TYPES if kind.lower() in path.stem.lower()), None)
 
 
 def _is_calibration(path: Path) -> bool:

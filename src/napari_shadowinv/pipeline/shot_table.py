@@ -2,13 +2,12 @@
 
 - one image: `ShotRow`; all of a fit: `shot_rows`, or `rows_by_shot` for a table of many shots
 - the images of a table that are inverted one by one: `rows_to_invert`
-- whether a file is such a table: `is_table`; all its rows: `table_rows`; write one: `write_table`
+- whether a file is such a table: `is_table`; all its rows: `table_rows`
 - known displacements: `fiducials_from`
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -16,10 +15,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from napari_shadowinv._system.tables import has_column_names, is_number, read_rows, write_cells
+from napari_shadowinv._system.tables import has_column_names, is_number, read_rows
 from napari_shadowinv._system.validation import CheckedModel, suggestion, validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.files import name_of, replacing
+from napari_shadowinv.io.files import name_of
 from napari_shadowinv.io.formats import SITES
 from napari_shadowinv.options import MAX_STRENGTH, Noise
 from napari_shadowinv.physics.setup import beam_quantities
@@ -199,24 +198,6 @@ def rows_to_invert(table: Path | Sequence[ShotRow]) -> list[ShotRow]:
 def table_rows(table: Path) -> list[ShotRow]:
     """Return all rows of a table of shots, including excluded ones."""
     return list(_read_shots(table).values())
-
-
-def write_table(path: Path, rows: Sequence[ShotRow]) -> None:
-    """Write or replace a table of shots; file names become relative to its folder."""
-    folder = path.parent.absolute()
-    table_cells = [
-        row.model_dump(mode="json", exclude_none=True, exclude_defaults=True) for row in rows
-    ]
-    for cells, row in zip(table_cells, rows, strict=True):
-        files = row.files.items()
-        cells |= {name: os.path.relpath(file.absolute(), folder) for name, file in files}
-        if row.strength is not None:
-            cells["strength"] = " ".join(f"{value:.17g}" for value in row.strength)
-        if row.exclude:
-            cells["exclude"] = "yes"
-    columns = [name for name in ShotRow.columns() if any(name in cells for cells in table_cells)]
-    with replacing(path, overwrite=True) as draft:
-        write_cells(draft, columns, table_cells)
 
 
 def _used_rows(table: Path | Sequence[ShotRow], shared: Mapping[str, Any]) -> dict[int, ShotRow]:

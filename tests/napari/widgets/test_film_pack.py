@@ -23,13 +23,12 @@ from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.layer_metadata import Frame, role_of, setup_of, usable_of
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.packs import BY_HAND, film_layers
-from napari_shadowinv._napari.widgets.film_pack import FilmPack, NewPackDialog
+from napari_shadowinv._napari.widgets.film_pack import FilmPack
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.film import read_corners
 from napari_shadowinv.film_doses import FilmDoses
-from napari_shadowinv.pipeline import read_pack
 from simulated_pack import Truth
 
 PATIENCE = 60_000  # ms
@@ -324,47 +323,6 @@ def test_without_a_setup_films_know_how_strongly_they_are_displaced(
     in_fit = [shot.strength[0] for shot in fit.request().shots]
     np.testing.assert_allclose(in_fit, strengths)
     # The first that is used is the reference, whatever the pack's first film is.
-    fit.images.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
+    fit.images.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
     in_fit = [shot.strength[0] for shot in fit.request().shots]
     np.testing.assert_allclose(in_fit, strengths[1:] / strengths[1])
-
-
-def test_new_pack_is_described_in_the_window(
-    tool: Any, film_pack: Truth, tmp_path: Path, qtbot: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for file in film_pack.folder.glob("*.[tc][is]*"):
-        (tmp_path / file.name).symlink_to(file)
-    chosen = {"folder": str(tmp_path)}
-    monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: chosen["folder"])
-
-    def fill_in(dialog: NewPackDialog) -> bool:
-        qtbot.addWidget(dialog)
-        assert [dialog.table.item(row, 0).text() for row in range(dialog.table.rowCount())] == [
-            path.name for path in film_pack.files
-        ]
-        assert dialog._problem.isHidden()
-        films = dialog.table.cellWidget(0, 1)
-        assert films.currentText() == "HDV2"
-        films.setCurrentText("EBT3")
-        assert dialog.entries()["layers"][0]["film"] == "EBT3"
-        films.setCurrentText("HDV2")
-        dialog.table.item(0, 2).setText("13 Al")
-        dialog.accept()
-        assert "expected thickness, unit" in dialog._problem.text()
-        assert not dialog._problem.isHidden()
-        dialog.table.item(0, 2).setText("13 um Al; 25 um Fe")
-        dialog.form.restore({"seen_from": "source"})
-        dialog.accept()
-        return True
-
-    monkeypatch.setattr(NewPackDialog, "exec", fill_in)
-    tool.new.click()
-    pack = read_pack(tmp_path / "pack.toml")
-    assert tool.path.path == str(tmp_path / "pack.toml")
-    assert pack.seen_from == "source"
-    assert [len(layer.filters) for layer in pack.layers] == [2] + [0] * (len(pack.layers) - 1)
-    assert pack.films["HDV2"].calibration is not None
-    assert "setup: distances" in tool.panel.status.text()
-    chosen["folder"] = str(tmp_path / "missing")
-    tool.new.click()
-    assert "cannot be read as a folder" in tool.panel.status.text()

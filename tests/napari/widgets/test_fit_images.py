@@ -129,12 +129,12 @@ def inputs_of(tool: Any) -> FitInputs:
 
 
 def texts(tool: Any, column: int) -> list[str]:
-    table = tool.images.table
+    table = tool.images
     return [table.item(row, column).text() for row in range(table.rowCount())]
 
 
 def type_in(tool: Any, row: int, column: int, text: str) -> None:
-    tool.images.table.item(row, column).setText(text)
+    tool.images.item(row, column).setText(text)
 
 
 def test_the_table_is_filled_from_the_layers(window: Any, tool: Any, assert_it_fits: Any) -> None:
@@ -143,7 +143,7 @@ def test_the_table_is_filled_from_the_layers(window: Any, tool: Any, assert_it_f
     window.add_image(np.ones(SHAPE), name="beam", metadata=metadata_for("source", ""))
     assert texts(tool, 0) == ["14.7 MeV", "6.0 MeV", "another size"]
     assert texts(tool, BEAM) == ["14.7", "6", ""]
-    assert tool.images.table.horizontalHeaderItem(BEAM).text() == "Energy (MeV)"
+    assert tool.images.horizontalHeaderItem(BEAM).text() == "Energy (MeV)"
     assert texts(tool, GAIN)[:2] == ["1", "1"]
     assert texts(tool, PSF)[:2] == ["0", "0"]
     assert tool.setup.setup() == SETUPS[0]
@@ -231,29 +231,8 @@ def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
     tool._last.keep_earlier.setChecked(True)
     show(tool, fitted)
     assert len(window.layers) > count
-    tool.images.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
+    tool.images.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
     assert not tool.view.verdict.isVisible()
-
-
-def test_a_stack_has_a_row_for_each_plane(window: Any, open_widget: Any) -> None:
-    stack = np.stack([*images(), images()[0]])
-    layer = window.add_image(stack, name="run", metadata=metadata_for("shot", "", SETUPS[0]))
-    tool = open_widget("Fit several images")
-    tool.images.stacks.layer = layer
-    assert texts(tool, 0) == ["run 0", "run 1", "run 2"]
-    assert texts(tool, BEAM) == ["14.7", "", ""]
-    with pytest.raises(InputError, match="'run 1' has no energy: enter it"):
-        tool.request()
-    type_in(tool, 1, BEAM, "6")
-    tool.images.table.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
-    inputs = inputs_of(tool)
-    assert inputs.setups == SETUPS
-    np.testing.assert_array_equal(of_each(inputs.shots, "image"), stack[:2])
-    # Another reference: its own energy goes with it, and comes back.
-    tool.images.table.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
-    assert tool.setup.setup().energy == 6
-    tool.images.table.item(0, 0).setCheckState(Qt.CheckState.Checked)
-    assert [setup.energy for setup in inputs_of(tool).setups] == [14.7, 6.0]
 
 
 def test_without_a_setup_strengths_are_asked_for(window: Any, open_widget: Any, run: Any) -> None:
@@ -262,7 +241,7 @@ def test_without_a_setup_strengths_are_asked_for(window: Any, open_widget: Any, 
         window.add_image(synthetic_image(strength * TRUTH) + noise, name=name)
     tool = open_widget("Fit several images")
     tool.options.restore(QUICK)
-    assert tool.images.table.horizontalHeaderItem(BEAM).text() == "Strength"
+    assert tool.images.horizontalHeaderItem(BEAM).text() == "Strength"
     with pytest.raises(InputError, match="'weak' has no strength"):
         tool.request()
     type_in(tool, 1, BEAM, "0.6")
@@ -305,11 +284,11 @@ def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
         ),
     ]
     for row, sentence in ((1, "1 image is checked"), (0, "No images are checked")):
-        tool.images.table.item(row, 0).setCheckState(Qt.CheckState.Unchecked)
+        tool.images.item(row, 0).setCheckState(Qt.CheckState.Unchecked)
         tool.panel.button.click()
         assert messages[-1].startswith(sentence)
     for row in (0, 1):
-        tool.images.table.item(row, 0).setCheckState(Qt.CheckState.Checked)
+        tool.images.item(row, 0).setCheckState(Qt.CheckState.Checked)
     for spoil, mend, sentence in mistakes:
         messages.clear()
         spoil()
@@ -344,11 +323,11 @@ def test_images_that_do_not_fit_are_refused(
 ) -> None:
     window.add_image(np.ones((40, 64)), name="crop", metadata=metadata_for("shot", "", SETUPS[0]))
     for row in range(3):
-        tool.images.table.item(row, 0).setCheckState(Qt.CheckState.Checked)
+        tool.images.item(row, 0).setCheckState(Qt.CheckState.Checked)
     tool.panel.button.click()
     assert "'crop' has shape (40, 64), '14.7 MeV' (48, 64)" in messages[-1]
     # What only the fit itself can see reaches the window in the same way.
-    tool.images.table.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
+    tool.images.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
     window.layers["6.0 MeV"].data = np.full(SHAPE, np.nan)
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
@@ -800,19 +779,6 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     inversion = run_job(single.request())
     write(tmp_path / "b.shadowinv", inversion)
     assert "bit for bit" in command("rerun", "b.shadowinv", "--out", "again2.shadowinv")
-
-
-def test_a_stack_of_files_knows_the_file_of_each_plane(
-    window: Any, open_widget: Any, files: list[Path]
-) -> None:
-    paths = [str(path) for path in files[:2]]
-    files[2].unlink()
-    window.open(str(files[0].parent), plugin="napari-shadowinv")
-    tool = open_widget("Fit several images")
-    tool.images.stacks.layer = window.layers[0]
-    tool.setup.show_setup(SETUPS[0].model_dump())
-    type_in(tool, 1, BEAM, "6")
-    assert [str(shot.path) for shot in tool.request().shots] == paths
 
 
 def test_a_source_of_another_file_is_not_taken_for_that_file(

@@ -27,7 +27,6 @@ from napari_shadowinv.physics.phantoms import paper_setup, wakefield_setup
 from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.files import setup_from
-from napari_shadowinv.pipeline.film_files import NewPack
 from napari_shadowinv.preprocessing import ESTIMATES, STEPS, Crop, Dark
 
 CHANGED = {
@@ -40,7 +39,7 @@ CHANGED = {
     "seed": 2**40,
     "threads": 1,
 }
-OTHERS = (InversionOptions, FitOptions, Instrument, ExperimentOptions, GridView, NewPack)
+OTHERS = (InversionOptions, FitOptions, Instrument, ExperimentOptions, GridView)
 MODELS = [*OTHERS, *PHANTOMS.values(), *STEPS.values(), *ESTIMATES.values()]
 STATED = [
     paper_setup(),

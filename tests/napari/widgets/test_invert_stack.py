@@ -19,7 +19,7 @@ from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.stack import _schedulers, _worker
+from napari_shadowinv.stack import _worker
 
 Array = np.ndarray[Any, Any]
 FEW = {"n_sites": 100}
@@ -268,12 +268,6 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.store.folder.edit.setText("")
     expect("o store is selected")
     tool.store.folder.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
-    tool.store.cluster.setText("somewhere")
-    expect("address is 'somewhere'")
-    monkeypatch.setattr(_schedulers, "_CONNECT_TIMEOUT_S", 0.3)
-    tool.store.cluster.setText("tcp://127.0.0.1:9")
-    expect("o scheduler responds at tcp://127.0.0.1:9")
-    tool.store.cluster.setText("")
     tool.shots.set_kind("files")
     expect("o files are selected")
     tool.shots.files.edit.setText(str(tmp_path / "*.tif"))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from napari_shadowinv._napari.widgets._image_table import ImageTable, beam_column
 from napari_shadowinv._napari.widgets._inputs import SetupPicker, fields_of
-from napari_shadowinv._napari.widgets._tables import ImageTable, ShotTable, beam_column
 
 
 def test_form_reads_a_new_kind(xray_setup: Any, qtbot: Any) -> None:
@@ -33,22 +32,5 @@ def test_table_of_images_has_the_quantity_of_a_new_kind(xray_setup: Any, qtbot: 
     table = ImageTable(viewer, lambda layer: True)
     qtbot.addWidget(table)
     table.show_beams("x-ray", 8.0, is_brightness_known=True)
-    assert table.table.horizontalHeaderItem(1).text() == "Energy (keV)"
+    assert table.horizontalHeaderItem(1).text() == "Energy (keV)"
     assert table.beam_value(table.used[0]) == 8.0
-
-
-def test_table_of_shots_follows_the_kind(xray_setup: Any, qtbot: Any, tmp_path: Path) -> None:
-    path = tmp_path / "shots.csv"
-    path.write_text("file, brightness\nshot0.npy, 1.5\n")
-    table = ShotTable()
-    qtbot.addWidget(table)
-    table.file.edit.setText(str(path))
-    table.file.changed.emit()
-    assert table.table.horizontalHeaderItem(1).text() == "Energy (MeV)"
-    table.show_kind("x-ray")
-    assert table.table.horizontalHeaderItem(1).text() == "Energy (keV)"
-    table.table.item(0, 1).setText("12")
-    (row,) = table.shots()
-    assert (row.beam, row.brightness) == ({"photon_energy": 12.0}, 1.5)
-    table.show_kind("optical")  # the table already has energies of photons
-    assert table.table.horizontalHeaderItem(1).text() == "Energy (keV)"

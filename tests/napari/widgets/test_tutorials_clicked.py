@@ -352,7 +352,7 @@ def test_two_energies_are_clicked_to_their_end(
     choose(f"File > Open Sample > {PLUGIN} > Two energies, beam not recorded")
     choose(f"Plugins > {PLUGIN} > Fit several images")
     tool = tool_of(window, "Fit several images")
-    table = tool.images.table
+    table = tool.images
     rows = [[table.item(row, column).text() for column in (0, 1)] for row in range(2)]
     assert rows == [["14.7 MeV", "14.7"], ["3 MeV", "3"]]
     assert table.horizontalHeaderItem(1).text() == "Energy (MeV)"
@@ -433,7 +433,7 @@ def test_film_pack_is_clicked_to_its_end(
     films = [layer for layer in window.layers if role_of(layer) == "shot"]
     assert len(films) == 3
     choose(f"Plugins > {PLUGIN} > Fit several images")
-    table = tool_of(window, "Fit several images").images.table
+    table = tool_of(window, "Fit several images").images
     assert [table.item(row, 0).text() for row in range(3)] == [layer.name for layer in films]
 
     values = np.asarray(fluence.data)

@@ -430,14 +430,14 @@ class SourcePicker(forms.ModelPicker):
         beams = layers.stack_of(self.layer)
         return beams if image is None else source_on(self.layer, beams, image)
 
-    def measured_for_each(self, images: Sequence[tuple[Any, int | None]]) -> list[Shot | None]:
-        """Return the measured sources of a fit's images, each a layer and its plane; or None."""
+    def measured_for_each(self, images: Sequence[Any]) -> list[Shot | None]:
+        """Return the measured sources of a fit's image layers, or None for each."""
         if self.kind != LAYER:
             return [None] * len(images)
         layer = self._selected_layer()
         if layer.ndim != 3:
             beam = layers.image_of(layer, "source")
-            return [source_of_shot(layer, beam, image, plane=plane) for image, plane in images]
+            return [source_of_shot(layer, beam, image) for image in images]
         planes = layers.stack_of(layer)
         if len(planes) != len(images):
             raise InputError(
@@ -445,8 +445,8 @@ class SourcePicker(forms.ModelPicker):
                 "source for each image, or one for all"
             )
         return [
-            source_of_shot(layer, beam, image, plane=plane, of=k)
-            for k, (beam, (image, plane)) in enumerate(zip(planes, images, strict=True))
+            source_of_shot(layer, beam, image, k)
+            for k, (beam, image) in enumerate(zip(planes, images, strict=True))
         ]
 
     def _selected_layer(self) -> Any:

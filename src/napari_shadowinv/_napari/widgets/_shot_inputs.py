@@ -16,13 +16,17 @@ from qtpy.QtWidgets import QFileDialog, QWidget
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._tables import ShotTable
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 LAYER, FILES, TABLE, FOLDER = "layer", "files", "table", "folder"
 _PLACES = {FILES: "Files…", TABLE: "Table (.csv)…", FOLDER: "Watched folder…"}
+_MISSING = {
+    TABLE: "no table is selected: choose a .csv file with a row for each shot, with the columns "
+    "file and energy or wavelength",
+    FOLDER: "no folder is selected: choose the folder in which the shots appear",
+}
 _SEPARATOR = "; "
 ONCE = {"overwrite", "redo_failed"}
 """Choices that count for one run."""
@@ -99,7 +103,13 @@ class ShotsPicker(QWidget):
             "A pattern such as shots/*.tif, files separated by ;, or a file of frames.",
             ask=_ask_for_files,
         )
-        self.table = ShotTable()
+        self.table = forms.PathEdit(
+            "Table of the shots",
+            "shots.csv",
+            "A table (.csv) with a row for each shot and the columns file, setup, energy or "
+            "wavelength, brightness, mask, source, exclude.",
+            qt.TABLES,
+        )
         self.folder = forms.PathEdit(
             "Folder to watch",
             "folder",
@@ -107,16 +117,12 @@ class ShotsPicker(QWidget):
             "Cancel.",
             ask=_ask_for_folder,
         )
-        self._edits = {FILES: self.files, TABLE: self.table.file, FOLDER: self.folder}
-        self._rows = {
-            FILES: forms.labelled("", self.files),
-            TABLE: self.table,
-            FOLDER: forms.labelled("", self.folder),
-        }
+        self.paths = {FILES: self.files, TABLE: self.table, FOLDER: self.folder}
+        self._rows = {kind: forms.labelled("", path) for kind, path in self.paths.items()}
         qt.column(self, forms.labelled("Image", self.layers), *self._rows.values())
         self.layers.picked.connect(self._on_choice)
-        for control in (self.files, self.table, self.folder):
-            control.changed.connect(self.changed)
+        for path in self.paths.values():
+            path.changed.connect(self.changed)
         self._on_choice()
 
     @property
@@ -140,8 +146,8 @@ class ShotsPicker(QWidget):
     @property
     def name(self) -> str:
         """The name of the shots, such as a path."""
-        if self.kind in self._edits:
-            return self._edits[self.kind].path
+        if self.kind in self.paths:
+            return self.paths[self.kind].path
         return "" if self.layers.layer is None else str(self.layers.layer.name)
 
     @property
@@ -157,14 +163,10 @@ class ShotsPicker(QWidget):
         """Return the shots of a stack for a run, or raise an `InputError`."""
         if self.kind == LAYER:
             return layers.stack_of(self.layers.layer)
-        if self.kind == TABLE:
-            return self.table.shots()
-        if self.kind == FOLDER:
-            if not self.folder.path:
-                raise InputError(
-                    "no folder is selected: choose the folder in which the shots appear"
-                )
-            return Path(self.folder.path).expanduser()
+        if self.kind in _MISSING:
+            if not self.name:
+                raise InputError(_MISSING[self.kind])
+            return Path(self.name).expanduser()
         parts = [part.strip() for part in self.files.path.split(_SEPARATOR.strip())]
         paths = [os.path.expanduser(part) for part in parts if part]
         if not paths:
@@ -184,15 +186,7 @@ class StoreSection(QWidget):
             "Store of the results", f"results{STORE_SUFFIX}", tip, ask=_ask_for_store
         )
         self.run, self.watch = forms.ModelForm(RunOptions), forms.ModelForm(WatchOptions)
-        self.cluster = forms.SavedLine(
-            "none: this computer",
-            "Address of a dask cluster, such as tcp://host:8786, as printed by 'dask scheduler'. "
-            "The results are the same. Its workers need access to the shots and the store at the "
-            "same paths.",
-        )
-        self.cluster.setMinimumWidth(60)
-        self._cluster_row = forms.labelled("Cluster", self.cluster)
-        run = forms.section("Run of many shots", self.run, self.watch, self._cluster_row)
+        run = forms.section("Run of many shots", self.run, self.watch)
         self._proposed = ""
         qt.column(self, forms.labelled("Store", self.folder), run)
 
@@ -212,21 +206,12 @@ class StoreSection(QWidget):
             self._proposed = shots.default_store
             self.folder.restore(self._proposed)
         # Watched shots are inverted one by one, as they arrive.
-        for row in (self.run, self._cluster_row):
-            row.setVisible(kind != FOLDER)
+        self.run.setVisible(kind != FOLDER)
         self.watch.setVisible(kind == FOLDER)
 
-    def choices(self, kind: str) -> dict[str, Any]:
-        """Return options and scheduler of a job, or raise an `InputError`."""
-        if kind == FOLDER:
-            return {"options": self.watch.model()}
-        address = self.cluster.text().strip()
-        if address and "://" not in address:
-            raise InputError(
-                f"the cluster's address is '{address}': expected an address such as "
-                "tcp://host:8786, as printed by 'dask scheduler'"
-            )
-        return {"options": self.run.model(), "scheduler": address or "threads"}
+    def options(self, kind: str) -> Any:
+        """Return the options of a run, or raise an `InputError`."""
+        return (self.watch if kind == FOLDER else self.run).model()
 
     def begin(self) -> None:
         """Uncheck what counts for one run: another must not discard its shots."""

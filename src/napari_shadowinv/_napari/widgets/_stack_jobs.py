@@ -61,7 +61,6 @@ class StackJob(Job):
     mask: BoolArray | None = None
     source_mask: BoolArray | None = None
     options: RunOptions | WatchOptions = field(default_factory=RunOptions)
-    scheduler: str = "threads"
     image: Any = None  # the layer of the shots
     companions: tuple[Any, ...] = ()  # layers that lie on the image
     placement: Mapping[str, Any] = field(default_factory=dict)  # keywords of the layers
@@ -101,10 +100,7 @@ class StackJob(Job):
         if isinstance(self.options, WatchOptions):
             watch_stack(shots, self.out, self.recipe, watch=self.options, **callbacks)
         else:
-            scheduler = self.scheduler
-            run_stack(
-                shots, self.out, self.recipe, run=self.options, scheduler=scheduler, **callbacks
-            )
+            run_stack(shots, self.out, self.recipe, run=self.options, **callbacks)
         return self.status
 
     def layers(self, content: RunStatus) -> LayerData:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from qtpy import QtWidgets
-from qtpy.QtCore import QSignalBlocker
+from qtpy.QtCore import QSignalBlocker, Qt
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
@@ -16,7 +16,6 @@ from napari_shadowinv._napari.placement import pixel_mapper
 from napari_shadowinv._napari.widgets import _products as products
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
-from napari_shadowinv._napari.widgets._tables import NumberTable
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.paths import (
     Profile,
@@ -32,6 +31,7 @@ from napari_shadowinv.physics.beam import number_in_unit
 _REDRAW_MS = 40  # while the line moves
 _MAX_NAME_LENGTH = 34
 _MAX_WIDTH = 1e6
+_LIST_HEIGHT_PX = 110
 
 
 def draw_profiles(
@@ -64,7 +64,8 @@ class Analyse(qt.Docked):
         tip = "<qt>Shapes layer with the line. Of several lines, the selected one is used.</qt>"
         self.lines = LayerPicker(self.viewer, tip, "none yet", kinds=("shapes",))
         self._listed: list[Any] = []
-        self.layers = NumberTable("Layers to plot", (), max_rows=4)
+        self.layers = QtWidgets.QListWidget(maximumHeight=_LIST_HEIGHT_PX)
+        self.layers.setSelectionMode(QtWidgets.QListWidget.SelectionMode.NoSelection)
         self.width_edit = forms.SavedLine(
             "0: line only",
             "Width of the strip, perpendicular to the line, over which values are averaged: in "
@@ -81,7 +82,8 @@ class Analyse(qt.Docked):
         self.export = qt.push_button("Export CSV…", "Save the profile as a table.", self._export)
         lines = qt.with_button(self.lines, "✎", "Draw a new line.", self._draw)
         width = forms.labelled("Width", self.width_edit)
-        controls = (forms.labelled("Line", lines), self.layers, width)
+        title = QtWidgets.QLabel("Layers to plot")
+        controls = (forms.labelled("Line", lines), title, self.layers, width)
         results = (self.hint, self.plot, self.measures, self.export, self.problem)
         page, self.products = QtWidgets.QWidget(), products.ProductForm(self.viewer)
         self.products.setMinimumWidth(0)  # that of the window counts
@@ -104,12 +106,15 @@ class Analyse(qt.Docked):
             signal.connect(lambda _: self._schedule_plot())
 
     def checked(self) -> list[Any]:
-        return [layer for row, layer in enumerate(self._listed) if self.layers.is_checked(row)]
+        checked = Qt.CheckState.Checked
+        items = (self.layers.item(row) for row in range(self.layers.count()))
+        pairs = zip(self._listed, items, strict=True)
+        return [layer for layer, item in pairs if item.checkState() == checked]
 
     def check(self, layer: Any, on: bool = True) -> None:
         for row, listed in enumerate(self._listed):
             if listed is layer:
-                self.layers.check(row, on)
+                self.layers.item(row).setCheckState(_state_of(on))
 
     @qt.notify_errors
     def plot_layer(self, layer: Any) -> None:
@@ -200,14 +205,15 @@ class Analyse(qt.Docked):
         images = [layer for layer in reversed(self.viewer.layers) if kind_of(layer) == "image"]
         self._listed = [layer for layer in images if not layer.rgb and layer.ndim >= 2]
         with QSignalBlocker(self.layers):
-            self.layers.setRowCount(len(self._listed))
-            for row, layer in enumerate(self._listed):
+            self.layers.clear()
+            for layer in self._listed:
                 is_new = not any(layer is old for old in earlier)
                 on = any(layer is old for old in checked) or (
                     is_new and layer.visible and (role_of(layer) is not None or not earlier)
                 )
-                self.layers.fill_row(row, layer.name, layer.name, checked=on)
-        self.layers.fit_height()
+                item = QtWidgets.QListWidgetItem(layer.name, self.layers)
+                item.setToolTip(layer.name)
+                item.setCheckState(_state_of(on))
         self._schedule_plot()
 
     @qt.notify_errors
@@ -224,6 +230,10 @@ class Analyse(qt.Docked):
     @qt.notify_errors
     def _export(self) -> None:
         products.export_csv(self, "profile", self.table())
+
+
+def _state_of(on: bool) -> Qt.CheckState:
+    return Qt.CheckState.Checked if on else Qt.CheckState.Unchecked
 
 
 def strip_width(text: str, pixel: float, unit: str) -> tuple[float, str]:

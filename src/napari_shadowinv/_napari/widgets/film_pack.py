@@ -25,89 +25,13 @@ from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, mask_of, new_shapes
 from napari_shadowinv._napari.widgets._results import ResultLayers
-from napari_shadowinv._napari.widgets._tables import Column, NumberTable
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film.pack import FILM_TYPES
 from napari_shadowinv.film.scans import checked_corners
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import write
 from napari_shadowinv.io.images import read_scan
-from napari_shadowinv.pipeline import film_files, read_pack, write_layers
-
-_COLUMNS = (
-    Column("film", "Film", None, "Type of the film.", choices=tuple(FILM_TYPES)),
-    Column(
-        "filters",
-        "Filters in front",
-        None,
-        "Thickness, unit and material of each filter in front of the film, such as 13 um Al; 25 um "
-        "Fe.",
-        320,
-    ),
-)
-_MIN_SIZE_PX = (620, 560)
-
-
-class NewPackDialog(QtWidgets.QDialog):
-    """The scans of a folder in pack order, and entries that the scans do not contain."""
-
-    def __init__(self, folder: Path, parent: QtWidgets.QWidget | None = None) -> None:
-        super().__init__(parent)
-        self.setWindowTitle("New film pack")
-        self.setMinimumSize(*_MIN_SIZE_PX)
-        self._folder = folder
-        self.written: Path | None = None  # the pack file after saving
-        self.form = forms.ModelForm(film_files.NewPack)
-        self.table = NumberTable("Scan, in the order of the beam", _COLUMNS, max_rows=14)
-        self._problem = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
-        choices = QtWidgets.QDialogButtonBox.StandardButton
-        self.buttons = QtWidgets.QDialogButtonBox(choices.Save | choices.Cancel)
-        self.buttons.accepted.connect(self.accept)
-        self.buttons.rejected.connect(self.reject)
-        column = qt.column(self, self.form, self.table, self._problem, margin=9)
-        column.addStretch(1)
-        column.addWidget(self.buttons)
-        layers = film_files.draft_pack(folder)["layers"]
-        self.table.setRowCount(len(layers))
-        for row, layer in enumerate(layers):
-            tip = "Uncheck a scan that is no film of the pack."
-            self.table.fill_row(row, layer["file"], tip, checked=True)
-            self.table.write_row(row, {"film": layer["film"]})
-        self.table.itemChanged.connect(lambda item: item.column() and self.table.enter(item))
-        self.form.entries["film"].line.changed.connect(self._on_film)
-
-    def entries(self) -> dict[str, Any]:
-        facts: Any = self.form.model()
-        layers = [
-            {**self.table.values(row), "file": self.table.item(row, 0).text()}
-            for row in filter(self.table.is_checked, range(self.table.rowCount()))
-        ]
-        for layer in layers:
-            parts = (part.strip() for part in (layer["filters"] or "").split(";"))
-            layer["filters"] = [part for part in parts if part]
-        if not layers:
-            raise InputError("no scan is checked: check the films of the pack")
-        return film_files.draft_pack(self._folder, facts, layers)
-
-    def accept(self) -> None:
-        """Write the pack file, or show the problem."""
-        try:
-            path = self._folder / film_files.PACK_FILE
-            entries = self.entries()
-            overwrite = qt.may_write(self, "New film pack", path)
-            self.written = film_files.write_new_pack(self._folder, entries, overwrite=overwrite)
-        except (InputError, OSError, ValueError) as error:
-            self._problem.show_text(str(error))
-            return
-        super().accept()
-
-    def _on_film(self) -> None:
-        """Show the selected type for all films whose file names contain no type."""
-        facts = film_files.NewPack(film=self.form.entries["film"].line.value)
-        for row, layer in enumerate(film_files.draft_pack(self._folder, facts)["layers"]):
-            self.table.write_row(row, {**self.table.values(row), "film": layer["film"]})
-
+from napari_shadowinv.pipeline import read_pack, write_layers
 
 _SETTLE_MS = 60
 _MIN_MOVE_PX = 0.01  # napari rounds coordinates
@@ -335,10 +259,7 @@ class FilmPack(panels.ToolPanel):
             qt.side_by_side((self.to_fit, 1), (self.write, 1), (self.save, 1)),
         )
         column.setAlignment(Qt.AlignmentFlag.AlignTop)
-        tip = "Create a pack file from a folder of scans."
-        self.new = qt.push_button("New pack…", tip, self._new_pack)
-        pack_row = qt.side_by_side((self.path, 1), (self.new, 0))
-        self.add(forms.labelled("Pack", pack_row), self.keep_earlier, self.panel, self.actions)
+        self.add(forms.labelled("Pack", self.path), self.keep_earlier, self.panel, self.actions)
         self.corners = CornerEditor(self.viewer, self)
 
     def request(self) -> PackJob:
@@ -349,18 +270,6 @@ class FilmPack(panels.ToolPanel):
         pack = read_pack(file)
         name = file.stem if file.stem != "pack" else file.parent.name
         return PackJob(pack, str(file), name, Path(mkdtemp(dir=self._scratch)))
-
-    @qt.notify_errors
-    def _new_pack(self) -> None:
-        folder = QtWidgets.QFileDialog.getExistingDirectory(self, "Folder with the scans of a pack")
-        if not folder:
-            return
-        dialog = NewPackDialog(Path(folder), self)
-        if dialog.exec() and dialog.written is not None:
-            self.path.edit.setText(str(dialog.written))
-            missing = film_files.missing_entries(dialog.entries())
-            action = f"Add to this file: {'; '.join(missing)}." if missing else "Press Run."
-            self.panel.say(f"Wrote {dialog.written}. {action}")
 
     def forget(self) -> None:
         self.panel.say("")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,14 @@ from napari_shadowinv._napari.widgets import _inputs as inputs
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._files import result_buttons
 from napari_shadowinv._napari.widgets._fitting import ResultView
+from napari_shadowinv._napari.widgets._image_table import (
+    ImageTable,
+    beam_column,
+    entries_of,
+    store_entries,
+)
 from napari_shadowinv._napari.widgets._qt import side_by_side
 from napari_shadowinv._napari.widgets._results import result_frame
-from napari_shadowinv._napari.widgets._tables import ImageRow, ImageTable, beam_column
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit, point_spread
@@ -32,13 +38,12 @@ from napari_shadowinv.preprocessing import FIT_STEPS, MeasuredSource, Recipe, Un
 from napari_shadowinv.shot import Shot
 
 
-def _cautions_of(rows: list[ImageRow]) -> dict[str, str]:
+def _cautions_of(images: Sequence[Any]) -> dict[str, str]:
     """Return the warnings of the images' readers as a row of the report."""
-    unique = {id(row.layer): row.layer for row in rows}.values()
     texts = [
-        f"'{layer.name}': {caution.text}"
-        for layer in unique
-        for caution in layers.cautions_of(layer)
+        f"'{image.name}': {caution.text}"
+        for image in images
+        for caution in layers.cautions_of(image)
     ]
     return {"Warning": "; ".join(texts)} if texts else {}
 
@@ -160,12 +165,11 @@ class FitImages(inputs.ImagePanel):
 
     def chosen_image(self) -> Any | None:
         """Return the layer of the reference, to which masks and source of a recipe belong."""
-        row = self.images.reference
-        return None if row is None else row.layer
+        return self.images.reference
 
     def common_psf(self) -> float | None:
         """Return the common point spread of all images; None if they differ."""
-        widths = {self.images.psf(row) for row in self.images.used}
+        widths = {self.images.values(image)["psf"] for image in self.images.used}
         return widths.pop() if len(widths) == 1 else None
 
     def check_choices(self, choices: FitChoices, setup: Setup | None, path: Path) -> None:
@@ -194,55 +198,52 @@ class FitImages(inputs.ImagePanel):
         self.noise.offer(inputs.NOISES | {noise: inputs.NOISES.get(noise, level)})
         self.noise.set_kind(noise)
         self.options.restore(choices.options.model_dump())
-        for row in self.images.used:
-            width = self._spread(choices, row)
+        for image in self.images.used:
+            width = self._spread(choices, image)
             if width is not None:
-                row.store(psf=width)
+                store_entries(image, psf=width)
         self._show_beams()
 
-    def _spread(self, choices: FitChoices, row: ImageRow) -> float | None:
+    def _spread(self, choices: FitChoices, image: Any) -> float | None:
         """Return the point spread of an image in px after the steps, by a recipe."""
         setup = self.setup.complete_setup()
         if setup is None or (choices.source_size is None and choices.resolution is None):
             return choices.psf
-        shot = Shot(np.zeros(row.data.shape), setup=self._base_setup(row, setup))
+        shot = Shot(np.zeros(image.data.shape), setup=self._base_setup(image, setup))
         processed: Any = Recipe(steps=self.steps.steps()).move(shot).setup
         return point_spread(processed, choices.source_size or 0.0, choices.resolution or 0.0)
 
     def request(self) -> FitJob:
-        rows = self._rows()
-        first = rows[0]
+        images = self._images()
+        first = images[0]
         recipe = self.recipe()
-        shots = self._shots(rows, recipe.setup)
+        shots = self._shots(images, recipe.setup)
         steps = "; ".join(step.summary for step in recipe.steps)
-        used_layers = (*(row.layer for row in rows), self.masks.layer)
-        described = self.describe(first.layer, recipe, used_layers, steps=steps)
-        described["origins"] |= _cautions_of(rows)
+        described = self.describe(first, recipe, (*images, self.masks.layer), steps=steps)
+        described["origins"] |= _cautions_of(images)
         return FitJob(
-            shots=shots,
-            name=f"{first.layer.name} fit",
-            frame=result_frame(first.layer, recipe),
-            **described,
+            shots=shots, name=f"{first.name} fit", frame=result_frame(first, recipe), **described
         )
 
-    def _shots(self, rows: list[ImageRow], setup: Setup | None) -> tuple[Shot, ...]:
+    def _shots(self, images: Sequence[Any], setup: Setup | None) -> tuple[Shot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
-        images = [shot_of_layer(row.layer, row.data, row.plane) for row in rows]
-        sources = self.source.measured_for_each([(row.layer, row.plane) for row in rows])
-        factors = self._known_brightness(rows)
+        sources = self.source.measured_for_each(images)
+        rows = [self.images.values(image) for image in images]
+        # One that is 1 for all need not be said.
+        is_known = self.brightness.kind != "free" and any(row["brightness"] != 1 for row in rows)
         return tuple(
             replace(
-                image,
-                name=row.name,
-                setup=None if setup is None else self._setup_of(row, setup),
+                shot_of_layer(image, layers.image_of(image)),
+                name=image.name,
+                setup=None if setup is None else self._setup_of(image, setup),
                 source=source,
-                mask=self.masks.usable(row.layer),
-                strength=(self.images.beam_value(row),) if setup is None else None,
-                brightness=factor,
-                psf=self.images.psf(row),
+                mask=self.masks.usable(image),
+                strength=(self.images.beam_value(image),) if setup is None else None,
+                brightness=row["brightness"] if is_known else None,
+                psf=row["psf"],
                 measured=self.source.layer is None or not about.is_estimate(self.source.layer),
             )
-            for row, image, source, factor in zip(rows, images, sources, factors, strict=True)
+            for image, row, source in zip(images, rows, sources, strict=True)
         )
 
     def show_result(self, finished: Finished, job: FitJob) -> None:
@@ -251,74 +252,76 @@ class FitImages(inputs.ImagePanel):
 
     def _show_cost(self) -> None:
         try:
-            rows = self._rows()
-            shape = Recipe(steps=self.steps.steps()).shape_after(rows[0].data.shape)
+            images = self._images()
+            shape = Recipe(steps=self.steps.steps()).shape_after(images[0].data.shape)
             options = self.options.model()
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
         is_unknown = self.source.kind == inputs.UNKNOWN
         fields = len(self.fields.kind.split(inputs.BOTH))
-        estimate = TimeEstimate(shape, len(rows), fields, is_unknown, options)  # type: ignore[arg-type]
+        estimate = TimeEstimate(shape, len(images), fields, is_unknown, options)  # type: ignore[arg-type]
         self.cost.show_text(estimate.text(FitJob.pace))
 
-    def _rows(self) -> list[ImageRow]:
-        rows = self.images.used
-        if len(rows) < 2:
+    def _images(self) -> list[Any]:
+        images = self.images.used
+        if len(images) < 2:
             raise InputError(
-                f"{len(rows) or 'no'} image{'s are' if not rows else ' is'} checked, expected two "
-                "or more of one object: open them, or use 'Refine' in Invert for one image"
+                f"{len(images) or 'no'} image{'s are' if not images else ' is'} checked, expected "
+                "two or more of one object: open them, or use 'Refine' in Invert for one image"
             )
-        shape = tuple(rows[0].data.shape)
-        for row in rows[1:]:
-            if tuple(row.data.shape) != shape:
+        shape = tuple(images[0].data.shape)
+        for image in images[1:]:
+            if tuple(image.data.shape) != shape:
                 raise InputError(
-                    f"'{row.name}' has shape {tuple(row.data.shape)}, '{rows[0].name}' {shape}: "
-                    "all images must have the same shape; crop or uncheck the image that differs"
+                    f"'{image.name}' has shape {tuple(image.data.shape)}, '{images[0].name}' "
+                    f"{shape}: all images must have the same shape; crop or uncheck the image that "
+                    "differs"
                 )
-        return rows
+        return images
 
-    def _known_brightness(self, rows: list[ImageRow]) -> list[float] | list[None]:
-        """Return the brightness of each image, or None for each if it is fitted or 1 for all."""
-        if self.brightness.kind == "free":
-            return [None] * len(rows)
-        factors = [self.images.brightness(row) for row in rows]
-        return [None] * len(rows) if factors == [1.0] * len(rows) else factors
-
-    def _setup_of(self, row: ImageRow, setup: Setup) -> Setup:
+    def _setup_of(self, image: Any, setup: Setup) -> Setup:
         """Return the setup of an image, its own or the reference's, with the beam of its row."""
-        base = self._base_setup(row, setup)
-        beam = self.images.beam
-        values = {**base.model_dump(), beam.name: self.images.beam_value(row)}
+        beam, base = self.images.beam, self._base_setup(image, setup)
+        values = {**base.model_dump(), beam.name: self.images.beam_value(image)}
         model_class = SETUPS[setup.kind]
         names = labels_of(model_class) | {beam.name: f"'{beam.title}'"}
-        return validate(model_class, values, f"the setup of '{row.name}'", names)
+        return validate(model_class, values, f"the setup of '{image.name}'", names)
 
-    def _base_setup(self, row: ImageRow, setup: Setup) -> Setup:
-        row_setup = row.setup if row.plane is None and row != self.images.reference else None
-        return row_setup if row_setup is not None and row_setup.kind == setup.kind else setup
+    def _base_setup(self, image: Any, setup: Setup) -> Setup:
+        own = about.setup_of(image)
+        is_of_kind = own is not None and own.kind == setup.kind
+        return own if own and is_of_kind and image is not self.images.reference else setup
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
         # Another widget may have changed the setup of the reference.
-        row = self.images.reference
-        if self._ready and row is not None and row.setup not in (None, self.setup.complete_setup()):
-            self.setup.suggest(row.setup, about.setup_origin_of(row.layer))
+        setup = self._setup_of_reference()
+        if self._ready and setup not in (None, self.setup.complete_setup()):
+            self.setup.suggest(setup, about.setup_origin_of(self.images.reference))
+
+    def _setup_of_reference(self) -> Any:
+        image = self.images.reference
+        return None if image is None else about.setup_of(image)
 
     def _on_reference(self) -> None:
         """Show the setup of a new reference; without a setup it gets the last one."""
-        row = self.images.reference
-        old_setup = self.setup.complete_setup()
-        image = None if row is None else row.layer
+        image, old_setup = self.images.reference, self.setup.complete_setup()
         # Other images show the same object: none of them is the beam of another.
         has_beam = image is not None and about.result_of(image) is not None
         self.source.follow(image if has_beam else None)
         self.setup.follow(image)
-        if row is not None:
-            self.masks.follow(row.layer)
-            base = row.setup or old_setup
-            if base is not None:
-                self._apply_setup(row, base)
+        if image is not None:
+            self.masks.follow(image)
+            own = self._setup_of_reference()
+            if (base := own or old_setup) is not None:
+                values, beam = base.model_dump(), beam_column(base.kind).name
+                entry = entries_of(image).get(beam)
+                if isinstance(entry, float) and own is None:
+                    values[beam] = entry
+                setup = self.setup.complete_setup()
+                if setup is None or values != setup.model_dump():
+                    self.setup.show_setup(values)
         self.view.empty()
         self._on_setup()
         # A complete setup is folded to show the controls below.
@@ -326,15 +329,6 @@ class FitImages(inputs.ImagePanel):
             self.setup_section.expand(animate=False)
         else:
             self.setup_section.collapse(animate=False)
-
-    def _apply_setup(self, row: ImageRow, base: Setup) -> None:
-        values, beam = base.model_dump(), beam_column(base.kind).name
-        entry = row.entries().get(beam)
-        if isinstance(entry, float) and (row.plane is not None or row.setup is None):
-            values[beam] = entry
-        setup = self.setup.complete_setup()
-        if setup is None or values != setup.model_dump():
-            self.setup.show_setup(values)
 
     def _set_beam(self, value: float) -> None:
         """Set the energy or wavelength of the shown setup from the reference's row."""

@@ -143,17 +143,14 @@ class Invert(ImagePanel):
         self.shots.changed.connect(self._on_shots)
         self.image.edited.connect(self._forget_report)
         self.panel.progressed.connect(self._on_progress)
-        self.setup.changed.connect(lambda: self.shots.table.show_kind(self.setup.picker.kind))
-        changes = [control.changed for name, control in self.parts().items() if name != "cluster"]
+        changes = [control.changed for control in self.parts().values()]
         masks = self.masks.layers, self.source_masks.layers
         edits = [each.edited for each in (self.image, *masks, self.crop, self.source.layers)]
-        cluster = self.store.cluster.editingFinished
-        for signal in (*changes, cluster, self.live.toggled, self.crop.picked, *edits):
+        for signal in (*changes, self.live.toggled, self.crop.picked, *edits):
             signal.connect(self.on_change)
 
     def parts(self) -> dict[str, Any]:
-        store = self.store
-        choices = {"run": store.run, "watch": store.watch, "cluster": store.cluster}
+        choices = {"run": self.store.run, "watch": self.store.watch}
         return {**super().parts(), "painted_is_object": self.source_masks, **choices}
 
     def state(self) -> dict[str, Any]:
@@ -237,7 +234,7 @@ class Invert(ImagePanel):
                 source_mask=hidden,
                 placement={} if layer is None else placement_on(layer, recipe),
                 limits=self.stack_view.limits_of(out),
-                **self.store.choices(self.shots.kind),
+                options=self.store.options(self.shots.kind),
                 **described,
             )
         shot = replace(
