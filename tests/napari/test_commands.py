@@ -248,7 +248,7 @@ def test_from_the_menu_the_selected_image_is_not_its_own_source(
     moved = window.layers[-1]
     assert moved.name.startswith("beam moved by y +2.")
     in_loop(registered("bin_pixels"))
-    assert len(window.layers) == 4
+    qtbot.waitUntil(lambda: len(window.layers) == 4, timeout=30_000)
     np.testing.assert_allclose(window.layers[-1].data[0, 0], moved.data[:2, :2].sum())
     assert beam in window.layers
 

@@ -11,7 +11,6 @@ import pytest
 from napari.components import ViewerModel
 
 from napari_shadowinv import ProtonSetup, read, write
-from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.layer_metadata import (
     Frame,
     Result,
@@ -22,7 +21,7 @@ from napari_shadowinv._napari.layer_metadata import (
     role_of,
     unit_of,
 )
-from napari_shadowinv._napari.layers import add_layers
+from napari_shadowinv._napari.layers import add_layers, fit_layers
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Assessment, Verdict

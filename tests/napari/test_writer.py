@@ -135,18 +135,6 @@ def test_painted_caustics_are_kept(viewer: ViewerModel, solved: Inversion, tmp_p
     np.testing.assert_array_equal(caustic[5:], solved.caustic[5:])
 
 
-def test_a_layer_that_was_changed_is_named(
-    viewer: ViewerModel, solved: Inversion, tmp_path: Path, messages: list[str]
-) -> None:
-    layers = by_role(add_to_viewer(viewer, solved, all_layers=True))
-    viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
-    assert messages == []
-    layers["potential"].data = layers["potential"].data + 1
-    viewer.layers.save(str(tmp_path / "b.shadowinv"), plugin=PLUGIN)
-    (text,) = messages
-    assert "'✓ potential (px²)' changed since the result was computed" in text
-
-
 def test_pradformat_has_the_potential(
     viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
 ) -> None:

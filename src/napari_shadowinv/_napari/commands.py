@@ -44,6 +44,7 @@ class _Selection:
     setup: Setup | None
     setup_origin: str
     role: str | None
+    layer: Any
 
     @property
     def image(self) -> FloatArray:
@@ -100,7 +101,7 @@ def refine(
     job = refinement(layer, layer, name_of_result(layer), psf=0.0)
     if viewer is None or not viewer_sync.in_event_loop():
         return list(job.work(lambda _: None, lambda: False).layer_data)
-    _open_widget(viewer, "Invert").refine_layer(layer)
+    _open_widget(viewer, "Invert").refine(layer)
     return []
 
 
@@ -158,16 +159,13 @@ def crop(
         show_info(f"Draw a rectangle on '{selection.name}', then choose this again")
         return []
     height, width = step.shape_after(selection.shot.shape)
-    return [_moved_layer(selection, layer, step, f"cropped to {width} × {height} px")]
+    return [_moved_layer(selection, step, f"cropped to {width} × {height} px")]
 
 
-@viewer_sync.notify_errors(otherwise=list)
-def bin_pixels(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> list[napari.types.LayerDataTuple]:
+@_in_thread("Binning", about.may_be_source)
+def bin_pixels(selection: _Selection, _: ShouldStop) -> results.LayerData:
     """Sum blocks of 2 × 2 pixels of the selected image."""
-    selection = _select_image(layer, viewer, about.may_be_source)
-    return [_moved_layer(selection, layer, preprocessing.Bin(factor=2), "binned 2 × 2")]
+    return [_moved_layer(selection, preprocessing.Bin(factor=2), "binned 2 × 2")]
 
 
 @viewer_sync.notify_errors(otherwise=list)
@@ -175,12 +173,12 @@ def align_source(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
     """Shift a source so that it fits the selected image."""
-    layer, viewer = without_proxy(layer), without_proxy(viewer)
     selection = _select_image(layer, viewer)
-    source, name = _source_for(selection, layer, viewer)
+    source, name = _source_for(selection, without_proxy(viewer))
 
     def align(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
-        measured = preprocessing.measure_shift(selection.image, source, about.usable_of(layer))
+        usable = about.usable_of(selection.layer)
+        measured = preprocessing.measure_shift(selection.image, source, usable)
         if not measured.is_significant.any():
             raise InputError(f"'{name}' need not be moved, or cannot: its shift is {measured.text}")
         aligned = preprocessing.move(source, measured.significant)
@@ -191,46 +189,27 @@ def align_source(
     return _start(selection, align, "Aligning the source with", viewer)
 
 
-@viewer_sync.notify_errors(otherwise=lambda: None)
-def plot_along_line(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> None:
-    """Plot the selected image along a line, in *Analyse*."""
-    _open_widget(viewer, "Analyse").plot_layer(without_proxy(layer))
+def _opens(title: str, show: Callable[[Any, Any], None]) -> Callable[..., None]:
+    """Return the command that opens a widget by its title, and shows the selected layer in it."""
+
+    def command(
+        layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
+    ) -> None:
+        show(_open_widget(viewer, title), without_proxy(layer))
+
+    return viewer_sync.notify_errors(otherwise=lambda: None)(command)
 
 
-@viewer_sync.notify_errors(otherwise=lambda: None)
-def measure_products(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> None:
-    """Measure products of the result that the selected layer belongs to, in *Analyse*."""
-    _open_widget(viewer, "Analyse").measure_layer(without_proxy(layer))
+plot_along_line = _opens("Analyse", lambda tool, layer: tool.plot_layer(layer))
+measure_products = _opens("Analyse", lambda tool, layer: tool.measure_layer(layer))
+predict_image = _opens("Simulate", lambda tool, layer: tool.start_from(layer))
+edit_setup = _opens("Invert", lambda tool, layer: tool.edit_setup(layer))
+watch_folder = _opens("Invert", lambda tool, _: tool.choose_folder())
 
 
-@viewer_sync.notify_errors(otherwise=lambda: None)
-def predict_image(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> None:
-    """Predict the image of the selected field or potential, in *Simulate*."""
-    _open_widget(viewer, "Simulate").start_from(without_proxy(layer))
-
-
-@viewer_sync.notify_errors(otherwise=lambda: None)
-def watch_folder(viewer: napari.Viewer | None = None) -> None:
-    """Choose a folder whose shots are inverted as they arrive, in *Invert*."""
-    _open_widget(viewer, "Invert").choose_folder()
-
-
-@viewer_sync.notify_errors(otherwise=lambda: None)
-def edit_setup(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> None:
-    """Enter the setup of the selected image, in *Invert*."""
-    _open_widget(viewer, "Invert").edit_setup(without_proxy(layer))
-
-
-def _source_for(selection: _Selection, layer: Any, viewer: Any) -> tuple[FloatArray, str]:
+def _source_for(selection: _Selection, viewer: Any) -> tuple[FloatArray, str]:
     """Return the source of an image and its name: selected with it, supplied, or the only one."""
+    layer = selection.layer
     layers = [] if viewer is None else [each for each in viewer.layers if each is not layer]
     fitting = [
         each
@@ -284,7 +263,8 @@ def _select_image(
         data, name = data[index], f"{name} {','.join(map(str, index))}"
     shot, frame = shot_of_layer(layer, np.asarray(data)), frame_of(layer)
     setup, origin = about.setup_of(layer), about.setup_origin_of(layer)
-    return _Selection(shot, name, frame, setup, origin, about.role_of(layer))
+    role = about.role_of(layer)
+    return _Selection(shot, name, frame, setup, origin, role, without_proxy(layer))
 
 
 def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> list[Any]:
@@ -301,11 +281,9 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
     return []
 
 
-def _moved_layer(
-    selection: _Selection, layer: Any, step: Step, title: str
-) -> results.FullLayerData:
+def _moved_layer(selection: _Selection, step: Step, title: str) -> results.FullLayerData:
     """Return an image after a step that moves pixels, with its source and usable pixels."""
-    source, usable = about.source_of(layer), about.usable_of(layer)
+    source, usable = about.source_of(selection.layer), about.usable_of(selection.layer)
     shot = replace(selection.shot, setup=selection.setup, source=source, mask=usable)
     moved = step.apply(shot)
     frame = selection.frame.beneath(step.matrix(shot.shape))

@@ -127,14 +127,6 @@ def _with_shots(matrix: Matrix, stacked: bool) -> FloatArray:
     return extended
 
 
-def place_image(layer: Any, setup: Setup) -> None:
-    """Set the pixel size of an image, whose last axes are y and x, from a setup."""
-    frame = frame_for(layer.data.shape, setup)
-    layer.scale = (*layer.scale[:-2], *frame.scale)
-    layer.units = (*layer.units[:-2], *frame.units)
-    layer.axis_labels = (*layer.axis_labels[:-2], "y", "x")
-
-
 _LayerTuple = tuple[Any, dict[str, Any], str]
 
 

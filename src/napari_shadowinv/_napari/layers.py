@@ -1,4 +1,8 @@
-"""Results as layers, with the features of their sites."""
+"""Results as layers.
+
+- an inversion, with the features of its sites: `result_layers`; in a viewer: `add_to_viewer`
+- a fit, with its images and alternative solutions: `fit_layers`; a field: `field_layers`
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, role_of
@@ -18,6 +23,7 @@ from napari_shadowinv.facts import Level
 from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
+from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.significance import Structures, significance
 from napari_shadowinv.physics.units import (
     ShownField,
@@ -29,6 +35,7 @@ from napari_shadowinv.physics.units import (
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.result import RetrievedField
     from napari_shadowinv.physics.setup import Setup
@@ -49,6 +56,10 @@ _MIN_ARROW_LENGTH = 0.05  # relative to the longest
 _MAX_SHOWN_SITES = 200_000
 _LIMITS_PERCENTILE = 99.7
 _LIMITS_SAMPLE_SIZE = 100_000  # pixels
+# Of alternative solutions only these are shown.
+_ALTERNATIVE_ROLES = ("field", "arrows")
+_KINDS = {kind.role: kind for kind in about.KINDS if kind.shown_of != "stack"}
+_MAX_BEAM_DIFFERENCE = 1e-6  # relative to the mean
 _MIN_SIGNIFICANCE_LIMIT = 4.0  # σ, so that a map of noise looks like noise
 
 
@@ -181,6 +192,96 @@ def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> La
             usable = None if content.mask.all() else content.mask
             keywords["metadata"][about.KEY] |= {"source": content.source, "usable": usable}
     return layer_data
+
+
+def fit_layers(
+    result: Result[Fit], frame: Frame, name: str, *, with_images: bool = False
+) -> LayerData:
+    """Describe the layers of a fit, the lowest first; the first of its fields is visible.
+
+    The fields of alternative solutions are hidden. `with_images` as for a file.
+    """
+    fit = result.content
+    verdict = {"verdict": fit.verdict.value, "explanation": fit.explanation}
+    facts = shared_metadata(result, name) | verdict
+    layers = _image_layers(fit, frame, name, facts, with_images=with_images)
+    for number in reversed(range(len(fit.basins))):
+        layers += _solution_layers(fit, number, frame, name, facts)
+    return layers
+
+
+def _solution_layers(
+    fit: Fit, number: int, frame: Frame, name: str, facts: dict[str, Any]
+) -> LayerData:
+    """Describe the fields of a solution; of others than the best, only strength and arrows."""
+    import xarray as xr
+
+    layers: LayerData = []
+    for m, field in reversed(list(enumerate(fit.fields))):
+        title, displacement = name, field.displacement
+        if number:
+            start = fit.basins[number].start
+            title = f"{name} from the inversion" if start == "given" else f"{name} {start}"
+            displacement = _full_size(fit.basins[number].displacement[m], displacement.shape[1:])
+        variables: dict[str, Any] = {"displacement": (("component", "y", "x"), displacement)}
+        part, level = {"part": f"{field.name} {number}"}, None
+        if not number:
+            variables["potential"] = ("y", "x"), field.potential
+            if fit.mask.shape[1:] == field.potential.shape:
+                variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
+            std, structures = per_pixel_of(field.errors), fit.structures(field)
+            variables |= significance_variables(displacement, std, structures)
+            part, level = {"part": field.name} if m else {}, fit.headline.level
+        title = title if len(fit.fields) == 1 else f"{title} {field.name}"
+        deflector = deflector_titles()[field.name]
+        view = View(xr.Dataset(variables), fit.setup, deflector=deflector)
+        more = facts | part | {"displacement": displacement}
+        for layer in dataset_layers(view, frame, title, more, level):
+            layer[1]["visible"] &= m == number == 0
+            if not number or role_of(layer[1]) in _ALTERNATIVE_ROLES:
+                layers.append(layer)
+    return layers
+
+
+def _image_layers(
+    fit: Fit, frame: Frame, name: str, facts: dict[str, Any], *, with_images: bool
+) -> LayerData:
+    """Describe hidden layers of the re-projections, the residuals and a non-uniform beam."""
+    grey = intensity_limits(fit.images[0])
+    means = [image[use].mean() for image, use in zip(fit.images, fit.mask, strict=True)]
+    percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)
+    content = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
+    if np.ptp(fit.source[0]):
+        # One plane unless the beams differ in more than their brightness.
+        beams = fit.source / fit.source.mean(axis=(1, 2), keepdims=True)
+        is_common = np.abs(beams - beams[0]).max() < _MAX_BEAM_DIFFERENCE
+        content = {"source": (fit.source[:1] if is_common else fit.source, grey), **content}
+    if with_images:
+        content = {"image": (fit.images, grey), **content}
+    layers: LayerData = []
+    for role, (planes, limits) in content.items():
+        kind = _KINDS[role]
+        data = planes[0] if len(planes) == 1 else planes
+        more = facts | {"main": role != "reprojection"}
+        if role == "image" and len(planes) == 1:
+            # With beam and mask, the image can be inverted again.
+            usable = None if fit.mask.all() else fit.mask[0]
+            more |= {"source": fit.source[0], "usable": usable}
+        look = {
+            "visible": False,
+            "colormap": colour_map(kind.colormap),
+            "contrast_limits": limits or symmetric_limits(planes[0]),
+        }
+        more |= {"level": fit.headline.level, "stack_axis": "image" if data.ndim == 3 else ""}
+        layers.append(kind.layer(data, name, frame, fit.setup, look, **more))
+    return layers
+
+
+def _full_size(displacement: FloatArray, shape: tuple[int, ...]) -> FloatArray:
+    """Interpolate values at every second pixel, between pixel pairs, to all pixels."""
+    points = (np.mgrid[: shape[0], : shape[1]] - 0.5) / 2
+    planes = [map_coordinates(plane, points, order=1, mode="nearest") for plane in displacement]
+    return np.stack(planes)
 
 
 def dataset_layers(

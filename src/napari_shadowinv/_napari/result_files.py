@@ -15,9 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.fit_layers import fit_layers
 from napari_shadowinv._napari.layer_metadata import Frame, Result, frame_for, frame_of, main_layers
-from napari_shadowinv._napari.layers import FullLayerData, LayerData, field_layers, result_layers
+from napari_shadowinv._napari.layers import (
+    FullLayerData,
+    LayerData,
+    field_layers,
+    fit_layers,
+    result_layers,
+)
 from napari_shadowinv._napari.packs import pack_layers
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
@@ -48,7 +53,7 @@ def layers_of_result(result: Result[AnyResult], frame: Frame, name: str = "") ->
     """Describe the layers of any result, the lowest first."""
     functions: dict[ResultKind, Callable[..., LayerData]] = {
         ResultKind.INVERSION: result_layers,
-        ResultKind.FIT: partial(fit_layers, alone=True),
+        ResultKind.FIT: partial(fit_layers, with_images=True),
         ResultKind.FILM_DOSES: pack_layers,
         ResultKind.FIELD: field_layers,
     }
@@ -196,10 +201,8 @@ def _write(path: str, layers: Sequence[FullLayerData], form: Format) -> list[str
 
 
 def dataset_to_save(layers: Sequence[FullLayerData]) -> xarray.Dataset:
-    """Return the dataset of the result that layers show; warn about changed layers."""
-    parts, result = _common_result(layers)
-    _warn_of_changes(parts, result)
-    return dataset_of_layers(parts, result)
+    """Return the dataset of the result that layers show, as it was computed."""
+    return dataset_of_layers(*_common_result(layers))
 
 
 def _common_result(layers: Sequence[FullLayerData]) -> tuple[LayerData, Result[AnyResult]]:
@@ -218,24 +221,6 @@ def _common_result(layers: Sequence[FullLayerData]) -> tuple[LayerData, Result[A
         )
     (common,) = results.values()
     return [layer for layer in layers if about.result_of(layer[1]) is common], common
-
-
-def _warn_of_changes(layers: Sequence[FullLayerData], result: Result[AnyResult]) -> None:
-    """Warn about layers whose data differ from the file."""
-    images = [layer for layer in layers if layer[2] == "image"]
-    originals = {about.layer_key(layer[1]): layer[0] for layer in layers_of_result(result, Frame())}
-    changed = []
-    for layer in images:
-        original: Any = originals.get(about.layer_key(layer[1]))
-        if layer[0] is not original and not np.array_equal(layer[0], original, equal_nan=True):
-            changed.append(_name(layer))
-    if changed:
-        from napari.utils.notifications import show_warning
-
-        show_warning(
-            f"{_quote_names(changed)} changed since the result was computed: the file contains the "
-            "original result; save the changed layers separately, as images"
-        )
 
 
 def _name(layer: FullLayerData) -> str:

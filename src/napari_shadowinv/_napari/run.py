@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from napari.utils import cancelable_progress as activity
+from napari.utils import cancelable_progress
 from napari.utils.notifications import notification_manager
 from qtpy import QtWidgets
 from qtpy.QtCore import Signal
@@ -49,7 +49,7 @@ _STAGES = {
     "register": "Aligning the films",
     "unfold": "Unfolding the spectra",
 }
-_MAILBOX_POLL_MS, _PROGRESS_POLL_MS = 10, 500
+_MAILBOX_POLL_MS, _CROSS_POLL_MS, _PROGRESS_POLL_MS = 10, 100, 500
 # Handling an event of the window may need the interpreter a dozen times: threads hand it over
 # after this time instead of 5 ms.
 _SWITCH_INTERVAL_S = 1e-3
@@ -98,20 +98,19 @@ class Run(QtWidgets.QWidget):
     """A button to run and cancel, with a progress bar and a line of text.
 
     It does one work at a time; cancelled work that does not stop is left alone after the `patience`
-    of its tag (s). The `task` names the work in napari's activity dock.
+    of its tag (s).
     """
 
     # A change outside the canvas redraws the whole window. Without a graphics card, an animated bar
-    # would slow the work down: this bar changes once a poll, and napari's animated activity dock is
-    # used only while the button is hidden.
+    # would slow the work down: this bar changes once a poll.
 
     started = Signal()
     progressed = Signal(object)
     ended = Signal(object)
 
-    def __init__(self, task: str, text: str, tip: str) -> None:
+    def __init__(self, text: str, tip: str) -> None:
         super().__init__()
-        self._task, self._text = task, text
+        self._text = text
         self._box: _Mailbox | None = None
         self._pending: tuple[Work, Any, bool] | None = None
         self._to_stop: list[_Mailbox] = []
@@ -122,7 +121,6 @@ class Run(QtWidgets.QWidget):
         self.bar.setVisible(False)
         self.status = forms.WrappingLabel()
         qt.column(self, self.button, self.bar, self.status)
-        self._activity: list[activity] = []  # the bar of the current stage, if any
         self._quiet = False
         self._progress: Progress | None = None
         self._start_time = 0.0
@@ -130,7 +128,6 @@ class Run(QtWidgets.QWidget):
         self._progress_timer = qt.timer(self, _PROGRESS_POLL_MS, self._show_progress)
         # Closing a window stops its work; this object no longer exists then.
         qt.when_destroyed(self, partial(_stop, self._to_stop))
-        qt.when_destroyed(self, partial(_close, self._activity))
 
     @property
     def running(self) -> bool:
@@ -184,8 +181,6 @@ class Run(QtWidgets.QWidget):
         box = self._box
         if box is None:
             return
-        if any(bar.is_canceled for bar in self._activity) and not self.cancelling:
-            self.cancel()
         outcome, progress = box.outcome, box.progress
         if progress is not None:
             box.progress = None
@@ -212,7 +207,6 @@ class Run(QtWidgets.QWidget):
         self.bar.setRange(0, 1)
         self.bar.setValue(0)
         self.bar.setVisible(True)
-        self._show_activity(self._task, Progress("", 0, None))
         self.say("Starting…")
         self._progress_timer.start()
 
@@ -221,30 +215,14 @@ class Run(QtWidgets.QWidget):
         if progress is None or self.cancelling:
             return
         stage = _STAGES.get(progress.stage, progress.stage)
-        self._show_activity(f"{self._task}: {stage}", progress)
         self.bar.setRange(0, progress.total or 1)
         self.bar.setValue(progress.step if progress.total else 0)
         text = f"{stage}: {progress.text}" if progress.text else f"{stage}…"
         seconds = time.monotonic() - self._start_time
         self.say(f"{text} ({seconds:.0f} s)" if seconds >= _MIN_SHOWN_TIME_S else text)
 
-    def _show_activity(self, text: str, progress: Progress) -> None:
-        """Show the stage, with a cross to cancel, in napari's dock while the button is hidden."""
-        total = progress.total or 0
-        bar = next(iter(self._activity), None)
-        if self.isVisible() or bar is None or (bar.desc, bar.total) != (text, total):
-            _close(self._activity)
-        if self.isVisible():
-            return
-        if not self._activity:
-            self._activity.append(activity(total=total, desc=text))
-        bar = self._activity[0]
-        if total and progress.step > bar.n:
-            bar.update(progress.step - bar.n)
-
     def _show_end(self, outcome: Outcome) -> None:
         self._progress_timer.stop()
-        _close(self._activity)
         self.bar.setVisible(False)
         self.button.setText(self._text)
         self.button.setEnabled(True)
@@ -260,18 +238,20 @@ class Run(QtWidgets.QWidget):
             show_user_error(error)
 
 
-def _close(bars: list[activity]) -> None:
-    while bars:
-        bars.pop().close()
-
-
 def run_in_background(task: str, work: Work, done: Callable[[Any], Any]) -> None:
-    """Run some work, shown in napari's activity dock only, until its window closes."""
+    """Run some work, shown in napari's activity dock with a cross, until its window closes."""
     app: Any = QtWidgets.QApplication
     windows = [each for each in app.topLevelWidgets() if isinstance(each, QtWidgets.QMainWindow)]
-    run = Run(task, "", "")
+    run, bar = Run("", ""), cancelable_progress(total=0, desc=task)
     active = app.activeWindow()  # perhaps a dialog
     run.setParent(max(windows, key=lambda each: (each is active, each.isVisible()), default=None))
+    qt.when_destroyed(run, bar.close)
+
+    def look_at_cross() -> None:
+        if bar.is_canceled:
+            run.cancel()
+
+    qt.timer(run, _CROSS_POLL_MS, look_at_cross).start()
 
     def end(outcome: Outcome) -> None:
         run.deleteLater()

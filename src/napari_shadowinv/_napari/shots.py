@@ -102,28 +102,25 @@ def _frame(shot: Shot) -> Frame:
     return frame_for(shot.image.shape, shot.setup, pixel_size=side)
 
 
-def shot_of_layer(layer: Any, image: Any, plane: int | None = None) -> Shot:
-    """Return a layer's image or a plane of a stack, perhaps lazy, as a radiograph with its file."""
+def shot_of_layer(layer: Any, image: Any) -> Shot:
+    """Return a layer's image, perhaps lazy, as a radiograph with its file."""
     metadata = metadata_of(layer)
     path = metadata.get("path") or layer.source.path
     shot = Shot(image, cautions=tuple(metadata.get("cautions", ())))
     if metadata.get("result") is not None:
         return shot  # processed images differ from their file
-    paths = metadata.get("paths", ())
-    if plane is not None and len(paths) == len(layer.data):
-        return replace(shot, path=Path(paths[plane]))
     # A plane split off a stack keeps the path of the first file.
-    if layer.ndim != 2 or len(paths) > 1 or path is None:
+    if layer.ndim != 2 or len(metadata.get("paths", ())) > 1 or path is None:
         return shot
     return replace(shot, path=Path(path), metadata=metadata.get("file") or {})
 
 
-def source_of_shot(layer: Any, data: Any, image: Any, plane: int | None = None) -> Shot:
-    """Return a layer's data, or a plane's of its stack, as the source of an image layer, or None.
+def source_of_shot(layer: Any, data: Any, image: Any) -> Shot:
+    """Return a layer's data as the source of an image layer, or of files (None).
 
     A file of another shot, or of more pixels than the image has, is not the source's.
     """
-    beam = shot_of_layer(layer, data, plane)
+    beam = shot_of_layer(layer, data)
     if image is None:
         return beam
     on_image = source_on(layer, data, image)

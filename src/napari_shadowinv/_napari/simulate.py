@@ -1,51 +1,308 @@
-"""The window that simulates an object before its shot: `Simulate`."""
+"""The window that simulates an object before its shot: `Simulate`.
+
+- the object: a phantom, a 3-D field in a file (`GridFile`), or the field of a layer (`InputField`)
+- its image: `ForwardJob`; a plan of shots of it: `PlanJob`
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import Field, create_model
 from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.jobs import Finished
+from napari_shadowinv._napari.jobs import Finished, Job, name_of_result
+from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.run import Run
-from napari_shadowinv._napari.simulations import (
-    ForwardJob,
-    GridFile,
-    InputField,
-    PlanJob,
-    SimulatedObject,
-    input_field,
-    is_field,
-    may_be_field,
-)
+from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _panels as panels
-from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, SaveButton
+from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, save_as
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
-from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of
-from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors
+from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
+from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors, push_button
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel, validate
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.options import Instrument
-from napari_shadowinv.physics.beam import numbers_in_unit
-from napari_shadowinv.physics.phantom_models import PHANTOMS
+from napari_shadowinv.facts import Level, percent
+from napari_shadowinv.io.field_grids import read_field_grid
+from napari_shadowinv.options import Instrument, InversionOptions
+from napari_shadowinv.physics.beam import (
+    displacement_from_potential,
+    number_in_unit,
+    numbers_in_unit,
+)
+from napari_shadowinv.physics.field_grid import FieldGrid
+from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
+from napari_shadowinv.physics.particle_flight import check_particles
+from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
+from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
 from napari_shadowinv.physics.setup import Setup, deflector_titles
-from napari_shadowinv.pipeline.experiment import SWEPT
-from napari_shadowinv.pipeline.experiment_object import setups_of_text, shape_of_text
+from napari_shadowinv.physics.trace_options import GridView
+from napari_shadowinv.physics.tracing import trace
+from napari_shadowinv.physics.units import intensity_limits
+from napari_shadowinv.pipeline.experiment import SWEPT, plan_experiment, sweep_experiment
+from napari_shadowinv.pipeline.experiment_object import (
+    PlannedObject,
+    object_of_displacement,
+    object_of_field,
+    setups_of_text,
+    shape_of_text,
+)
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
+from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
+from napari_shadowinv.pipeline.inversion_run import plane_of
 from napari_shadowinv.plotting import draw_errors
 
 _IMAGE, _PLAN = "image", "plan"  # tasks
 _GRID, _LAYER = "grid", "layer"  # objects that are no phantoms
 _NOTHING = ""  # of the quantities
-_SIZE = " x ".join(map(str, ForwardJob.shape))
+_SHAPE = 200, 200
+_SIZE = " x ".join(map(str, _SHAPE))
 _PLOT_HEIGHT_PX = 260
+_FIELDS = ("field", "field y", "field x")
+
+
+class _File(CheckedModel):
+    file: Path = Field(
+        title="File",
+        description="openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; "
+        "particles are traced through it.",
+    )
+
+
+class GridFile(GridView, _File):
+    """A 3-D field in a file, and the direction from which it is seen."""
+
+    def field(self) -> FieldGrid:
+        """Read the field, in the frame of the beam."""
+        return self.apply(read_field_grid(self.file))
+
+    @property
+    def title(self) -> str:
+        """Name of the file without its ending."""
+        return self.file.stem
+
+
+@dataclass(frozen=True, eq=False)
+class InputField:
+    """A potential or displacement of a layer."""
+
+    values: ArrayLike  # (H, W), or (2, H, W) in px
+    to_px2: float = 1.0  # conversion factor of the potential to px²
+    setup: Setup | None = None  # of its measurement, if the layer has it
+    text: str = ""  # the interpretation, in a sentence
+    title: str = ""
+
+    def displacement(self) -> FloatArray:
+        """Return the displacement in px."""
+        values: Any = self.values
+        if np.ndim(values) == 3:
+            return np.asarray(values, dtype=np.float64)
+        return displacement_from_potential(self.to_px2 * plane_of(values, "the potential"))
+
+
+SimulatedObject = PhantomRecipe | GridFile | InputField
+
+
+def is_field(layer: Any) -> bool:
+    """Whether a layer is labelled as a potential, or as the field of one result."""
+    if about.role_of(layer) == "potential":
+        return True
+    return about.role_of(layer) in _FIELDS and about.result_of(layer) is not None
+
+
+def may_be_field(layer: Any) -> bool:
+    """Whether a layer is a field, or an image without a label."""
+    is_unlabelled = about.may_be_shot(layer) and about.result_of(layer) is None
+    return is_field(layer) or (is_unlabelled and not getattr(layer, "rgb", False))
+
+
+def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
+    """Return the field of a layer, or of its shot in view.
+
+    `setup` converts a potential in m whose layer has no setup.
+    """
+    if layer is None:
+        raise InputError(
+            "there is no potential or result to start from: invert a shot (Plugins → Shadowinv → "
+            "Invert), open a .shadowinv file or an image of a potential in px² (File → Open), "
+            "or select a simulated object"
+        )
+    result, title = about.result_of(layer), name_of_result(layer)
+    is_masked = about.role_of(layer) == "potential" and bool(np.isnan(layer.data).any())
+    if result is not None and (about.role_of(layer) in _FIELDS or is_masked):
+        displacement = np.asarray(about.displacement_of(layer))
+        return InputField(
+            displacement, 1.0, result.setup, "The displacement of this result.", title
+        )
+    potential = shown_plane(layer, point) if layer.ndim == 3 else image_of(layer, "potential")
+    unit, layer_setup = about.unit_of(layer), about.setup_of(layer)
+    if about.role_of(layer) != "potential":
+        _refuse_counts(potential, layer.name)
+        text = (
+            "This image is not labelled as a potential. Its values are treated as a potential in "
+            "px² of the object plane."
+        )
+        return InputField(potential, 1.0, layer_setup, text, title)
+    if unit in ("", "px²"):
+        return InputField(potential, 1.0, layer_setup, "A potential in px².", title)
+    field_setup = layer_setup or setup
+    if field_setup is None:
+        raise InputError(
+            f"'{layer.name}' is in {unit}: select the setup of its experiment, which is needed "
+            "to convert it to pixels"
+        )
+    to_px2 = float(field_setup.normalized_potential(number_in_unit(f"1 {unit}", "m")))
+    return InputField(potential, to_px2, field_setup, f"A potential in {unit}.", title)
+
+
+def _refuse_counts(potential: ArrayLike, name: str) -> None:
+    """Refuse whole numbers from zero on, which a detector counts and no potential has."""
+    values = np.asarray(potential)
+    if values.any() and values.min() >= 0 and np.array_equal(values, np.round(values)):
+        raise InputError(
+            f"'{name}' has whole numbers from {values.min():g} to {values.max():g}, as a detector "
+            "counts, expected a potential in px²: invert the image first (Plugins → Shadowinv → "
+            "Invert), or choose a layer of a result"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """The image that an object casts, with its displacement and source."""
+
+    image: FloatArray  # in the unit of the source
+    displacement: FloatArray  # px
+    source: FloatArray | None  # the beam past opaque parts of the object; None if uniform
+    warning: str = ""  # about caustics, lost flux and assumptions
+
+
+@dataclass(frozen=True, eq=False)
+class ForwardJob(Job):
+    """A prediction of the image of an object."""
+
+    object: SimulatedObject
+    shape: tuple[int, int] = _SHAPE  # of the image of a phantom, or of a field in a file
+    setup: Setup | None = None
+    deflector: str | None = None
+    source: ArrayLike | None = None  # None for a uniform beam
+    name: str = ""  # of the image
+    frame: about.Frame = about.Frame()  # noqa: RUF009
+    unit: str = ""  # of the source
+    setup_origin: str = ""
+    subject: Any = None  # the layer of the field, or the name of an object
+
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Prediction:
+        Reporter(on_progress, should_stop)("field", 0, None)
+        callbacks: Any = {"on_progress": on_progress, "should_stop": should_stop}
+        source = None if self.source is None else plane_of(self.source, "the source")
+        shadow, warnings = None, []
+        if isinstance(self.object, GridFile):
+            shape: Any = self.shape if source is None else source.shape
+            particles = check_particles(self.setup)
+            traced = trace(self.object.field(), particles, shape, profile=source, **callbacks)
+            image, displacement = traced.image, np.nan_to_num(traced.displacement)
+            flux = traced.source.sum()
+            doubts = [fact.text for fact in traced.facts if fact.level is not Level.SOUND]
+            warnings += [f"{text[0].upper()}{text[1:]}." for text in doubts]
+        else:
+            if isinstance(self.object, InputField):
+                displacement, warnings = self._transfer(self.object)
+            else:
+                displacement = self.object.phantom(self.shape, self.setup).displacement
+                shadow = self.object.shadow(self.shape, self.setup)
+            if shadow is not None:
+                source = np.where(shadow, 0.0, 1.0 if source is None else source)
+            image = synthetic_image(displacement, source, **callbacks)
+            flux = image.size if source is None else source.sum()
+        caustic = jacobian_determinant(displacement) < InversionOptions().caustic_jacobian
+        share = float((caustic if shadow is None else caustic & ~shadow).mean())
+        if share > 0:
+            warnings.append(
+                f"Caustics: rays cross or nearly cross in {percent(share)} of the pixels. Once "
+                "rays cross, one image no longer determines the whole field."
+            )
+        inside = float(image.sum() / flux) if flux else 1.0
+        if inside < 0.99:
+            warnings.append(f"Only {percent(inside)} of the flux lands inside the image.")
+        return Prediction(image, displacement, source, " ".join(warnings))
+
+    def layers(self, content: Prediction) -> LayerData:
+        origin = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
+        layer = shot_layer(
+            content.image,
+            self.name,
+            self.setup,
+            intensity_limits(content.image),
+            frame=self.frame,
+            unit=self.unit,
+            source=content.source,  # for an inversion of the image
+            setup_origin=origin if self.setup_origin else None,
+        )
+        return [layer]
+
+    def _transfer(self, field: InputField) -> tuple[FloatArray, list[str]]:
+        """Return the displacement in the chosen setup, and the assumption behind it."""
+        displacement, setup = field.displacement(), self.setup
+        if field.setup is None or setup is None or field.setup == setup:
+            return displacement, []
+        deflector = self.deflector or default_deflector(field.setup, setup)
+        shape: Any = None if self.source is None else np.shape(self.source)
+        moved = transferred_displacement(
+            displacement, field.setup, setup, deflector=deflector, shape=shape
+        )
+        text = f"Converted to another setup, assuming that only a {deflector} deflects the beam."
+        return moved, [text]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlanJob(Job):
+    """A plan of an experiment, or a sweep of one of its quantities."""
+
+    object: SimulatedObject
+    setups: tuple[Setup, ...]
+    shape: tuple[int, int] | None
+    instrument: Instrument
+    options: ExperimentOptions
+    quantity: str = ""  # none
+    values: tuple[float, ...] = ()
+
+    def run(
+        self, on_progress: OnProgress, should_stop: ShouldStop
+    ) -> ExperimentPlan | ExperimentSweep:
+        choices = {"shape": self.shape, "instrument": self.instrument, "options": self.options}
+        keywords: Any = {**choices, "on_progress": on_progress, "should_stop": should_stop}
+        setups, target = self.setups or None, self._object(on_progress, should_stop)
+        if self.quantity:
+            return sweep_experiment(target, setups, vary={self.quantity: self.values}, **keywords)
+        return plan_experiment(target, setups, **keywords)
+
+    def _object(self, *callbacks: Any) -> PhantomRecipe | PlannedObject:
+        if isinstance(self.object, PhantomRecipe):
+            return self.object
+        Reporter(*callbacks)("field", 0, None)
+        if isinstance(self.object, GridFile):
+            setup, name = next(iter(self.setups), None), self.object.file.name
+            return object_of_field(self.object.field(), setup, title=name)
+        field = self.object
+        return object_of_displacement(field.displacement(), field.setup, title=field.title)
+
+    def layers(self, content: ExperimentPlan | ExperimentSweep) -> LayerData:
+        """Describe the image of the first draw."""
+        plan = content.plans[content.best] if isinstance(content, ExperimentSweep) else content
+        setup = plan.setups[0] if plan.setups else None
+        image, name = plan.images[0], f"{plan.title}, planned"
+        return [shot_layer(image, name, setup, intensity_limits(image), unit="counts")]
 
 
 class Simulate(panels.ToolPanel):
@@ -53,18 +310,15 @@ class Simulate(panels.ToolPanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Trace the beam through the object, or invert shots with random imperfections."
-        super().__init__(napari_viewer, "simulate", Run("Simulate", "Run", tip))
+        super().__init__(napari_viewer, "simulate", Run("Run", tip))
         self._predicted: Any = None  # layers of the last image; plans have others
         self._build_object()
         self._build_task()
         self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.verdict, self.report = panels.VerdictLine(), panels.ReportView()
         self.plot = Plot(_PLOT_HEIGHT_PX, fixed=True)
-        self.save_result = SaveButton(
-            self,
-            self._image_to_save,
-            "Save the predicted image with its pixel size (.tif, .npy or .png).",
-        )
+        tip = "Save the predicted image with its pixel size (.tif, .npy or .png)."
+        self.save_result = push_button("Save result…", tip, self._save_image)
         self.add(self.object, self._size_row, self.setup, self.task, self.keep_earlier)
         self.add(self.panel, self.warning, self.verdict, self.save_result, self.plot, self.report)
         self._connect()
@@ -180,7 +434,7 @@ class Simulate(panels.ToolPanel):
         size = self.side.text().strip()
         shape = shape_of_text(size, "the size") if size else None
         if self.task.kind == _IMAGE:
-            return self._image_job(target, setup, shape or ForwardJob.shape)
+            return self._image_job(target, setup, shape or _SHAPE)
         key, sweep = self.quantity.kind, self.quantity.model()
         values: list[float] = []
         if sweep is not None:
@@ -232,11 +486,13 @@ class Simulate(panels.ToolPanel):
             subject=target.title if layer is None else layer,
         )
 
-    def _image_to_save(self) -> Savable:
+    @notify_errors
+    def _save_image(self) -> None:
         if self._predicted is None or not self._predicted.layers:
             raise InputError("there is no predicted image yet: press Run first")
         (layer,) = self._predicted.layers
-        return Savable(layer.name, np.asarray(layer.data), IMAGE_FORMATS, about.setup_of(layer))
+        setup = about.setup_of(layer)
+        save_as(self, Savable(layer.name, layer.data, IMAGE_FORMATS, setup), self.panel.say)
 
     def forget(self) -> None:
         self.warning.setVisible(False)

@@ -43,21 +43,19 @@ _CONTRAST_SHOTS = 16
 
 
 @as_file_errors
-def store_layers(path: Path, name: str = "", shot: int | None = None) -> LayerData:
+def store_layers(path: Path, name: str = "") -> LayerData:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
 
-    `shot` also sets the units and the contrast. By default, units are those of the first finished
-    shot, and the contrast suits up to 16 finished shots.
+    Units are those of the first finished shot, and the contrast suits up to 16 finished shots.
     """
     dataset = _open(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
-    reference = _first_done(dataset, path) if shot is None else shot
+    reference = _first_done(dataset, path)
     setup = setup_from_dataset(dataset.isel(shot=reference))
     frame = frame_for(dataset["displacement"].shape, setup)
     facts = {"store": str(path), "name": name, "shots": _shot_names(dataset)}
     layers = dataset_layers(View(dataset, setup, reference), frame, name, facts)
-    if shot is None:
-        _widen_contrast(layers, _finished_shots(dataset))
+    _widen_contrast(layers, _finished_shots(dataset))
     return layers
 
 
@@ -70,12 +68,6 @@ def _widen_contrast(layers: Sequence[FullLayerData], finished: Sequence[int]) ->
             for data, words in images:
                 plane = np.asarray(data[shot])
                 words["contrast_limits"] = widen_limits(words["contrast_limits"], plane)
-
-
-@as_file_errors
-def first_shot(path: Path) -> int:
-    """Return the index of the first finished shot of a store."""
-    return _first_done(_open(path), path)
 
 
 @as_file_errors

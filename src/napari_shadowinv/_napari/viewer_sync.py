@@ -10,7 +10,6 @@ import functools
 import sys
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from napari_shadowinv._napari.events import connect, connect_layers, without_proxy
@@ -200,24 +199,19 @@ def _is_bare_image(layer: Any) -> bool:
     return not is_plugin_layer and frame_of(layer) == Frame()
 
 
-@dataclass
-class _FilmContrast:
-    """The shown plane of a stack of films, and the contrast limits of each plane."""
-
-    initial_limits: Any
-    limits: list[Any]
-    plane: int
-
-
 def plane_in_view(viewer: Any, layer: Any) -> int:
     """Return the index of a stack's shown plane."""
     index = round(float(layer.world_to_data(viewer.dims.point[-layer.ndim :])[0]))
     return min(max(index, 0), len(layer.data) - 1)
 
 
+# The contrast limits of a stack's films, and the one in view.
+_Planes = weakref.WeakKeyDictionary[Any, tuple[list[Any], int]]
+
+
 def _label_films(viewer: Any) -> None:
     """Label the shown film of a pack on the canvas, and restore its contrast."""
-    contrasts: weakref.WeakKeyDictionary[Any, _FilmContrast] = weakref.WeakKeyDictionary()
+    planes: _Planes = weakref.WeakKeyDictionary()
     labels: list[str] = []
 
     def follow(_: Any = None) -> None:
@@ -227,7 +221,7 @@ def _label_films(viewer: Any) -> None:
             if films is None or layer.ndim != 3:
                 continue
             plane = plane_in_view(viewer, layer)
-            _restore_contrast(contrasts, layer, plane)
+            _restore_contrast(planes, layer, plane)
             if layer.visible:
                 text = films[plane]
         if text or labels:
@@ -244,25 +238,19 @@ def _label_films(viewer: Any) -> None:
     follow()
 
 
-def _restore_contrast(
-    contrasts: weakref.WeakKeyDictionary[Any, _FilmContrast], layer: Any, plane: int
-) -> None:
+def _restore_contrast(planes: _Planes, layer: Any, plane: int) -> None:
     """Restore the contrast limits that a film had when it was last shown."""
     limits = metadata_of(layer).get("limits")
     if limits is None:
         return
-    contrast = contrasts.get(layer)
-    if contrast is None or contrast.initial_limits is not limits:
-        contrasts[layer] = _FilmContrast(limits, list(limits), plane)
-        return
-    if contrast.plane == plane:
-        return
-    contrast.limits[contrast.plane] = tuple(layer.contrast_limits)
-    contrast.plane = plane
-    low, high = contrast.limits[plane]
-    # Fluences of films differ by powers of ten: the slider spans the range of one film.
-    layer.contrast_limits_range = (min(0.0, low), 2 * high)
-    layer.contrast_limits = (low, high)
+    old_limits, old = planes.get(layer, (None, plane))
+    planes[layer] = limits, plane
+    if old_limits is not None and old_limits is limits and old != plane:
+        limits[old] = tuple(layer.contrast_limits)
+        low, high = limits[plane]
+        # Fluences of films differ by powers of ten: the slider spans the range of one film.
+        layer.contrast_limits_range = (min(0.0, low), 2 * high)
+        layer.contrast_limits = (low, high)
 
 
 def _text_overlay(viewer: Any) -> Any:

@@ -91,7 +91,7 @@ def opened(viewer: Any, qtbot: Any) -> Iterator[Callable[[Any], Any]]:
     yield make
     # None writes into the settings of the next test.
     for widget in widgets:
-        widget._keeper._timer.stop()
+        widget._writing.stop()
 
 
 @pytest.fixture

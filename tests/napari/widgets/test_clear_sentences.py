@@ -12,7 +12,7 @@ from napari.components import ViewerModel
 
 from helpers.reports import texts_of
 from napari_shadowinv._napari.form import StepsSection
-from napari_shadowinv._napari.simulations import input_field
+from napari_shadowinv._napari.simulate import input_field
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.errors import InputError

@@ -139,7 +139,7 @@ def test_corners_are_shown_dragged_and_used(
     qtbot.waitUntil(lambda: tool.corners.scan.name == "scan of film 3", timeout=PATIENCE)
     np.testing.assert_allclose(tool.corners.polygon.data[0], corners[2], atol=1e-4)
     tool.corners.polygon.data = [moved[2]]
-    tool.run_again.click()
+    tool.panel.button.click()
     wait(tool)
     doses = tool._selected()[1]
     assert doses is not pack_doses
@@ -165,10 +165,10 @@ def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluate
     polygon = tool.corners.polygon
     polygon.data = [polygon.data[0][[0, 2, 1, 3]]]
     before = len(viewer.layers)
-    tool.run_again.click()
+    tool.panel.button.click()
     assert "do not go around a film" in tool.panel.status.text()
     polygon.data = [polygon.data[0][:3]]
-    tool.run_again.click()
+    tool.panel.button.click()
     assert "with 3 corners: expected one polygon with the four" in tool.panel.status.text()
     assert len(viewer.layers) == before
     assert not tool.panel.running
@@ -191,7 +191,7 @@ def test_painted_pixels_are_not_used(
     spot = np.s_[1, 30:36, 40:48]
     assert pack_doses.usable[spot].all()
     marks.data[spot] = BY_HAND
-    tool.run_again.click()
+    tool.panel.button.click()
     wait(tool)
     doses = tool._selected()[1]
     usable = doses.usable
@@ -211,7 +211,7 @@ def test_painted_pixels_are_not_used(
     assert not read(mask).image[30:36, 40:48].any()
     # Rubbed out, they count again.
     marks.data[spot] = 0
-    tool.run_again.click()
+    tool.panel.button.click()
     wait(tool)
     assert tool._selected()[1].usable[spot].all()
 
@@ -236,7 +236,7 @@ def test_cancelling_leaves_nothing(
     monkeypatch.setattr(packs, "run_film", work_slowly)
     layer_of(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
     before = list(viewer.layers)
-    tool.run_again.click()
+    tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(written), timeout=PATIENCE)
     assert [path.name for path in written[0] if path.is_file()] == ["mask_01.tif"]
     tool.panel.button.click()

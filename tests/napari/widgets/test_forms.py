@@ -13,13 +13,13 @@ import tomli_w
 from annotated_types import Ge, Gt, Le, Lt
 from magicgui.widgets import ComboBox, LineEdit
 from pydantic import BaseModel
-from qtpy.QtWidgets import QFileDialog, QWidget
+from qtpy.QtWidgets import QFileDialog
 
 from helpers.forms import enter
 from napari_shadowinv import InputError, Instrument, InversionOptions, ProtonSetup
 from napari_shadowinv._napari.form import ModelForm, ModelPicker, kinds_of
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
-from napari_shadowinv._napari.widgets._qt import StateKeeper
+from napari_shadowinv._napari.widgets._qt import save_state, saved_state
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.phantom_models import PHANTOMS
@@ -214,16 +214,13 @@ def test_a_picker_remembers_what_each_kind_holds(qtbot: Any) -> None:
 
 
 def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot: Any, settings_folder: Path) -> None:
-    widget = QWidget()
-    qtbot.addWidget(widget)
-    keeper = StateKeeper(widget, "test", lambda: {"a": [1, math.inf], "b": "µm"})
-    assert keeper.load() == {}
-    keeper.write()
-    assert keeper.load() == {"a": [1, math.inf], "b": "µm"}
-    StateKeeper(widget, "damaged", lambda: {}).write()
+    assert saved_state("test") == {}
+    save_state("test", {"a": [1, math.inf], "b": "µm"})
+    assert saved_state("test") == {"a": [1, math.inf], "b": "µm"}
+    save_state("damaged", {})
     (file,) = settings_folder.rglob("*.ini")
     file.write_text(file.read_text().replace("damaged={}", "damaged={]"))
-    assert StateKeeper(widget, "damaged", lambda: {}).load() == {}
+    assert saved_state("damaged") == {}
     form = the_form(qtbot, InversionOptions)
     form.restore({"unknown": 3, "floor": None, "readout": "none"})
     assert form.model() == InversionOptions()

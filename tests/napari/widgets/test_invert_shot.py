@@ -236,7 +236,7 @@ def test_a_run_replaces_the_last_result_of_its_shot(
     qtbot: Any,
 ) -> None:
     run(tool)
-    tool.more_layers.click()
+    tool.view.more_layers.click()
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     first = list(window.layers)
     layer_of(window, "caustic").visible = True
@@ -458,7 +458,7 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     tool.steps.folded.expand()
     tool.store.run.restore({"workers": 3, "overwrite": True})
     assert_it_fits(tool)
-    tool._keeper.write()
+    tool.write_state()
     again = Invert(window)
     qtbot.addWidget(again)
     assert again.options.model() == InversionOptions(seed=5)

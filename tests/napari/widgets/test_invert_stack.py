@@ -193,7 +193,7 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     assert StackStore(out).statuses().tolist() == [DONE, DONE, PENDING, PENDING]
     before = written(out)
     assert len(before) == 2
-    tool.more_layers.click()
+    tool.view.more_layers.click()
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     potential = layer_of(window, "potential")
     potential.contrast_limits = (-3.0, 4.0)

@@ -11,7 +11,7 @@ from napari.layers import Image, Labels, Shapes
 
 from helpers.jobs import run_job
 from napari_shadowinv import InputError, InversionOptions
-from napari_shadowinv._napari.jobs import SourceJob, estimate_cost
+from napari_shadowinv._napari.jobs import SourceJob
 from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob
 from napari_shadowinv._system.progress import Progress
@@ -131,20 +131,3 @@ def test_layers_that_are_no_single_image_are_refused() -> None:
         image_of(Image(np.ones((4, 8, 8))))
     with pytest.raises(InputError, match="they must match"):
         mask_of(Labels(np.zeros((8, 9), int)), Image(np.ones((8, 8))), True)
-
-
-def test_the_cost_of_a_large_image_is_told_beforehand() -> None:
-    few = InversionOptions(n_sites=10_000)
-    assert estimate_cost((500, 500), few).text == ""
-    four = estimate_cost((2000, 2000), few)
-    # Measured: a process of 0.8 GB at its peak, without the layers of 7 planes.
-    assert 0.8e9 < four.memory < 2 * (0.8e9 + 7 * 8 * 4e6)
-    # Measured: 16 s of processor time, which two cores share.
-    assert 16 / 2 < four.seconds < 16
-    assert four.text == "4 Mpx with 10,000 sites: about 10 s and up to 1.3 GB."
-    assert "about 40 s" in estimate_cost((2000, 2000), few, pace=3).text
-    sixteen = estimate_cost((4000, 4000), few)
-    assert sixteen.seconds == pytest.approx(4 * four.seconds, rel=0.05)
-    huge = estimate_cost((100_000, 100_000), few)
-    assert huge.exceeds_memory
-    assert "GB: crop or bin the image" in huge.text

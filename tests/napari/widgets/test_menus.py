@@ -172,7 +172,7 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
 
 def test_runs_have_the_preferred_number_of_threads(preferences: Any, qtbot: Any) -> None:
     cores, threads = available_threads(None), []
-    panel = Run("Some work", "Run", "")
+    panel = Run("Run", "")
     qtbot.addWidget(panel)
     try:
         for preferences.widgets.threads in (7, 0):  # 0: all of them

@@ -7,7 +7,6 @@ import time
 from typing import Any
 
 import pytest
-from napari.utils import progress
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QDockWidget
 
@@ -34,7 +33,7 @@ class Work:
 
 @pytest.fixture
 def panel(window: Any, qtbot: Any) -> Run:
-    run_panel = Run("Some work", "Run", "Do it.")
+    run_panel = Run("Run", "Do it.")
     window.window.add_dock_widget(run_panel, name="work", area="right")
     qtbot.wait(500)
     return run_panel
@@ -62,20 +61,6 @@ def test_a_run_seldom_makes_the_window_be_drawn(
     assert len(composed) <= 6 * changes
     assert len({text for text in texts if "Solving the transport: at" in text}) >= 2
     assert panel.bar.maximum() > 0
-
-
-def test_a_panel_that_cannot_be_seen_uses_the_activity_dock(
-    panel: Run, window: Any, qtbot: Any
-) -> None:
-    panel.start(Work(200))
-    qtbot.waitUntil(lambda: "Solving" in panel.status.text(), timeout=PATIENCE)
-    assert panel.bar.isVisible()
-    assert not progress._all_instances
-    panel.hide()
-    qtbot.waitUntil(lambda: bool(progress._all_instances), timeout=PATIENCE)
-    assert all("Some work" in bar.desc for bar in progress._all_instances)
-    finish(panel, qtbot)
-    assert not progress._all_instances
 
 
 def test_what_went_wrong_stays_until_the_next_run(

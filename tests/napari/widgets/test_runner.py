@@ -14,7 +14,7 @@ class Heard(Run):
     """A button that remembers how its work ended."""
 
     def __init__(self, qtbot: Any) -> None:
-        super().__init__("Some work", "Run", "")
+        super().__init__("Run", "")
         qtbot.addWidget(self)
         self.outcomes: list[Outcome] = []
         self.ended.connect(self.outcomes.append)

@@ -31,7 +31,7 @@ def test_saved_result_comes_back_and_is_inverted_again(
     run(tool)
     verdict, peak = tool.verdict.text(), window.layers.selection.active.data.max()
     choose(tmp_path / "a")
-    tool.save_result.click()
+    tool.view.save_result.click()
     path = tmp_path / "a.shadowinv"
     assert str(path) in tool.panel.status.text()
     assert str(path) in messages[-1]
@@ -59,10 +59,10 @@ def test_save_asks_before_it_replaces_a_file(
     path = tmp_path / "a.shadowinv"
     path.write_text("precious")
     choose(tmp_path / "a")
-    tool.save_result.click()
+    tool.view.save_result.click()
     assert path.read_text() == "precious"
     choose(tmp_path / "a", replace=True)
-    tool.save_result.click()
+    tool.view.save_result.click()
     assert read(path)["displacement"].shape == (2, 48, 60)
 
 
@@ -70,7 +70,7 @@ def test_save_without_a_result_says_what_to_do(
     tool: Any, tmp_path: Path, choose: Any, messages: list[str]
 ) -> None:
     choose(tmp_path / "a")
-    tool.save_result.click()
+    tool.view.save_result.click()
     assert messages == ["There is no result yet: press Run first, or select a layer of a result"]
     assert not list(tmp_path.glob("a*"))
 
@@ -80,7 +80,7 @@ def test_save_that_fails_leaves_no_file(
 ) -> None:
     run(tool)
     choose(tmp_path / "nowhere" / "a")
-    tool.save_result.click()
+    tool.view.save_result.click()
     assert "nowhere" in messages[-1]
     assert "\n" not in messages[-1]
     assert tool.panel.status.text() == messages[-1]
@@ -93,7 +93,7 @@ def test_more_layers_adds_those_that_are_missing(
     run(tool)
     few = [role_of(layer) for layer in window.layers]
     assert few == ["shot", "residual", "field", "caustic", "arrows"]
-    tool.more_layers.click()
+    tool.view.more_layers.click()
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     added = {role_of(layer) for layer in window.layers} - set(few)
     assert added == {
@@ -105,7 +105,7 @@ def test_more_layers_adds_those_that_are_missing(
         "arrows",
     }
     count = len(window.layers)
-    tool.more_layers.click()
+    tool.view.more_layers.click()
     run(tool)
     assert len(window.layers) == count
 
@@ -139,7 +139,7 @@ def test_shot_of_a_store_is_saved_alone(
     qtbot.waitUntil(lambda: not tool.panel.running and not tool.results.busy, timeout=PATIENCE)
     window.dims.set_current_step(0, 1)
     choose(tmp_path / "second")
-    tool.save_result.click()
+    tool.view.save_result.click()
     field = read(tmp_path / "second.shadowinv")["displacement"].values
     # The second shot is the first one's mirror image.
     blob = field[1][:, field.shape[2] // 2 :]

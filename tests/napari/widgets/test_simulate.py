@@ -16,8 +16,7 @@ from helpers.reports import texts_of
 from napari_shadowinv import InputError, Instrument, ProtonSetup
 from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_to_viewer
-from napari_shadowinv._napari.simulate import Simulate
-from napari_shadowinv._napari.simulations import ForwardJob, GridFile, InputField
+from napari_shadowinv._napari.simulate import ForwardJob, GridFile, InputField, Simulate
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read_field_grid

@@ -24,7 +24,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.simulate import Simulate
-from napari_shadowinv._napari.widgets._qt import StateKeeper
+from napari_shadowinv._napari.widgets import _qt
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
@@ -87,7 +87,7 @@ def test_the_setup_of_a_file_is_not_there_in_the_next_session(
     assert tool.setup.setup() is not None
     enter(tool.setup.picker.form.entries["energy"], "3 MeV")
     assert setup_origin_of(of_a_file) == "came with experiment.h5, changed by hand"
-    tool._keeper.write()
+    tool.write_state()
     viewer.layers.clear()
     viewer.add_image(shot, name="another")
     later = opened(Invert)
@@ -120,7 +120,7 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(
     tool.image.layer = plain
     assert tool.setup.setup() is None
 
-    tool._keeper.write()
+    tool.write_state()
     viewer.layers.clear()
     new = viewer.add_image(shot, name="new")
     later = opened(Invert)
@@ -140,7 +140,7 @@ def test_the_last_setup_is_selected_where_that_is_preferred(
     assert tool.setup.setup() is None  # there is no last one
     typed(tool, 5.0)
     entered = tool.setup.setup()
-    tool._keeper.write()
+    tool.write_state()
     viewer.layers.clear()
     new = viewer.add_image(shot, name="new")
     later = opened(Invert)
@@ -150,10 +150,10 @@ def test_the_last_setup_is_selected_where_that_is_preferred(
     assert setup_of(new) is None
     # None is a choice, too.
     later.setup.picker.set_kind("none")
-    later._keeper.write()
+    later.write_state()
     assert opened(Invert).setup.setup() is None
     later.setup.picker.set_kind("proton")
-    later._keeper.write()
+    later.write_state()
     preferences.widgets.last_setup = False
     viewer.layers.clear()
     viewer.add_image(shot, name="newest")
@@ -488,7 +488,7 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     assert tool.setup.setup() == proton_setup
     tool.object.set_kind("toroid")
     assert tool.setup.setup() == entered
-    tool._keeper.write()
+    tool.write_state()
     later = opened(Simulate)
     assert later.setup.setup() == entered
     tool.side.setText("20 x 20")
@@ -508,7 +508,7 @@ def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
     viewer: ViewerModel, opened: Any, kind: Any, value: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     parts = opened(kind).state()
-    monkeypatch.setattr(StateKeeper, "load", lambda self: dict.fromkeys(parts, value))
+    monkeypatch.setattr(_qt, "saved_state", lambda name: dict.fromkeys(parts, value))
     assert opened(kind).state().keys() == parts.keys()
 
 
@@ -518,5 +518,5 @@ def test_a_part_of_another_form_leaves_the_other_parts_restored(
     first = opened(Invert)
     first.options.restore({"n_sites": 777})
     saved = {**first.state(), "source": {"values": 5}, "steps": 3}
-    monkeypatch.setattr(StateKeeper, "load", lambda self: saved)
+    monkeypatch.setattr(_qt, "saved_state", lambda name: saved)
     assert opened(Invert).options.model().n_sites == 777

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from napari_shadowinv import Instrument
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, unit_of
 from napari_shadowinv._napari.viewer_sync import _text_overlay
-from napari_shadowinv._napari.widgets import _fitting
+from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets._panels import ReportView
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE
@@ -217,10 +217,10 @@ def test_first_shadowgram_is_clicked_to_its_end(
     ends[:, 0] = middle[0]
     lines = profile.lines.layer
     lines.add_lines(np.array([lines.world_to_data(end) for end in ends]))
-    for row in range(profile.layers.rowCount()):
-        on = profile.layers.item(row, 0).text() == field.name
+    for row in range(profile.layers.count()):
+        on = profile.layers.item(row).text() == field.name
         state = Qt.CheckState.Checked if on else Qt.CheckState.Unchecked
-        profile.layers.item(row, 0).setCheckState(state)
+        profile.layers.item(row).setCheckState(state)
     qtbot.waitUntil(
         lambda: [one.name for one in profile.profiles] == [field.name], timeout=PATIENCE_MS
     )
@@ -348,7 +348,7 @@ def test_two_energies_are_clicked_to_their_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     text = page("two-energies.md")
-    monkeypatch.setattr(_fitting, "_REDRAW_MS", PATIENCE_MS)  # the curve once, at the end
+    monkeypatch.setattr(_panels, "_REDRAW_MS", PATIENCE_MS)  # the curve once, at the end
     choose(f"File > Open Sample > {PLUGIN} > Two energies, beam not recorded")
     choose(f"Plugins > {PLUGIN} > Fit several images")
     tool = tool_of(window, "Fit several images")
@@ -422,7 +422,7 @@ def test_film_pack_is_clicked_to_its_end(
     marks = window.layers.selection.active
     assert marks.mode == "paint"
     marks.paint((1, 40, 50), marks.selected_label)
-    press(tool, "Run again")
+    press(tool, "Run")
     wait()
     assert "Warning" not in tool.panel.status.text()
     fluence = layer_of(window, "fluence")

@@ -1,7 +1,7 @@
 """Files of a tool: recipes of its controls, and results to save or to repeat.
 
 - recipes, as for the commands: `RecipeButton`
-- buttons below Run: `SaveButton` saves a result, `MoreLayersButton` shows its hidden layers
+- a result to save: `result_to_save`, `save_as`; its other layers: `add_missing_layers`
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from napari_shadowinv._napari.run import Outcome
 from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._layers import new_mask
-from napari_shadowinv._napari.widgets._panels import ToolPanel
 from napari_shadowinv._napari.widgets._qt import ask_file, filter_of, notify_errors
 from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
@@ -256,98 +255,48 @@ def shown_result(viewer: Any, preferred: Iterable[Any] = ()) -> Any:
 
 
 def result_to_save(viewer: Any, layer: Any) -> Savable:
-    """Collect the result that a layer belongs to, with the appearance of its layers."""
-    result = about.result_of(layer)
-    if result is None:
-        raise InputError(f"'{layer.name}' shows no result: select a layer of a result")
-    layers = [each for each in viewer.layers if about.result_of(each) is result]
-    layer_data = [each.as_layer_data_tuple() for each in layers]
-    formats = _formats_for(result.content.kind, result.setup)
-    return Savable(name_of_result(layer), dataset_to_save(layer_data), formats)
-
-
-def shot_to_save(viewer: Any, layer: Any) -> Savable:
-    """Collect the displayed shot of a store."""
-    store = about.metadata_of(layer).get("store")
-    if store is None:
-        return result_to_save(viewer, layer)
-    index = plane_in_view(viewer, layer)
-    shots = about.metadata_of(layer).get("shots", ())
-    name = Path(shots[index]).stem if index < len(shots) else str(index)
-    dataset = shot_of_store(Path(store), index)
-    formats = _formats_for(ResultKind.of(dataset.attrs), setup_from_dataset(dataset))
-    return Savable(f"{about.metadata_of(layer).get('name', '')} {name}", dataset, formats)
-
-
-def _formats_for(kind: ResultKind, setup: Setup | None) -> tuple[Format, ...]:
+    """Collect the result of a layer with the appearance of its layers; of a store, its shot."""
+    result, facts = about.result_of(layer), about.metadata_of(layer)
+    content: Any
+    if result is not None:
+        layers = [each for each in viewer.layers if about.result_of(each) is result]
+        content = dataset_to_save([each.as_layer_data_tuple() for each in layers])
+        name, kind, setup = name_of_result(layer), result.content.kind, result.setup
+    else:
+        index, shots = plane_in_view(viewer, layer), facts.get("shots", ())
+        content = shot_of_store(Path(facts["store"]), index)
+        shot = Path(shots[index]).stem if index < len(shots) else str(index)
+        name, kind = f"{facts.get('name', '')} {shot}", ResultKind.of(content.attrs)
+        setup = setup_from_dataset(content)
     has_particles = setup is not None and setup.in_pradformat
-    return tuple(each for each in formats_for(kind) if has_particles or each is not PRADFORMAT)
+    formats = [each for each in formats_for(kind) if has_particles or each is not PRADFORMAT]
+    return Savable(name, content, tuple(formats))
 
 
-class SaveButton(QPushButton):
-    """Asks for a file, saves the result of `savable`, and reports the path."""
-
-    def __init__(self, tool: ToolPanel, savable: Callable[[], Savable], tip: str) -> None:
-        super().__init__("Save result…", toolTip=f"<qt>{tip}</qt>")
-        self._tool, self._savable = tool, savable
-        self.clicked.connect(lambda: self.ask_and_save())
-
-    @notify_errors
-    def ask_and_save(self) -> None:
-        """Ask for a file and save the content, unless the user cancels."""
-        content = self._savable()
-        filters = ";;".join(filter_of(_TITLES[form], form.suffixes) for form in content.formats)
-        path = ask_file(self, "Save result", _file_name(content.name), filters)
-        if path is None:
-            return
-        write(path, content.content, setup=content.setup, overwrite=True)
-        suffix = path.suffix.lower()
-        title = next(_TITLES[form] for form in content.formats if suffix in form.suffixes)
-        text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
-        self._tool.panel.say(text)
-        show_info(text)
+def save_as(parent: Any, content: Savable, say: Callable[[str], Any]) -> None:
+    """Ask for a file, save the content unless the user cancels, and say where it is."""
+    filters = ";;".join(filter_of(_TITLES[form], form.suffixes) for form in content.formats)
+    path = ask_file(parent, "Save result", _file_name(content.name), filters)
+    if path is None:
+        return
+    write(path, content.content, setup=content.setup, overwrite=True)
+    suffix = path.suffix.lower()
+    title = next(_TITLES[form] for form in content.formats if suffix in form.suffixes)
+    text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
+    say(text)
+    show_info(text)
 
 
-class MoreLayersButton(QPushButton):
-    """Adds the hidden layers of a result."""
-
-    def __init__(self, tool: ToolPanel, results: Callable[[], ResultLayers]) -> None:
-        super().__init__("More layers")
-        self._tool, self._results = tool, results
-        self._others = ResultLayers(tool.viewer, self)
-        self.setToolTip(
-            "<qt>Add further layers of the result: potential, components of the field, "
-            "re-projection, sites and others.</qt>"
-        )
-        self.clicked.connect(lambda: self.add())
-
-    @notify_errors
-    def add(self) -> None:
-        """Add the layers, hidden, to this result and to later results of the same shot."""
-        results = self._results()
-        layer = shown_result(self._tool.viewer, results.layers)
-        missing = missing_layers(self._tool.viewer, layer)
-        if not missing:
-            show_info("All layers of the result are in the layer list")
-        elif layer in results.layers:
-            results.extend(missing)
-        else:
-            self._others = ResultLayers(self._tool.viewer, self)
-            self._others.show(missing, select=False)
-
-
-def result_buttons(
-    tool: ToolPanel,
-    results: Callable[[], ResultLayers],
-    tip: str,
-    collect: Callable[[Any, Any], Savable] = result_to_save,
-) -> tuple[SaveButton, MoreLayersButton]:
-    """Create the buttons for the shown result, which of several is the last of the tool."""
-
-    def savable() -> Savable:
-        return collect(tool.viewer, shown_result(tool.viewer, field_of(results().layers)))
-
-    return SaveButton(tool, savable, tip), MoreLayersButton(tool, results)
+def add_missing_layers(viewer: Any, results: ResultLayers) -> None:
+    """Add the other layers of the shown result, hidden, also to later results of the same shot."""
+    layer = shown_result(viewer, results.layers)
+    missing = missing_layers(viewer, layer)
+    if not missing:
+        show_info("All layers of the result are in the layer list")
+    elif layer in results.layers:
+        results.extend(missing)
+    else:
+        ResultLayers(viewer, results).show(missing, select=False)
 
 
 def field_of(layers: Iterable[Any]) -> list[Any]:

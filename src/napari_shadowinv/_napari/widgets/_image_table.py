@@ -23,7 +23,9 @@ from napari_shadowinv.pipeline.shot_table import ShotRow
 _PREFIXED_UNIT = "m"  # cells show it, with the prefix of each number
 _METADATA_KEY = "fit"  # a row's entries in its layer's metadata
 _MAX_ROWS = 8  # more of them scroll
-_BRIGHTNESS = 2  # column
+_BEAM, _BRIGHTNESS = 1, 2  # columns
+_READABLE = Qt.ItemFlag.ItemIsEnabled
+_EDITABLE = _READABLE | Qt.ItemFlag.ItemIsEditable
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,6 @@ class ImageTable(QTableWidget):
 
     changed = Signal()  # an entry or the selection
     reference_changed = Signal()
-    reference_beam_entered = Signal(float)  # energy or wavelength of the reference
 
     def __init__(self, viewer: Any, suits: Callable[[Any], bool]) -> None:
         super().__init__(0, 2 + len(_OTHER_COLUMNS))
@@ -163,9 +164,11 @@ class ImageTable(QTableWidget):
             for number, spec in enumerate(self._columns, 1):
                 self._write(row, number, values.get(spec.name, spec.default))
             with QSignalBlocker(self):
+                # Energy or wavelength of the reference are those of the setup.
+                is_reference = image is self.reference
+                self.item(row, _BEAM).setFlags(_READABLE if is_reference else _EDITABLE)
                 brightness = self.item(row, _BRIGHTNESS)
-                editable = Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsEditable
-                brightness.setFlags(editable if is_brightness_known else Qt.ItemFlag.NoItemFlags)
+                brightness.setFlags(_EDITABLE if is_brightness_known else Qt.ItemFlag.NoItemFlags)
                 if not is_brightness_known:
                     brightness.setText("free")
 
@@ -233,11 +236,7 @@ class ImageTable(QTableWidget):
         spec = self._columns[item.column() - 1]
         value = spec.read(item.text().strip())
         self._write(row, item.column(), value)
-        is_setup = spec.name == self.beam.name != "strength" and image is self.reference
-        if is_setup and isinstance(value, float):
-            self.reference_beam_entered.emit(value)
-        else:
-            store_entries(image, **{spec.name: value})
+        store_entries(image, **{spec.name: value})
         self.changed.emit()
 
     def _on_use(self) -> None:

@@ -22,10 +22,8 @@ from napari_shadowinv._napari.shots import shot_of_layer, source_of_shot
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import RecipeButton
-from napari_shadowinv._napari.widgets._fitting import ResultView
-from napari_shadowinv._napari.widgets._panels import ToolPanel
+from napari_shadowinv._napari.widgets._panels import ResultView, ToolPanel
 from napari_shadowinv._napari.widgets._results import place_together
-from napari_shadowinv._system.validation import validate
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import read_shot, read_toml
@@ -210,7 +208,7 @@ class SetupPicker(QWidget):
             raise InputError("there is no image: open one (File → Open), or a sample")
         setup = self.setup()
         self.keep()
-        about.store_setup(self._layer, setup, self.origin)
+        self._store_with_image()
         if setup is not None:
             place_together(self._viewer, self._layer, setup, ())
 
@@ -255,15 +253,9 @@ class SetupPicker(QWidget):
             self._entered[kind] = entry
 
     def _store_with_image(self) -> None:
-        if self._layer is None or not self._stores or self._is_loaded:
-            return
-        try:
-            setup = self.setup()
-        except InputError:
-            return  # incomplete: the image keeps its setup
-        stored = about.setup_of(self._layer), about.setup_origin_of(self._layer)
-        if stored != (setup, self.origin):
-            about.store_setup(self._layer, setup, self.origin)
+        if self._layer is not None and self._stores and not self._is_loaded:
+            with suppress(InputError):  # incomplete: the image keeps its setup
+                about.store_setup(self._layer, self.setup(), self.origin)
 
     def _typed_origin(self) -> str:
         name = self._name if self._layer is None else self._layer.name
@@ -330,19 +322,18 @@ class SourcePicker(forms.ModelPicker):
     def __init__(self, viewer: Any, kinds: Sequence[str], tip: str) -> None:
         self._image: Any = None
         self._own_kind = UNIFORM  # without a source that came with the image or is likely
-        self.is_chosen, self._is_guessed = False, False
+        self._proposes = True
         layer_tip = "Image layer of the undisturbed beam."
-        if UNKNOWN in kinds:
-            layer_tip = "Image layer of the undisturbed beam, or a stack with one for each image."
         self.layers = layers.LayerPicker(viewer, layer_tip, "choose a layer", self._offers)
         rows = {LAYER: forms.labelled("", self.layers), FILE: preprocessing.MeasuredSource}
         below = preprocessing.ESTIMATES | rows
         described = {kind: (_SOURCE_TITLES[kind], below.get(kind)) for kind in kinds}
         super().__init__("Source", described, tip)
         self.layers.picked.connect(self.changed)
+        self._proposes = self.is_chosen = False
         for box in (self.choice, self.layers):
-            box.activated.connect(self._choose)
-        qt.while_alive(self, viewer.layers, ("inserted", "removed"), self._guess)
+            box.activated.connect(lambda _: self._choose(self.kind))
+        qt.while_alive(self, viewer.layers, ("inserted", "removed"), self._on_layers)
 
     @property
     def layer(self) -> Any | None:
@@ -409,10 +400,14 @@ class SourcePicker(forms.ModelPicker):
     def measured(self, image: Any) -> Shot | None:
         """Return the measured source of an image layer; None for estimates and files."""
         if self.kind == LAYER:
-            layer = self._selected_layer()
-            data = layers.image_of(layer, "source image")
-            beam = source_of_shot(layer, data, image)
-            return replace(beam, cautions=layers.cautions_of(layer))
+            if self.layer is None:
+                raise InputError(
+                    "no source layer is selected: choose a layer below 'a layer', or another kind "
+                    "of source"
+                )
+            data = layers.image_of(self.layer, "source image")
+            beam = source_of_shot(self.layer, data, image)
+            return replace(beam, cautions=layers.cautions_of(self.layer))
         if not self.is_supplied:
             return None
         supplied = about.source_of(image)
@@ -429,33 +424,6 @@ class SourcePicker(forms.ModelPicker):
             return None if beam is None else beam.image
         beams = layers.stack_of(self.layer)
         return beams if image is None else source_on(self.layer, beams, image)
-
-    def measured_for_each(self, images: Sequence[Any]) -> list[Shot | None]:
-        """Return the measured sources of a fit's image layers, or None for each."""
-        if self.kind != LAYER:
-            return [None] * len(images)
-        layer = self._selected_layer()
-        if layer.ndim != 3:
-            beam = layers.image_of(layer, "source")
-            return [source_of_shot(layer, beam, image) for image in images]
-        planes = layers.stack_of(layer)
-        if len(planes) != len(images):
-            raise InputError(
-                f"'{layer.name}' has {len(planes)} sources for {len(images)} images: expected one "
-                "source for each image, or one for all"
-            )
-        return [
-            source_of_shot(layer, beam, image, k)
-            for k, (beam, image) in enumerate(zip(planes, images, strict=True))
-        ]
-
-    def _selected_layer(self) -> Any:
-        if self.layer is None:
-            raise InputError(
-                "no source layer is selected: choose a layer below 'a layer', or another kind of "
-                "source"
-            )
-        return self.layer
 
     def usable(self, source: Any, image: Any, path: Path) -> Any:
         """Return the source of a recipe for these controls; None for uniform."""
@@ -491,7 +459,7 @@ class SourcePicker(forms.ModelPicker):
 
     def state(self) -> dict[str, Any]:
         """Return the choice without layers and files, which belong to a session."""
-        kind = self._own_kind if self.is_supplied or self._is_guessed else self.kind
+        kind = self._own_kind
         values = {
             name: stated for name, stated in super().state()["values"].items() if name != FILE
         }
@@ -502,47 +470,44 @@ class SourcePicker(forms.ModelPicker):
         self.is_chosen = self.kind != UNIFORM
 
     def set_kind(self, kind: str) -> None:
-        self._choose()
+        self._choose(kind)
         super().set_kind(kind)
 
-    def _choose(self, _: int = 0) -> None:
-        self.is_chosen, self._is_guessed = True, False
+    def _choose(self, kind: str) -> None:
+        self.is_chosen = True
+        self._own_kind = UNIFORM if kind == SUPPLIED else kind
 
     def follow(self, image_layer: Any) -> None:
         """Select the source supplied with an image, or a likely one; else the last one."""
         self._image = image_layer
         self.layers.fill()
-        if image_layer is not None and about.source_of(image_layer) is not None:
-            self._set_aside(SUPPLIED)
-        elif self.is_supplied:
-            super().set_kind(self._own_kind)
-        self._guess()
+        self._propose()
 
-    def _guess(self, _: Any = None) -> None:
-        """Select the only likely beam of the image, unless the user has chosen a source."""
-        if self.is_chosen or self.is_supplied:
-            return
-        image = self._image
-        beam = None if image is None else layers.likely_beam(image, self.layers.offered)
-        if beam is not None:
-            self.layers.layer = beam
-            self._set_aside(LAYER)
-        elif self._is_guessed:
-            super().set_kind(self._own_kind)
-        self._is_guessed = beam is not None
+    def _on_layers(self, _: Any = None) -> None:
+        if not (self.is_chosen or self.is_supplied):
+            self._propose()
 
-    def _set_aside(self, kind: str) -> None:
-        """Select a kind for this image only."""
-        if not (self.is_supplied or self._is_guessed):
-            self._own_kind = self.kind
+    def _propose(self) -> None:
+        """Select the image's own source, or else its only likely beam unless one was chosen."""
+        image, kind = self._image, self._own_kind
+        has_own = image is not None and about.source_of(image) is not None
+        if has_own and SUPPLIED in self._kinds:
+            kind = SUPPLIED
+        elif image is not None and not self.is_chosen:
+            beam = layers.likely_beam(image, self.layers.offered)
+            if beam is not None:
+                self.layers.layer, kind = beam, LAYER
+        self._proposes = True
         super().set_kind(kind)
-        self._is_guessed = False
+        self._proposes = False
 
     def _offers(self, layer: Any) -> bool:
         # An image cannot be its own source.
         return layer != self._image and about.may_be_source(layer)
 
     def _on_choice(self) -> None:
+        if not self._proposes:
+            self._choose(self.kind)
         if self.kind == LAYER and self.layers.layer is None and self._image is not None:
             offered = self.layers.offered
             self.layers.layer = layers.likely_beam(self._image, offered, estimates=True)
@@ -558,12 +523,6 @@ class InstrumentForm(forms.ModelForm):
         super().__init__(Instrument)
         self.changed.connect(self._show_defaults)
         self._show_defaults()
-
-    def restore(self, values: Mapping[str, Any]) -> None:
-        """Show the values that differ from their defaults."""
-        with suppress(InputError):  # invalid entries are shown one by one
-            values = validate(Instrument, values, "instrument").stated
-        super().restore(values)
 
     def _show_defaults(self) -> None:
         """Show the defaults of the chosen detector and beam source, with their names."""
@@ -657,7 +616,7 @@ class ImagePanel(ToolPanel):
     def show_inputs(self, recipe: preprocessing.Recipe, path: Path) -> None:
         """Show steps, setup and instrument of a recipe."""
         self.steps.show_steps(recipe.steps)
-        self.instrument.restore(recipe.instrument.model_dump())
+        self.instrument.restore(recipe.instrument.stated)
         if recipe.setup is not None:
             self.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -225,14 +224,15 @@ class LayerPicker(SteadyComboBox):
     ) -> None:
         super().__init__()
         self._viewer, self._kinds, self._none, self._suits = viewer, kinds, none, suits
+        self.is_chosen = False
         self.offered: list[Any] = []
-        self._watched: weakref.WeakSet[Any] = weakref.WeakSet()
         self.setToolTip(tip)
-        self.picked.connect(self._watch)
         self.fill()
         self.currentIndexChanged.connect(lambda _: self.picked.emit())
+        self.activated.connect(self._choose)
         qt.while_alive(self, viewer.layers, ("inserted", "removed"), self.fill)
         qt.layers_while_alive(self, viewer.layers, "name", self.fill)
+        qt.layers_while_alive(self, viewer.layers, ("data", "paint"), self._on_edit)
 
     @property
     def layer(self) -> Any | None:
@@ -241,7 +241,11 @@ class LayerPicker(SteadyComboBox):
 
     @layer.setter
     def layer(self, layer: Any | None) -> None:
+        self._choose()
         self._select(layer)
+
+    def _choose(self, _: int = 0) -> None:
+        self.is_chosen = True
 
     def _default(self) -> Any:
         """Return the offered layer to begin with."""
@@ -275,57 +279,9 @@ class LayerPicker(SteadyComboBox):
         if self.layer is not before:
             self.picked.emit()
 
-    def _watch(self) -> None:
-        layer = self.layer
-        if layer is not None and layer not in self._watched:
-            self._watched.add(layer)
-            qt.while_alive(self, layer, ("data", "paint"), self._on_edit)
-
     def _on_edit(self, layer: Any) -> None:
         if layer is self.layer:
             self.edited.emit()
-
-
-class ShotPicker(LayerPicker):
-    """A picker of the shot's layer.
-
-    Until a layer is chosen, it is the image of an object rather than that of a beam, by names or
-    structure, whichever was opened first.
-    """
-
-    def __init__(self, viewer: Any) -> None:
-        self.is_chosen = False
-        super().__init__(viewer, "Layer of the shot, a greyscale image.", suits=about.may_be_shot)
-        self.activated.connect(self._choose)
-        qt.while_alive(self, viewer.layers, "inserted", self._on_insertion)
-
-    @property
-    def layer(self) -> Any | None:
-        return super().layer
-
-    @layer.setter
-    def layer(self, layer: Any | None) -> None:
-        self._choose()
-        self._select(layer)
-
-    def _choose(self, _: int = 0) -> None:
-        self.is_chosen = True
-
-    def _default(self) -> Any:
-        recorded = [layer for layer in self.offered if not about.belongs_to_result(layer)]
-        *earlier, best = recorded or self.offered
-        for layer in reversed(earlier):
-            if _is_rather_shot(layer, best, is_pair=len(recorded) == 2):
-                best = layer
-        return best
-
-    def _on_insertion(self, new: Any) -> None:
-        current = self.layer
-        if self.is_chosen or current is None or new is current or new not in self.offered:
-            return
-        recorded = [layer for layer in self.offered if not about.belongs_to_result(layer)]
-        if _is_rather_shot(new, current, is_pair=len(recorded) == 2):
-            self._select(new)
 
 
 # Whole words of a name: 'ref_3', 'shotBeam', but not 'refraction'.
@@ -361,10 +317,10 @@ def likely_beam(image: Any, offered: Sequence[Any], *, estimates: bool = False) 
         return None
     (beam,) = beams or fitting
     is_of_series = re.sub(r"\d", "", beam.name) == re.sub(r"\d", "", image.name)
-    return beam if beams or _is_rather_shot(image, beam, is_pair=not is_of_series) else None
+    return beam if beams or is_rather_shot(image, beam, is_pair=not is_of_series) else None
 
 
-def _is_rather_shot(layer: Any, other: Any, *, is_pair: bool = False) -> bool:
+def is_rather_shot(layer: Any, other: Any, *, is_pair: bool = False) -> bool:
     """Whether of two images a layer is the one with an object; a pair may differ less."""
     is_aside, other_is_aside = (
         _is_beam(each) or _has_word(each, _DARK_NAME) for each in (layer, other)

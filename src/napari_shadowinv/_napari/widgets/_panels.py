@@ -1,22 +1,32 @@
-"""The frame of a widget: controls in a column, and the report below its button."""
+"""The frame of a window: controls in a column, and the result below its button.
+
+- a column of controls, whose button runs a job: `ToolPanel`
+- verdict and report of a result, of a fit also its course: `ResultView`
+"""
 
 from __future__ import annotations
 
 import html
 import re
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
 from qtpy import QtWidgets
 
 from napari_shadowinv._napari import form as forms
-from napari_shadowinv._napari.jobs import Job
+from napari_shadowinv._napari.jobs import Finished, FitJob, ImageJob, Job, Refinement
+from napari_shadowinv._napari.layer_metadata import Result, main_layers, result_of
 from napari_shadowinv._napari.run import Outcome, Run
+from napari_shadowinv._napari.viewer_sync import show_caution
+from napari_shadowinv._napari.widgets import _files as files
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers
+from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.cautions import CAUTION_CODES
 from napari_shadowinv.facts import Fact, Headline, Level
+from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.preprocessing import Recipe
 
 Rows = Sequence[tuple[str, str]]  # of a report: names and values
 
@@ -28,6 +38,11 @@ _LEVEL_STYLES = {
 }
 _TITLE_WIDTH = "30%"
 _SETTLE_MS = 10  # merges simultaneous changes
+_WRITE_DELAY_MS = 300  # a moving slider is written once
+# Errors that a saved state causes which another version wrote in another form.
+_UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
+_REDRAW_MS = 500
+_MIN_REDRAW_RATIO = 10  # interval over the time of a drawing
 
 
 def fact_rows(facts: Iterable[Fact], *, details: bool = False) -> list[tuple[str, str]]:
@@ -118,7 +133,8 @@ class ToolPanel(qt.Docked):
         self._last = LastResults(viewer, self)
         self.keep_earlier = self._last.keep_earlier
         self.area, self.column = qt.scrolling_column(self)
-        self._keeper = qt.StateKeeper(self, name, self.state)
+        self._name = name  # of its saved state
+        self._writing = qt.timer(self, _WRITE_DELAY_MS, self.write_state, once=True)
         self._revealed: QtWidgets.QWidget | None = None
         self._revealing = qt.timer(self, _SETTLE_MS, self._reveal, once=True)
         panel.button.clicked.connect(lambda: self._run_or_cancel())
@@ -153,20 +169,25 @@ class ToolPanel(qt.Docked):
         for name, part in self.parts().items():
             if name in state:
                 # A part with an unreadable state keeps its defaults; the others are restored.
-                with suppress(*qt.UNREADABLE):
+                with suppress(*_UNREADABLE):
                     part.restore(state[name])
 
     def restore_last(self) -> None:
-        self._keeper.restore(self.restore)
+        with suppress(*_UNREADABLE):
+            self.restore(qt.saved_state(self._name))
 
     def keep(self) -> None:
         """Save the changed state soon."""
         if self._ready:
-            self._keeper.changed()
+            self._writing.start()
+
+    def write_state(self) -> None:
+        self._writing.stop()
+        qt.save_state(self._name, self.state())
 
     def hideEvent(self, event: Any) -> None:
         if self._ready:
-            self._keeper.write()
+            self.write_state()
         super().hideEvent(event)
 
     @property
@@ -201,3 +222,130 @@ class ToolPanel(qt.Docked):
     def _on_end(self, outcome: Outcome) -> None:
         if outcome.value is not None:
             self.show_result(outcome.value, outcome.tag)
+
+
+class ResultView(QtWidgets.QWidget):
+    """Verdict and report of a result; of a fit also its course.
+
+    It follows the results of selected layers if their `content` is of one of these kinds; `said`
+    returns warnings that stand elsewhere.
+    """
+
+    def __init__(
+        self,
+        tool: ToolPanel,
+        last: LastResults,
+        content: type | tuple[type, ...],
+        save_tip: str,
+        said: Callable[[], str] = str,
+    ) -> None:
+        super().__init__()
+        self._tool, self._last, self._content, self._said = tool, last, content, said
+        self._result: Result[Any] | None = None
+        self._recipe: Recipe | None = None  # that was run for the result, if it is the form's
+        self.changes = forms.WrappingLabel()
+        self.curve = qt.ObjectiveCurve()
+        self.verdict = VerdictLine()
+        self.save_result = qt.push_button("Save result…", save_tip, self.save)
+        tip = "Add potential, components of the field, re-projection, sites and other layers."
+        self.more_layers = qt.push_button("More layers", tip, self.add_layers)
+        buttons = qt.side_by_side((self.save_result, 1), (self.more_layers, 1))
+        self.report = ReportView()
+        qt.column(self, self.changes, self.verdict, self.curve, buttons, self.report)
+        self._redraw_timer = qt.timer(self, _REDRAW_MS, self._draw)
+        # Also for runs that are cancelled, or refused before they start.
+        tool.panel.button.clicked.connect(self.empty)
+        tool.panel.started.connect(self._on_start)
+        tool.panel.ended.connect(self._on_end)
+        qt.while_alive(self, tool.viewer.layers.selection, "active", self.follow)
+        self.empty()
+
+    def empty(self) -> None:
+        """Clear the report of the last result; its layers stay."""
+        self._result = self._recipe = None
+        self.changes.show_text("")
+        self.curve.empty()
+        self.verdict.show_text("")
+        self.report.empty()
+
+    @qt.notify_errors
+    def save(self) -> None:
+        """Ask for a file, and save the shown result, which of several is the last of the tool."""
+        viewer, last = self._tool.viewer, files.field_of(self._tool.results.layers)
+        content = files.result_to_save(viewer, files.shown_result(viewer, last))
+        files.save_as(self, content, self._tool.panel.say)
+
+    @qt.notify_errors
+    def add_layers(self) -> None:
+        files.add_missing_layers(self._tool.viewer, self._tool.results)
+
+    def show_fit(self, job: FitJob, finished: Finished) -> ResultLayers:
+        """Show the layers, verdict and report of a fit; return its layers."""
+        fit, tool = finished.content, self._tool
+        moved = place_inputs(tool.viewer, job)
+        self.show_report(finished.result, job, fit.facts_with_names(job.names))
+        results = self._last.layers_for_next((job.image, job.name))
+        results.show(main_layers(finished.layer_data, also=results.layer_keys), fit=moved)
+        return results
+
+    def show_report(
+        self, result: Result[Any], job: ImageJob, facts: Sequence[Fact] | None = None
+    ) -> None:
+        """Show the verdict and report of a job's result; notify if it is doubtful."""
+        headline = self._show(result, facts)
+        self._recipe = None if isinstance(job, Refinement) else job.recipe
+        if not headline.level.is_success:
+            show_caution(str(headline))
+        self._tool.reveal(self.verdict)
+
+    def compare(self, recipe: Recipe) -> None:
+        """Say so if the form's recipe is no longer that of the result."""
+        is_other = self._recipe is not None and recipe != self._recipe
+        self.changes.show_text("Changed since this result: press Run." if is_other else "")
+
+    def show_preview(self, result: Result[Any]) -> None:
+        self._result = result
+        self.verdict.show_headline(result.content.headline, "Preview: ")
+
+    def follow(self, _: Any = None) -> None:
+        """Show the report of the result whose layer is selected, such as a layer from a file."""
+        layer = self._tool.viewer.layers.selection.active
+        result = None if layer is None else result_of(layer)
+        if result is None or result is self._result or self._tool.panel.running:
+            return
+        if isinstance(result.content, self._content):
+            self.empty()
+            self._show(result)
+            self._tool.reveal(self.verdict)
+
+    def _show(self, result: Result[Any], facts: Sequence[Fact] | None = None) -> Headline:
+        self._result, content, origins = result, result.content, result.origins.items()
+        if isinstance(content, Inversion):
+            content = content.in_units(result.setup)
+        facts, said = facts or content.facts, self._said()
+        self.verdict.show_headline(content.headline)
+        warnings = [row for row in warning_rows(facts) if row not in origins and row[1] not in said]
+        rows, details = (fact_rows(facts, details=flag) for flag in (False, True))
+        self.report.show_rows([*warnings, *origins, *rows], details)
+        return content.headline
+
+    def _on_start(self) -> None:
+        # The verdict of a preview stays until the next preview.
+        if not self._tool.previewing:
+            self.empty()
+        if isinstance(self._tool.panel.tag, FitJob):
+            self._redraw_timer.start()
+
+    def _draw(self) -> None:
+        job = self._tool.panel.tag
+        if isinstance(job, FitJob):
+            start = time.perf_counter()
+            self.curve.show_steps(list(job.progress.history))
+            # A slow screen must not delay the fit and the window.
+            elapsed_ms = 1000 * (time.perf_counter() - start)
+            self._redraw_timer.setInterval(max(_REDRAW_MS, round(_MIN_REDRAW_RATIO * elapsed_ms)))
+
+    def _on_end(self, outcome: Any) -> None:
+        self._redraw_timer.stop()
+        if isinstance(outcome.tag, FitJob):
+            self.curve.show_steps(list(outcome.tag.progress.history))

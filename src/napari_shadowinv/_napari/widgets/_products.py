@@ -125,7 +125,7 @@ class ProductForm(ToolPanel):
     """
 
     def __init__(self, viewer: Any) -> None:
-        run = Run("analysis", "Measure", "Measure the product with its bands.")
+        run = Run("Measure", "Measure the product with its bands.")
         super().__init__(viewer, "products", run)
         self.measured: list[ProductResult] = []
         self._origin: about.Result[Any] | Path | None = None

@@ -40,9 +40,6 @@ _WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
 _LEGEND_CHARACTERS, _HANDLE_CHARACTERS = 60, 5  # of a row above a plot
 _CONSTANT_STAGES = ("samples",)  # do not change the objective
-# Errors that a saved state causes which another version wrote in another form.
-UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
-_WRITE_DELAY_MS = 300  # a moving slider is written once
 # napari's docks, which users expect to see next to a plugin's.
 _NAPARI_DOCKS = {"layer list", "layer controls", "console"}
 # Garbage collection of a widget would clear a function that only the widget holds before Qt
@@ -101,14 +98,6 @@ def _with_action(button: Any, tip: str, action: Callable[[], Any]) -> Any:
     return button
 
 
-def may_write(parent: QWidget, title: str, path: Path) -> bool:
-    """Ask whether an existing file may be replaced."""
-    if not path.exists():
-        return True
-    answer = QMessageBox.question(parent, title, f"{path.name} already exists. Replace it?")
-    return bool(answer == QMessageBox.StandardButton.Yes)
-
-
 def filter_of(title: str, endings: Sequence[str]) -> str:
     """Return the filter of a dialog for files with some endings, the usual one first."""
     return f"{title} ({' '.join(f'*{ending}' for ending in endings)})"
@@ -140,7 +129,10 @@ def ask_file(parent: QWidget, title: str, proposal: str, filters: str) -> Path |
         options=QFileDialog.Option.DontConfirmOverwrite,
     )
     path = complete(entered, chosen or filters) if entered else None
-    return path if path is not None and may_write(parent, title, path) else None
+    if path is None or not path.exists():
+        return path
+    answer = QMessageBox.question(parent, title, f"{path.name} already exists. Replace it?")
+    return path if answer == QMessageBox.StandardButton.Yes else None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -263,37 +255,19 @@ class Docked(QWidget):
                 return
 
 
-class StateKeeper(QObject):
-    """Saves a widget's state, of JSON values, in the settings soon after a change."""
-
-    def __init__(self, parent: QObject, name: str, state: Callable[[], dict[str, Any]]) -> None:
-        super().__init__(parent)
-        self._name = name
-        self._state = state
-        self._timer = timer(self, _WRITE_DELAY_MS, self.write, once=True)
-
-    def load(self) -> Mapping[str, Any]:
-        """Return the saved state; empty if there is none or it is damaged."""
-        text = _settings().value(self._name, "{}")
-        try:
-            state = json.loads(str(text))
-        except ValueError:
-            return {}
+def saved_state(name: str) -> Mapping[str, Any]:
+    """Return what a window saved in the settings; empty if there is nothing, or it is damaged."""
+    with suppress(ValueError):
+        state = json.loads(str(_settings().value(name, "{}")))
         return state if isinstance(state, dict) else {}
+    return {}
 
-    def restore(self, restore: Callable[[Mapping[str, Any]], None]) -> None:
-        """Restore the saved state by a widget's function; ignore a state that is unreadable."""
-        with suppress(*UNREADABLE):
-            restore(self.load())
 
-    def changed(self) -> None:
-        self._timer.start()
-
-    def write(self) -> None:
-        self._timer.stop()
-        settings = _settings()
-        settings.setValue(self._name, json.dumps(self._state()))
-        settings.sync()
+def save_state(name: str, state: Mapping[str, Any]) -> None:
+    """Save JSON values of a window in the settings."""
+    settings = _settings()
+    settings.setValue(name, json.dumps(state))
+    settings.sync()
 
 
 def _settings() -> QSettings:

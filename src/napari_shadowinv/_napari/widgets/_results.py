@@ -43,7 +43,10 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
         and about.frame_of(layer) == old
     ]
     on_image = [layer for layer in companions if about.frame_of(layer).units == old.units]
-    about.place_image(image, setup)
+    upright = about.frame_for(image.data.shape, setup)
+    image.scale = (*image.scale[:-2], *upright.scale)
+    image.units = (*image.units[:-2], *upright.units)
+    image.axis_labels = (*image.axis_labels[:-2], "y", "x")
     new = about.frame_of(image)
     if new == old:
         return False

@@ -14,6 +14,7 @@ from qtpy.QtCore import QSignalBlocker, Signal
 from qtpy.QtWidgets import QFileDialog, QWidget
 
 from napari_shadowinv._napari import form as forms
+from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv.errors import InputError
@@ -61,8 +62,42 @@ def _ask_for_store(edit: forms.PathEdit) -> str:
     return path + STORE_SUFFIX if path else ""
 
 
-class _ShotChoice(layers.ShotPicker):
-    """A layer, or another place that shots come from."""
+class _ShotChoice(layers.LayerPicker):
+    """A layer, or another place that shots come from.
+
+    Until one is chosen, it is the image of an object rather than that of a beam, by names or
+    structure, whichever was opened first.
+    """
+
+    def __init__(self, viewer: Any) -> None:
+        tip = (
+            "<qt>Layer of a shot, or of a stack of shots; or shots in files, which are inverted "
+            "into one store.</qt>"
+        )
+        super().__init__(viewer, tip, suits=about.may_be_shot)
+        self.setPlaceholderText("no image is open")
+        qt.while_alive(self, viewer.layers, "inserted", self._on_insertion)
+
+    def _default(self) -> Any:
+        *earlier, best = self._recorded or self.offered
+        for layer in reversed(earlier):
+            if self._is_better(layer, best):
+                best = layer
+        return best
+
+    def _on_insertion(self, new: Any) -> None:
+        current = self.layer
+        if self.is_chosen or current is None or new is current or new not in self.offered:
+            return
+        if self._is_better(new, current):
+            self._select(new)
+
+    @property
+    def _recorded(self) -> list[Any]:
+        return [layer for layer in self.offered if not about.belongs_to_result(layer)]
+
+    def _is_better(self, layer: Any, other: Any) -> bool:
+        return layers.is_rather_shot(layer, other, is_pair=len(self._recorded) == 2)
 
     @property
     def kind(self) -> str:
@@ -92,11 +127,6 @@ class ShotsPicker(QWidget):
     def __init__(self, viewer: Any) -> None:
         super().__init__()
         self.layers = _ShotChoice(viewer)
-        self.layers.setPlaceholderText("no image is open")
-        self.layers.setToolTip(
-            "<qt>Layer of a shot, or of a stack of shots; or shots in files, which are inverted "
-            "into one store.</qt>"
-        )
         self.files = forms.PathEdit(
             "Files of the shots",
             "shots/*.tif",

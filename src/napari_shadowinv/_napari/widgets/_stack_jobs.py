@@ -15,10 +15,10 @@ from numpy.typing import ArrayLike
 from qtpy.QtWidgets import QLabel, QWidget
 
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.layer_metadata import KEY, main_layers, role_of
-from napari_shadowinv._napari.layers import LayerData, widen_limits
+from napari_shadowinv._napari.layer_metadata import layer_key, main_layers, role_of
+from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.run import Outcome
-from napari_shadowinv._napari.stores import first_shot, follow_shots, shot_rows, store_layers
+from napari_shadowinv._napari.stores import follow_shots, shot_rows, store_layers
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import kind_of
@@ -33,10 +33,11 @@ from napari_shadowinv.shot import Shot
 if TYPE_CHECKING:
     from napari_shadowinv.stack import RunStatus, ShotOutcome
 
-_UPDATE_INTERVAL_S = 0.5  # while the inversion falls behind the folder
+_UPDATE_INTERVAL_S = 0.5
+_MIN_UPDATE_RATIO = 10  # interval over the time of a description
 _REFRESH_INTERVAL_MS = 200  # many small shots may finish within a second
 _MAX_FAILURES = 100
-Limits = dict[str, tuple[float, float]]
+_SAME_LIMITS = 0.03  # relative to their range; smaller changes are not shown
 
 
 def _empty_status() -> RunStatus:
@@ -65,15 +66,11 @@ class StackJob(Job):
     companions: tuple[Any, ...] = ()  # layers that lie on the image
     placement: Mapping[str, Any] = field(default_factory=dict)  # keywords of the layers
     origins: Mapping[str, str] = field(default_factory=dict)  # of its inputs, rows of the report
-    limits: Limits = field(default_factory=dict)  # by role, over all shots in the store so far
     status: RunStatus = field(default_factory=_empty_status)
     layer_data: LayerData = field(default_factory=list)  # empty until a shot is finished
-    longer_data: LayerData = field(default_factory=list)  # with shots that the layers do not show
     newest: int = 0  # the last shot that could be inverted
     _note: str = ""
-    _reference: int = 0  # the shot that decides on units
-    _new_shots: list[int] = field(default_factory=list)  # not in the limits yet
-    _described_at: float = 0.0  # s
+    _describe_at: float = 0.0  # s
 
     @property
     def is_watch(self) -> bool:
@@ -116,51 +113,22 @@ class StackJob(Job):
         return Progress(stage, status.ended, None, f"{status.text}{note}")
 
     def _update(self, status: RunStatus) -> None:
-        """Describe the layers once a shot is done, and include each shot in the limits."""
+        """Describe the layers of the store from time to time, so that the shots need not wait."""
         outcome: ShotOutcome | None = status.outcome
         if outcome is not None and not outcome.reason:
-            self._new_shots.append(outcome.index)
             self.newest = max(self.newest, outcome.index)
-        layer_data = self.layer_data
-        if not layer_data:
-            layer_data = self.layer_data = self._first_layers()
-        elif self.is_watch:
-            # From time to time only, so that the shots need not wait.
-            is_early = time.monotonic() <= self._described_at + _UPDATE_INTERVAL_S
-            if status.waiting > 1 and is_early:
-                return
-            layer_data = self._described(self._reference)
-            self.longer_data = layer_data or self.longer_data
-        for shot in self._new_shots if layer_data else ():
-            for data, keywords, kind in layer_data:
-                if kind == "image":
-                    role = str(role_of(keywords))
-                    self.limits[role] = widen_limits(self.limits[role], np.asarray(data[shot]))
-        self._new_shots.clear()
-        self._described_at = time.monotonic()
-
-    def _first_layers(self) -> LayerData:
+        start = time.monotonic()
+        if self.layer_data and status.waiting > 1 and start < self._describe_at:
+            return
         # napari's cache of a pending shot would hide that it is done.
         placement = {"cache": False, **self.placement}
-        layer_data = [
-            (data, keywords | placement, kind) for data, keywords, kind in self._described()
-        ]
-        for _, keywords, kind in layer_data:
-            if kind == "image":
-                role, (low, high) = str(role_of(keywords)), keywords["contrast_limits"]
-                earlier = self.limits.get(role, (low, high))
-                self.limits[role] = min(low, earlier[0]), max(high, earlier[1])
-        if layer_data:
-            self._reference = first_shot(self.out)
-            self.newest = max(self.newest, self._reference)
-        return layer_data
-
-    def _described(self, shot: int | None = None) -> LayerData:
-        """Describe the layers of the store; none if that has to wait for the next shot."""
-        try:
-            return store_layers(self.out, shot=shot)
-        except (InputError, OSError):
-            return []
+        with suppress(InputError, OSError):  # that has to wait for the next shot
+            self.layer_data = [
+                (data, keywords | placement, kind)
+                for data, keywords, kind in store_layers(self.out)
+            ]
+        end = time.monotonic()
+        self._describe_at = end + max(_UPDATE_INTERVAL_S, _MIN_UPDATE_RATIO * (end - start))
 
 
 class StackView(QWidget):
@@ -171,8 +139,10 @@ class StackView(QWidget):
         self._viewer, self._report = viewer, report
         self.job: StackJob | None = None  # whose layers are shown
         self.results = ResultLayers(viewer, self)
-        self._applied: Limits = {}  # other contrast is the user's
-        self._ended, self._failed, self._newest, self._resets_view = 0, 0, 0, False
+        self._applied: dict[str, tuple[float, float]] = {}  # by role; other contrast is the user's
+        self._failed, self._newest = 0, 0
+        self._resets_view, self._moves = False, False
+        self._shown: LayerData = []  # all layers of the store as it was
         self._arrows: Any = None
         self._read_arrows: Callable[[], None] | None = None
         self._refresh_timer = qt.timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
@@ -192,93 +162,72 @@ class StackView(QWidget):
 
     def empty(self) -> None:
         """Forget the failures of the last run; its layers stay."""
-        self._ended = 0
         self.show_failures([])
-
-    def limits_of(self, out: Path) -> Limits:
-        """Return the limits with which another run into a store begins."""
-        return dict(self.job.limits) if self.job is not None and self.job.out == out else {}
 
     def show_run(self, job: StackJob) -> None:
         """Show the failures and layers of a run."""
         if len(job.status.failures) != self._failed:
             self.show_failures(list(job.status.failures))
         if job.layer_data and job is not self.job:
-            self._show_layers(job)
-        elif job.status.ended > self._ended and not self._refresh_timer.isActive():
+            self._begin(job)
+        if job.layer_data is not self._shown and not self._refresh_timer.isActive():
             self._refresh_timer.start()
-        self._ended = job.status.ended
 
-    def _show_layers(self, job: StackJob) -> None:
+    def _begin(self, job: StackJob) -> None:
         is_resumed = self.job is not None and self.job.out == job.out
         if not is_resumed:
-            self.results, self._applied = ResultLayers(self._viewer, self), {}
+            self.results, self._applied, self._newest = ResultLayers(self._viewer, self), {}, 0
             self.results.complete.connect(self._on_layers)
         self.job, self._resets_view = job, not is_resumed and job.image is None
         if job.image is not None and job.recipe.setup is not None:
             place_together(self._viewer, job.image, job.recipe.setup, job.companions)
-        current = {role_of(layer): tuple(layer.contrast_limits) for layer in self.images}
-        for _, keywords, kind in job.layer_data:
-            if kind == "image":
-                role = str(role_of(keywords))
-                limits = job.limits[role]
-                keywords["contrast_limits"] = current.get(role, limits)
-                self._applied.setdefault(role, limits)  # also for layers that are added later
-        layer_data = main_layers(job.layer_data, also=self.results.layer_keys)
-        self.results.show(layer_data, select=not is_resumed)
+        self._show(main_layers(job.layer_data, also=self.results.layer_keys), select=not is_resumed)
+
+    def _refresh(self) -> None:
+        """Show the shots that have ended since; layers that the user deleted stay so."""
+        if self.results.busy:
+            self._refresh_timer.start()
+        elif self.job is not None and self.job.layer_data is not self._shown:
+            keys = self.results.layer_keys
+            self._show([each for each in self.job.layer_data if layer_key(each[1]) in keys])
+
+    def _show(self, layer_data: LayerData, *, select: bool = False) -> None:
+        assert self.job is not None
+        self._shown, shot = self.job.layer_data, self.shot_in_view
+        # The newest shot is followed only if it was in view.
+        self._moves = not self.images or (shot is not None and shot >= self._newest)
+        current: dict[str, Any] = {
+            str(role_of(layer)): tuple(layer.contrast_limits) for layer in self.images
+        }
+        for _, keywords, kind in self._shown:
+            if kind != "image":
+                continue
+            role, limits = str(role_of(keywords)), keywords["contrast_limits"]
+            applied: Any = self._applied.get(role, limits)
+            change = np.subtract(current.get(role) or applied, applied)
+            if np.abs(change).max() > _SAME_LIMITS * np.ptp(applied):
+                keywords["contrast_limits"] = current[role]
+            else:
+                self._applied[role] = limits
+        self.results.show(layer_data, select=select)
 
     def _on_layers(self) -> None:
         # The setup places the results of files, perhaps far outside the view.
         if self._resets_view:
             self._resets_view = False
             self._viewer.reset_view()
-            self._follow()
+        if self.job is not None and self.job.is_watch:
+            # A failed shot would leave a black canvas.
+            self._newest = max(self._newest, min(self.job.newest, self._last))
+            if self._moves:
+                self._viewer.dims.set_current_step(self._viewer.dims.ndim - 3, self._newest)
         layers = self.results.layers
         arrows = next((layer for layer in layers if role_of(layer) == "arrows"), None)
         if arrows is not self._arrows:
             self._arrows = arrows
             self._read_arrows = None if arrows is None else follow_shots(self._viewer, arrows)
-        self._refresh_timer.start()
-
-    def _refresh(self) -> None:
-        job = self.job
-        if job is None:
-            return
-        if job.is_watch:
-            self._grow(job)
-        for layer in self.images:
-            role, current = str(role_of(layer)), tuple(layer.contrast_limits)
-            if role in job.limits and np.allclose(self._applied.get(role, current), current):
-                layer.contrast_limits = job.limits[role]
-                self._applied[role] = tuple(layer.contrast_limits)
-        for layer in self.results.layers:
-            layer.refresh()
         if self._read_arrows is not None:
             self._read_arrows()
-
-    def _grow(self, job: StackJob) -> None:
-        """Add new shots to the layers; follow them only if the newest shot was in view."""
-        if self.results.busy:
-            self._refresh_timer.start()
-            return
-        shot = self.shot_in_view
-        layer_data, job.longer_data = job.longer_data, []
-        content = {role_of(keywords): (data, keywords) for data, keywords, _ in layer_data}
-        for layer in self.results.layers:
-            if role_of(layer) not in content:
-                continue
-            data, keywords = content[role_of(layer)]
-            layer.metadata[KEY].update(keywords["metadata"][KEY])
-            if kind_of(layer) in ("image", "labels"):
-                layer.data = data
-        self._follow(moves=shot is not None and shot >= self._newest)
-
-    def _follow(self, *, moves: bool = True) -> None:
-        """Show the newest shot that could be inverted; a failed one would leave a black canvas."""
-        if self.job is not None and self.job.is_watch:
-            self._newest = min(self.job.newest, self._last)
-            if moves:
-                self._viewer.dims.set_current_step(self._viewer.dims.ndim - 3, self._newest)
 
     @property
     def _last(self) -> int:

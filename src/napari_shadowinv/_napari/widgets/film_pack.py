@@ -177,11 +177,11 @@ def draw_spectrum(axes: Any, spectrum: packs.Spectrum, where: str, ink: str) -> 
 
 
 class FilmPack(panels.ToolPanel):
-    """Choose a pack file, then press Run; correct corners and masks, and run again."""
+    """Choose a pack file, then press Run; correct corners and masks, and press it again."""
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Compute dose and fluence of each film of the pack."
-        super().__init__(napari_viewer, "film-pack", Run("Film pack", "Run", tip))
+        super().__init__(napari_viewer, "film-pack", Run("Run", tip))
         scratch = TemporaryDirectory(prefix="film-pack-")
         qt.when_destroyed(self, scratch.cleanup)
         self._scratch = Path(scratch.name)
@@ -230,11 +230,6 @@ class FilmPack(panels.ToolPanel):
         self.paint = qt.push_button(
             "Paint mask", "Paint pixels of the displayed film to exclude them.", self._paint
         )
-        self.run_again = qt.push_button(
-            "Run again",
-            "Evaluate the pack again with the dragged corners and without the painted pixels.",
-            self._run_again,
-        )
         self.to_fit = qt.push_button(
             "Layers for a fit",
             "Add each film as an image with energy, setup and mask, for Invert and Fit "
@@ -255,7 +250,7 @@ class FilmPack(panels.ToolPanel):
             self.report,
             forms.labelled("Region", region),
             self.plot,
-            qt.side_by_side((self.show_corners, 1), (self.paint, 1), (self.run_again, 1)),
+            qt.side_by_side((self.show_corners, 1), (self.paint, 1)),
             qt.side_by_side((self.to_fit, 1), (self.write, 1), (self.save, 1)),
         )
         column.setAlignment(Qt.AlignmentFlag.AlignTop)
@@ -263,40 +258,38 @@ class FilmPack(panels.ToolPanel):
         self.corners = CornerEditor(self.viewer, self)
 
     def request(self) -> PackJob:
-        path = self.path.path
-        if not path:
-            raise InputError("no pack is selected: choose a pack file, such as pack.toml")
-        file = Path(path).expanduser().absolute()
-        pack = read_pack(file)
-        name = file.stem if file.stem != "pack" else file.parent.name
-        return PackJob(pack, str(file), name, Path(mkdtemp(dir=self._scratch)))
+        """Return the pack of the file, or else of the result, with its corners and painted pixels.
 
-    def forget(self) -> None:
-        self.panel.say("")
-
-    def _corrected_job(self) -> PackJob:
-        layer, doses = self._selected()
-        metadata = about.metadata_of(layer)
+        Another file than the result's has none of them.
+        """
+        file = str(Path(self.path.path).expanduser().absolute()) if self.path.path else ""
+        layer, folder = self.packs.layer, Path(mkdtemp(dir=self._scratch))
+        metadata = {} if layer is None else about.metadata_of(layer)
+        if layer is None or file not in ("", metadata.get("path")):
+            if not file:
+                raise InputError("no pack is selected: choose a pack file, such as pack.toml")
+            path = Path(file)
+            name = path.stem if path.stem != "pack" else path.parent.name
+            return PackJob(read_pack(path), file, name, folder)
+        doses = self._selected()[1]
         labels = self._partner(layer, packs.UNUSABLE)
         by_hand = None if labels is None else packs.painted_by_hand(labels.data, doses)
+        pack = read_pack(Path(file)) if file else metadata.get("pack") or doses.pack
+        if len(pack.layers) != len(doses.usable):
+            return PackJob(pack, file, name_of_result(layer), folder)
         return PackJob(
-            metadata.get("pack") or doses.pack,
+            pack,
             metadata.get("path", ""),
             name_of_result(layer),
-            Path(mkdtemp(dir=self._scratch)),
+            folder,
             self.corners.corners(doses) or metadata.get("corners"),
             by_hand,
             doses.scales,
             plane_in_view(self.viewer, layer),
         )
 
-    @qt.notify_errors
-    def _run_again(self) -> None:
-        if self.panel.running:
-            return
-        job = self._corrected_job()
-        self.forget()
-        self.start(job)
+    def forget(self) -> None:
+        self.panel.say("")
 
     def show_result(self, finished: Finished, job: PackJob) -> None:
         self.corners.close()
@@ -361,9 +354,7 @@ class FilmPack(panels.ToolPanel):
     def _show_corners(self) -> None:
         layer, doses = self._selected()
         self.corners.show(layer, doses)
-        self.panel.say(
-            "Drag the corners. Move the slider to show other films. Then press Run again."
-        )
+        self.panel.say("Drag the corners. Move the slider to show other films. Then press Run.")
 
     @qt.notify_errors
     def _paint(self) -> None:
@@ -379,7 +370,7 @@ class FilmPack(panels.ToolPanel):
         labels.brush_size = _BRUSH_PX
         self.viewer.layers.selection.active = labels
         labels.mode = "paint"
-        self.panel.say("Paint the pixels to exclude. Then press Run again.")
+        self.panel.say("Paint the pixels to exclude. Then press Run.")
 
     @qt.notify_errors
     def _add_fit_images(self) -> None:

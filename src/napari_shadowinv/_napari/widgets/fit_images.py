@@ -11,20 +11,20 @@ import numpy as np
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.jobs import Finished, FitJob, TimeEstimate
+from napari_shadowinv._napari.costs import fit_cost
+from napari_shadowinv._napari.jobs import Finished, FitJob
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import layers_of_shot, shot_of_layer
 from napari_shadowinv._napari.widgets import _inputs as inputs
 from napari_shadowinv._napari.widgets import _layers as layers
-from napari_shadowinv._napari.widgets._files import result_buttons
-from napari_shadowinv._napari.widgets._fitting import ResultView
 from napari_shadowinv._napari.widgets._image_table import (
     ImageTable,
     beam_column,
     entries_of,
     store_entries,
 )
+from napari_shadowinv._napari.widgets._panels import ResultView
 from napari_shadowinv._napari.widgets._qt import side_by_side
 from napari_shadowinv._napari.widgets._results import result_frame
 from napari_shadowinv._system.validation import labels_of, validate
@@ -55,7 +55,7 @@ class FitImages(inputs.ImagePanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Fit the fields, and an unknown beam, to all images together."
-        panel = Run("Fit several images", "Run", tip)
+        panel = Run("Run", tip)
         super().__init__(napari_viewer, "fit-images", panel)
         self._build()
         self._connect()
@@ -93,14 +93,11 @@ class FitImages(inputs.ImagePanel):
         )
         self.setup_section = forms.titled_section(self.setup)
         self.cost = forms.WrappingLabel()
-        self.save_result, self.more_layers = result_buttons(
-            self,
-            lambda: self.results,
+        tip = (
             "Save the selected or last fit: complete with its layers (.shadowinv), or its field "
-            "for other programs (.h5).",
+            "for other programs (.h5)."
         )
-        buttons = side_by_side((self.save_result, 1), (self.more_layers, 1))
-        self.view = ResultView(self, self._last, Fit, buttons)
+        self.view = ResultView(self, self._last, Fit, tip)
         self.add(self.images, self.fields, self.source, self.masks, self.brightness, self.noise)
         self.add(self.setup_section, *self.settings)
         self.add(side_by_side((self.keep_earlier, 1), (self.recipes, 0)), self.cost, self.panel)
@@ -108,7 +105,6 @@ class FitImages(inputs.ImagePanel):
 
     def _connect(self) -> None:
         self.images.reference_changed.connect(self._on_reference)
-        self.images.reference_beam_entered.connect(self._set_beam)
         self.images.changed.connect(self._show_beams)
         self.source.changed.connect(self.images.fill)
         self.setup.changed.connect(self._on_setup)
@@ -227,7 +223,6 @@ class FitImages(inputs.ImagePanel):
 
     def _shots(self, images: Sequence[Any], setup: Setup | None) -> tuple[Shot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
-        sources = self.source.measured_for_each(images)
         rows = [self.images.values(image) for image in images]
         # One that is 1 for all need not be said.
         is_known = self.brightness.kind != "free" and any(row["brightness"] != 1 for row in rows)
@@ -236,14 +231,14 @@ class FitImages(inputs.ImagePanel):
                 shot_of_layer(image, layers.image_of(image)),
                 name=image.name,
                 setup=None if setup is None else self._setup_of(image, setup),
-                source=source,
+                source=self.source.measured(image),
                 mask=self.masks.usable(image),
                 strength=(self.images.beam_value(image),) if setup is None else None,
                 brightness=row["brightness"] if is_known else None,
                 psf=row["psf"],
                 measured=self.source.layer is None or not about.is_estimate(self.source.layer),
             )
-            for image, row, source in zip(images, rows, sources, strict=True)
+            for image, row in zip(images, rows, strict=True)
         )
 
     def show_result(self, finished: Finished, job: FitJob) -> None:
@@ -252,16 +247,14 @@ class FitImages(inputs.ImagePanel):
 
     def _show_cost(self) -> None:
         try:
-            images = self._images()
-            shape = Recipe(steps=self.steps.steps()).shape_after(images[0].data.shape)
-            options = self.options.model()
+            images, recipe = self._images(), self.recipe()
+            shape = recipe.shape_after(images[0].data.shape)
+            assert recipe.fit is not None
+            cost = fit_cost(shape, len(images), recipe.fit, FitJob.pace)
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
-        is_unknown = self.source.kind == inputs.UNKNOWN
-        fields = len(self.fields.kind.split(inputs.BOTH))
-        estimate = TimeEstimate(shape, len(images), fields, is_unknown, options)  # type: ignore[arg-type]
-        self.cost.show_text(estimate.text(FitJob.pace))
+        self.cost.show_text(cost.text)
 
     def _images(self) -> list[Any]:
         images = self.images.used
@@ -329,12 +322,6 @@ class FitImages(inputs.ImagePanel):
             self.setup_section.expand(animate=False)
         else:
             self.setup_section.collapse(animate=False)
-
-    def _set_beam(self, value: float) -> None:
-        """Set the energy or wavelength of the shown setup from the reference's row."""
-        form = self.setup.picker.form
-        if form is not None:
-            self.setup.show_setup({**form.state(), self.images.beam.name: value})
 
     def _on_setup(self) -> None:
         self.fields.offer(inputs.fields_of(self.setup.picker.kind))

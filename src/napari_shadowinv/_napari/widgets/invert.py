@@ -12,19 +12,20 @@ from qtpy.QtWidgets import QCheckBox
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.costs import inversion_cost
 from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.run import Outcome, Run
 from napari_shadowinv._napari.shots import shot_of_layer
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._files import field_of, result_buttons, shot_to_save
-from napari_shadowinv._napari.widgets._fitting import ResultView
+from napari_shadowinv._napari.widgets._files import field_of
 from napari_shadowinv._napari.widgets._inputs import (
     SHOT_SOURCES,
     ImagePanel,
     SetupPicker,
 )
+from napari_shadowinv._napari.widgets._panels import ResultView
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
 from napari_shadowinv._napari.widgets._shot_inputs import FOLDER, ShotsPicker, StoreSection, lasting
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob, StackView, placement_on
@@ -54,25 +55,6 @@ _SAVE_TIP = (
 _PREVIEW_DELAY_MS = 10  # merges simultaneous changes
 
 
-class CostLine(forms.WrappingLabel):
-    """The estimated time and memory of an inversion of a large image, by the last one's pace."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._pace = 1.0
-
-    def show_cost(self, shape: tuple[int, ...], options: Any) -> None:
-        cost = jobs.estimate_cost(shape, options, self._pace)
-        self.show_text(cost.text, forms.PROBLEM_STYLE if cost.exceeds_memory else "")
-
-    def learn(self, inversion: Inversion) -> None:
-        seconds = inversion.report.seconds
-        estimated_s = jobs.estimate_cost(inversion.potential.shape, inversion.options).seconds
-        # Cached sites and small images would give a wrong pace.
-        if estimated_s > 1 and seconds.get("sites", 0) > 0.1:
-            self._pace = sum(seconds.values()) / estimated_s
-
-
 class Invert(ImagePanel):
     """Choose an image or many shots, then press Run; everything else has a default."""
 
@@ -80,7 +62,7 @@ class Invert(ImagePanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Invert the image, or all shots that are not in the store yet."
-        super().__init__(napari_viewer, "invert", Run("Invert", "Run", tip))
+        super().__init__(napari_viewer, "invert", Run("Run", tip))
         self._cache = Cache()
         self.previewed = ResultLayers(self.viewer, self)
         self._preview_timer = qt.timer(self, _PREVIEW_DELAY_MS, self._preview, once=True)
@@ -115,17 +97,13 @@ class Invert(ImagePanel):
         tip = f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
         self.live = QCheckBox("Live preview", toolTip=tip)
         self.store = StoreSection()
-        self.cost, self.refine_form = CostLine(), forms.ModelForm(FitChoices, ["psf"])
+        self.cost, self.refine_form = forms.WrappingLabel(), forms.ModelForm(FitChoices, ["psf"])
         self.refine_button = qt.push_button("Refine", _REFINE_TIP, self.refine)
         refine = self.refine_form, self.refine_button
         self.refine_section = forms.section("Refine the result", *refine)
         self._refined = ResultLayers(self.viewer, self)
-        self.save_result, self.more_layers = result_buttons(
-            self, lambda: self.results, _SAVE_TIP, shot_to_save
-        )
-        buttons = qt.side_by_side((self.save_result, 1), (self.more_layers, 1))
         kinds, said = (Inversion, Fit), self.setup.warning_label.text
-        self.view = ResultView(self, self._last, kinds, buttons, said)
+        self.view = ResultView(self, self._last, kinds, _SAVE_TIP, said)
         self.verdict, self.report = self.view.verdict, self.view.report
         self.stack_view = StackView(self.viewer, self.report)
         self.show_source = qt.push_button(
@@ -225,15 +203,13 @@ class Invert(ImagePanel):
             layer, recipe, chosen, name=self.shots.name, source_mask=source_mask
         )
         if is_stack:
-            out = self.store.path
             return StackJob(
                 shots=self.shots.shots(),
-                out=out,
+                out=self.store.path,
                 source=source,
                 mask=mask,
                 source_mask=hidden,
                 placement={} if layer is None else placement_on(layer, recipe),
-                limits=self.stack_view.limits_of(out),
                 options=self.store.options(self.shots.kind),
                 **described,
             )
@@ -254,31 +230,27 @@ class Invert(ImagePanel):
         )
 
     @qt.notify_errors
-    def refine(self) -> None:
-        """Refine the last inversion of the image, or else that of the selected layer."""
-        if self.is_busy:
-            return
-        fields = field_of(self._last.layers_of(self.image.layer))
-        chosen = fields[0] if fields else self.viewer.layers.selection.active
-        if chosen is None or about.result_of(chosen) is None:
-            raise InputError(
-                "there is no inversion of this image to refine: press Run first, then Refine"
-            )
-        self.refine_layer(chosen)
-
-    @qt.notify_errors
-    def refine_layer(self, layer: Any) -> None:
-        """Refine the inversion that a layer belongs to, such as a result from a file."""
-        self.refine_section.expand()
-        image = self._last.shot_of(layer)
-        name = jobs.name_of_result(layer) if image is None else str(image.name)
-        choices: Any = self.refine_form.model()
-        job = jobs.refinement(layer, layer if image is None else image, name, choices.psf or 0.0)
+    def refine(self, layer: Any = None) -> None:
+        """Refine the inversion of a layer; by default the image's last one, or the selected."""
         if self.is_busy:
             raise InputError(
                 "Invert is running: wait until it finishes, or press Cancel, then refine"
             )
-        self.start(job)
+        fields = field_of(self._last.layers_of(self.image.layer))
+        chosen: Any = layer
+        if layer is None:
+            chosen = next(iter(fields), self.viewer.layers.selection.active)
+        if chosen is None or about.result_of(chosen) is None:
+            raise InputError(
+                "there is no inversion of this image to refine: press Run first, then Refine"
+            )
+        self.refine_section.expand()
+        image = self._last.shot_of(chosen)
+        name = jobs.name_of_result(chosen) if image is None else str(image.name)
+        choices: Any = self.refine_form.model()
+        self.start(
+            jobs.refinement(chosen, chosen if image is None else image, name, choices.psf or 0.0)
+        )
 
     @qt.notify_errors
     def _show_source(self) -> None:
@@ -340,7 +312,6 @@ class Invert(ImagePanel):
             self.previewed.show(finished.layer_data, select=False, fit=moved)
             return
         self.view.show_report(finished.result, job)
-        self.cost.learn(inversion)
         self._show_cost()
         # They refine an earlier result and would cover the new one.
         self._refined.hide()
@@ -386,7 +357,9 @@ class Invert(ImagePanel):
         try:
             recipe = Recipe(steps=self.all_steps())
             shape = recipe.shape_after(layers.image_of(self.image.layer).shape)
-            self.cost.show_cost(shape, self.options.model())
+            options: Any = self.options.model()
+            cost = inversion_cost(shape, options, jobs.InversionJob.pace)
+            self.cost.show_text(cost.text, forms.PROBLEM_STYLE if cost.exceeds_memory else "")
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
 

@@ -1,0 +1,114 @@
+"""Time and memory of a run, estimated before it, and the stages of a fit as they pass.
+
+- the cost of an inversion: `inversion_cost`; of a fit: `fit_cost`
+- the course of a fit: `FitProgress`
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from napari_shadowinv._system.machine import physical_memory
+from napari_shadowinv._system.progress import Progress
+from napari_shadowinv.options import MAX_DEFAULT_SITES, FitChoices, InversionOptions
+
+# Twice what two fast cores take for two to four images of 64² to 400² px without crossing rays.
+# Crossing rays, or a search for the cause of a misfit, multiply the time by 1.9 to 4.
+_TIME_S, _TIME_PER_PIXEL_S = 0.45, 1.7e-5
+_CROSSING_RAYS_FACTOR = 4.0
+_TWO_FIELDS_FACTOR, _UNKNOWN_BEAM_FACTOR = 1.5, 1.2
+# Time of an error bar's sample relative to the fit.
+_TIME_PER_SAMPLE, _TIME_PER_BEAM_SAMPLE = 0.008, 0.012
+_EVIDENCE_IN_SAMPLES = 20
+# Of an inversion; measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites,
+# including the layers of the result.
+_SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
+_BYTES, _BYTES_PER_PIXEL, _BYTES_PER_SITE = 200e6, 280.0, 1700.0
+_MIN_PIXELS_FOR_ESTIMATE = 1_000_000
+_MINUTE_S, _HOUR_S = 60, 3600
+
+_STAGES = ("starts", "smoothness", "full size and error bars")
+_STAGE_NUMBERS = {"smoothness": 1} | dict.fromkeys(
+    ("other starts", "full size", "point spread", "rivals", "samples", "evidence"), 2
+)
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Estimated time of a run, and a sentence about it, empty for a small one."""
+
+    seconds: float
+    text: str
+    exceeds_memory: bool = False
+
+
+def inversion_cost(
+    shape: Sequence[int], options: InversionOptions, pace: float | None = None
+) -> Cost:
+    """Estimate an inversion that takes `pace` times the reference time on this machine."""
+    pixels, available = shape[0] * shape[1], physical_memory()
+    sites = options.n_sites or min(pixels, MAX_DEFAULT_SITES)
+    seconds = (pace or 1) * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites)
+    memory = _BYTES + _BYTES_PER_PIXEL * pixels + _BYTES_PER_SITE * sites
+    text = (
+        f"{pixels / 1e6:.3g} Mpx with {sites:,} sites: about {_in_words(seconds)} and up to "
+        f"{memory / 1e9:.1f} GB"
+    )
+    if available is not None and memory > available:
+        advice = "crop or bin the image, or choose fewer sites"
+        text += f", more than this machine's {available / 1e9:.1f} GB: {advice}."
+        return Cost(seconds, text, exceeds_memory=True)
+    return Cost(seconds, f"{text}." if pixels >= _MIN_PIXELS_FOR_ESTIMATE else "")
+
+
+def fit_cost(
+    shape: Sequence[int], images: int, choices: FitChoices, pace: float | None = None
+) -> Cost:
+    """Estimate a fit without crossing rays, by the pace of the last one if it is known."""
+    fields, is_unknown = len(choices.fields or ("B",)), choices.beam == "unknown"
+    seconds = _TIME_S + _TIME_PER_PIXEL_S * images * shape[0] * shape[1]
+    seconds *= _TWO_FIELDS_FACTOR if fields > 1 else 1
+    seconds *= _UNKNOWN_BEAM_FACTOR if is_unknown else 1
+    samples = choices.options.samples if choices.options.samples > 1 else 0
+    samples += _EVIDENCE_IN_SAMPLES if choices.options.evidence else 0
+    seconds *= 1 + samples * (_TIME_PER_BEAM_SAMPLE if is_unknown else _TIME_PER_SAMPLE)
+    seconds *= pace or 1
+    count = "one image" if images == 1 else f"{images} images"
+    more = f", {fields} fields" if fields > 1 else ""
+    more += ", unknown beam" if is_unknown else ""
+    basis = "based on the last fit"
+    if pace is None:
+        basis = f"up to {_in_words(_CROSSING_RAYS_FACTOR * seconds)} if rays cross"
+    subject = f"{count} of {shape[0]} × {shape[1]} px{more}"
+    return Cost(seconds, f"{subject}: about {_in_words(seconds)}, {basis}.")
+
+
+def _in_words(seconds: float) -> str:
+    """Format an approximate time with a suitable unit."""
+    if seconds < 2 * _MINUTE_S:
+        return f"{float(f'{seconds:.1g}'):g} s" if seconds < 10 else f"{round(seconds, -1):g} s"
+    if seconds < 2 * _HOUR_S:
+        return f"{seconds / _MINUTE_S:.0f} min"
+    return f"{seconds / _HOUR_S:.1f} h"
+
+
+class FitProgress:
+    """Converts messages of a fit to its stages, and records its objectives."""
+
+    def __init__(self) -> None:
+        self.history: list[tuple[str, float]] = []
+        self._stage, self._objective = 0, float("nan")
+
+    def update(self, progress: Progress) -> Progress:
+        """Return the progress of the fit, with the number of its stage and its name."""
+        if progress.stage != "fit" or progress.objective is None:
+            return progress
+        name, value = progress.message, progress.objective
+        self.history.append((name, value))
+        if name != "samples":  # drawn in larger pixels, whose objective is another
+            self._objective = value
+        self._stage = max(self._stage, _STAGE_NUMBERS.get(name, 0))
+        title = _STAGES[self._stage] + (f" ({name})" if self._stage == 0 else "")
+        message = f"stage {self._stage + 1} of {len(_STAGES)}, {title}"
+        return Progress(progress.stage, self._stage, len(_STAGES), message, self._objective)

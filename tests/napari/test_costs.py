@@ -1,0 +1,88 @@
+"""Time and memory of runs, estimated before them, and the stages of a fit while it runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from napari_shadowinv import InversionOptions, fit
+from napari_shadowinv._napari.costs import FitProgress, fit_cost, inversion_cost
+from napari_shadowinv._system.progress import Progress
+from napari_shadowinv.options import FitChoices, FitOptions
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.shot import shots_of
+
+
+def test_the_bar_never_goes_back_and_names_the_stages() -> None:
+    truth = gaussian_blob((48, 48), 15.0, 8.0).displacement
+    progress = FitProgress()
+    reports: list[Progress] = []
+    fit(
+        shots_of(
+            [synthetic_image(truth), synthetic_image(0.6 * truth)], strength=[1, 0.6], noise=0.02
+        ),
+        options=FitOptions(samples=2),
+        on_progress=lambda report: reports.append(progress.update(report)),
+    )
+    reports = [report for report in reports if report.stage != "compile"]
+    shares = [report.step / report.total for report in reports if report.total]
+    assert len(shares) == len(reports)
+    assert shares == sorted(shares)
+    stages = dict.fromkeys(report.message.partition(" (")[0] for report in reports)
+    assert list(stages) == [
+        "stage 1 of 3, starts",
+        "stage 2 of 3, smoothness",
+        "stage 3 of 3, full size and error bars",
+    ]
+    assert "starts (transport)" in reports[0].message
+    assert not any("nan" in report.text for report in reports)
+
+
+def test_other_progress_is_passed_on() -> None:
+    progress = FitProgress()
+    compiling = Progress("compile", 1, None, "once")
+    assert progress.update(compiling) is compiling
+    assert progress.history == []
+
+
+def test_samples_beside_the_fit_do_not_change_the_objective_shown() -> None:
+    progress = FitProgress()
+    steps = [("smoothness", 20.0), ("samples", 20.0), ("full size", 81.0), ("samples", 20.0)]
+    shown = [progress.update(Progress("fit", 1, None, *step)).objective for step in steps]
+    assert shown == [20, 20, 81, 81]
+    assert progress.history == steps
+
+
+def test_a_forecast_grows_with_what_is_asked_for() -> None:
+    def seconds(side: int, count: int, **choices: Any) -> float:
+        return fit_cost((side, side), count, FitChoices(**choices)).seconds
+
+    assert 1.2 < seconds(200, 2) < 3
+    assert 0.4 < seconds(64, 2) < 1.2
+    assert seconds(400, 2) > 3 * seconds(200, 2)
+    assert seconds(200, 4) > 1.5 * seconds(200, 2)
+    assert seconds(200, 2, fields=("B", "E")) > 1.3 * seconds(200, 2)
+    assert seconds(200, 2, beam="unknown") > 1.2 * seconds(200, 2)
+    assert seconds(200, 2, options=FitOptions(samples=0)) < seconds(200, 2)
+
+
+def test_the_next_forecast_follows_the_last_fit() -> None:
+    shape, choices = (1000, 1000), FitChoices(fields=("B", "E"))
+    text = fit_cost(shape, 3, choices).text
+    assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 80 s, up to 5 min")
+    assert "about 4 min, based on the last fit" in fit_cost(shape, 3, choices, 3.0).text
+    single = fit_cost((200, 200), 1, FitChoices(beam="unknown"))
+    assert single.text.startswith("one image of 200 × 200 px, unknown beam: about ")
+
+
+def test_cost_of_a_large_image_is_shown_and_that_of_a_small_one_not() -> None:
+    few = InversionOptions(n_sites=10_000)
+    assert inversion_cost((500, 500), few).text == ""
+    four = inversion_cost((2000, 2000), few)
+    # Measured: 16 s of processor time, which two cores share.
+    assert 16 / 2 < four.seconds < 16
+    assert four.text == "4 Mpx with 10,000 sites: about 10 s and up to 1.3 GB."
+    assert "about 40 s" in inversion_cost((2000, 2000), few, pace=3).text
+    huge = inversion_cost((100_000, 100_000), few)
+    assert huge.exceeds_memory
+    assert "GB: crop or bin the image" in huge.text
