@@ -23,11 +23,10 @@ from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import shot_layer
-from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, save_as
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
-from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of, shown_plane
+from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of
 from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors, push_button
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel, validate
@@ -37,8 +36,6 @@ from napari_shadowinv.facts import Level, percent
 from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.options import Instrument, InversionOptions
 from napari_shadowinv.physics.beam import (
-    displacement_from_potential,
-    number_in_unit,
     numbers_in_unit,
 )
 from napari_shadowinv.physics.field_grid import FieldGrid
@@ -69,7 +66,7 @@ _NOTHING = ""  # of the quantities
 _SHAPE = 200, 200
 _SIZE = " x ".join(map(str, _SHAPE))
 _PLOT_HEIGHT_PX = 260
-_FIELDS = ("field", "field y", "field x")
+_FIELDS = ("field", "field y", "field x", "potential")  # roles
 
 
 class _File(CheckedModel):
@@ -95,86 +92,19 @@ class GridFile(GridView, _File):
 
 @dataclass(frozen=True, eq=False)
 class InputField:
-    """A potential or displacement of a layer."""
+    """The field of a result."""
 
-    values: ArrayLike  # (H, W), or (2, H, W) in px
-    to_px2: float = 1.0  # conversion factor of the potential to px²
-    setup: Setup | None = None  # of its measurement, if the layer has it
-    text: str = ""  # the interpretation, in a sentence
+    displacement: FloatArray  # (2, H, W), px
+    setup: Setup | None = None
     title: str = ""
-
-    def displacement(self) -> FloatArray:
-        """Return the displacement in px."""
-        values: Any = self.values
-        if np.ndim(values) == 3:
-            return np.asarray(values, dtype=np.float64)
-        return displacement_from_potential(self.to_px2 * plane_of(values, "the potential"))
 
 
 SimulatedObject = PhantomRecipe | GridFile | InputField
 
 
 def is_field(layer: Any) -> bool:
-    """Whether a layer is labelled as a potential, or as the field of one result."""
-    if about.role_of(layer) == "potential":
-        return True
-    return about.role_of(layer) in _FIELDS and about.result_of(layer) is not None
-
-
-def may_be_field(layer: Any) -> bool:
-    """Whether a layer is a field, or an image without a label."""
-    is_unlabelled = about.may_be_shot(layer) and about.result_of(layer) is None
-    return is_field(layer) or (is_unlabelled and not getattr(layer, "rgb", False))
-
-
-def input_field(layer: Any | None, point: Any, setup: Any) -> InputField:
-    """Return the field of a layer, or of its shot in view.
-
-    `setup` converts a potential in m whose layer has no setup.
-    """
-    if layer is None:
-        raise InputError(
-            "there is no potential or result to start from: invert a shot (Plugins → Shadowinv → "
-            "Invert), open a .shadowinv file or an image of a potential in px² (File → Open), "
-            "or select a simulated object"
-        )
-    result, title = about.result_of(layer), name_of_result(layer)
-    is_masked = about.role_of(layer) == "potential" and bool(np.isnan(layer.data).any())
-    if result is not None and (about.role_of(layer) in _FIELDS or is_masked):
-        displacement = np.asarray(about.displacement_of(layer))
-        return InputField(
-            displacement, 1.0, result.setup, "The displacement of this result.", title
-        )
-    potential = shown_plane(layer, point) if layer.ndim == 3 else image_of(layer, "potential")
-    unit, layer_setup = about.unit_of(layer), about.setup_of(layer)
-    if about.role_of(layer) != "potential":
-        _refuse_counts(potential, layer.name)
-        text = (
-            "This image is not labelled as a potential. Its values are treated as a potential in "
-            "px² of the object plane."
-        )
-        return InputField(potential, 1.0, layer_setup, text, title)
-    if unit in ("", "px²"):
-        return InputField(potential, 1.0, layer_setup, "A potential in px².", title)
-    field_setup = layer_setup or setup
-    if field_setup is None:
-        raise InputError(
-            f"'{layer.name}' is in {unit}: select the setup of its experiment, which is needed "
-            "to convert it to pixels"
-        )
-    to_px2 = float(field_setup.normalized_potential(number_in_unit(f"1 {unit}", "m")))
-    return InputField(potential, to_px2, field_setup, f"A potential in {unit}.", title)
-
-
-def _refuse_counts(potential: ArrayLike, name: str) -> None:
-    """Refuse whole numbers from zero on, which a detector counts and no potential has."""
-    values = np.asarray(potential)
-    if values.any() and values.min() >= 0 and np.array_equal(values, np.round(values)):
-        raise InputError(
-            f"'{name}' has whole numbers from {values.min():g} to {values.max():g}, as a detector "
-            "counts, expected a potential in px²: invert the image first (Plugins → Shadowinv → "
-            "Invert), or choose a layer of a result"
-        )
+    """Whether a layer shows the field or the potential of one result."""
+    return about.role_of(layer) in _FIELDS and about.displacement_of(layer) is not None
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +183,7 @@ class ForwardJob(Job):
 
     def _transfer(self, field: InputField) -> tuple[FloatArray, list[str]]:
         """Return the displacement in the chosen setup, and the assumption behind it."""
-        displacement, setup = field.displacement(), self.setup
+        displacement, setup = field.displacement, self.setup
         if field.setup is None or setup is None or field.setup == setup:
             return displacement, []
         deflector = self.deflector or default_deflector(field.setup, setup)
@@ -295,7 +225,7 @@ class PlanJob(Job):
             setup, name = next(iter(self.setups), None), self.object.file.name
             return object_of_field(self.object.field(), setup, title=name)
         field = self.object
-        return object_of_displacement(field.displacement(), field.setup, title=field.title)
+        return object_of_displacement(field.displacement, field.setup, title=field.title)
 
     def layers(self, content: ExperimentPlan | ExperimentSweep) -> LayerData:
         """Describe the image of the first draw."""
@@ -327,21 +257,14 @@ class Simulate(panels.ToolPanel):
         self._on_change()
 
     def _build_object(self) -> None:
-        self.potential = LayerPicker(
-            self.viewer,
-            "<qt>The field or potential of a result, or a potential in px² from a file; for a "
-            "stack, the shot in view.</qt>",
-            suits=may_be_field,
-        )
-        self.interpretation = forms.WrappingLabel()
-        layer = QWidget()
-        column(layer, forms.labelled("Layer", self.potential), self.interpretation)
+        tip = "<qt>The field or the potential of a result, from a run or a .shadowinv file.</qt>"
+        self.field = LayerPicker(self.viewer, tip, suits=is_field)
         self.object = forms.ModelPicker(
             "Object",
             {
                 **forms.kinds_of(PHANTOMS),
                 _GRID: ("a 3-D field from a file", GridFile),
-                _LAYER: ("a result or potential", layer),
+                _LAYER: ("a result", forms.labelled("Layer", self.field)),
             },
             "Object that deflects the beam.",
         )
@@ -388,7 +311,7 @@ class Simulate(panels.ToolPanel):
 
     def _connect(self) -> None:
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
-        self.potential.picked.connect(self._follow_layer)
+        self.field.picked.connect(self._follow_layer)
         parts = (self.object, self.task, self.setup, self.instrument, self.options, self.quantity)
         for part in parts:
             part.changed.connect(self._on_change)
@@ -397,16 +320,15 @@ class Simulate(panels.ToolPanel):
 
     @notify_errors
     def start_from(self, layer: Any) -> None:
-        """Select a field or potential, whose image is to be predicted."""
-        if layer is None or not any(layer is offered for offered in self.potential.offered):
+        """Select the field of a result, whose image is to be predicted."""
+        if layer is None or not any(layer is offered for offered in self.field.offered):
             name = "no layer" if layer is None else f"layer '{layer.name}'"
             raise InputError(
-                f"{name} is selected: select the field or the potential of a result, or an image "
-                "of a potential"
+                f"{name} is selected: select the field or the potential of a result of one shot"
             )
         self.task.set_kind(_IMAGE)
         self.object.set_kind(_LAYER)
-        self.potential.layer = layer
+        self.field.layer = layer
 
     def parts(self) -> dict[str, Any]:
         return {
@@ -430,7 +352,7 @@ class Simulate(panels.ToolPanel):
 
     def request(self) -> ForwardJob | PlanJob:
         setup = self.setup.setup()
-        target = self._object(setup)
+        target = self._object()
         size = self.side.text().strip()
         shape = shape_of_text(size, "the size") if size else None
         if self.task.kind == _IMAGE:
@@ -452,12 +374,20 @@ class Simulate(panels.ToolPanel):
             values=tuple(values),
         )
 
-    def _object(self, setup: Setup | None) -> SimulatedObject:
+    def _object(self) -> SimulatedObject:
         """Return the phantom, the file or the layer's field, or raise an `InputError`."""
-        if self.object.kind == _LAYER:
-            return input_field(self.potential.layer, self.viewer.dims.point, setup)
-        chosen: Any = self.object.model()
-        return chosen
+        if self.object.kind != _LAYER:
+            chosen: Any = self.object.model()
+            return chosen
+        layer: Any = self.field.layer
+        result = None if layer is None else about.result_of(layer)
+        if result is None:
+            raise InputError(
+                "there is no result to start from: invert a shot (Plugins → Shadowinv → Invert), "
+                "open a .shadowinv file (File → Open), or select a simulated object"
+            )
+        displacement = np.asarray(about.displacement_of(layer), dtype=np.float64)
+        return InputField(displacement, result.setup, name_of_result(layer))
 
     def _image_job(
         self, target: SimulatedObject, setup: Setup | None, shape: tuple[int, int]
@@ -466,7 +396,7 @@ class Simulate(panels.ToolPanel):
         source = None if beam is None else image_of(beam)
         layer: Any = None
         if isinstance(target, InputField):
-            layer, setup = self.potential.layer, setup or target.setup
+            layer, setup = self.field.layer, setup or target.setup
             shape = layer.data.shape[-2:]
             source = None if source is None else source_on(beam, source, layer)
         elif source is not None:
@@ -518,12 +448,6 @@ class Simulate(panels.ToolPanel):
 
     def _on_object(self) -> None:
         """Select the setup that the object requires, keeping its entries."""
-        layer = self.potential.layer
-        if self.object.kind == _LAYER and self._ready and (layer is None or not is_field(layer)):
-            # Layers labelled as a field are preferred to unlabelled images.
-            fields = list(filter(is_field, self.viewer.layers))
-            if fields:
-                self.potential.layer = fields[-1]
         self._follow_layer()
         phantom = PHANTOMS.get(self.object.kind)
         probe = "" if phantom is None else phantom.probe
@@ -535,7 +459,7 @@ class Simulate(panels.ToolPanel):
     def _follow_layer(self) -> None:
         """Show the setup of a layer's result, or the user's setup for an object."""
         is_layer = self.object.kind == _LAYER
-        self.setup.follow(self.potential.layer if is_layer else None, store=False)
+        self.setup.follow(self.field.layer if is_layer else None, store=False)
         if self._ready:
             self._on_change()
 
@@ -546,20 +470,7 @@ class Simulate(panels.ToolPanel):
         self._deflector_row.setVisible(kind == _LAYER)
         has_size = is_plan and kind not in PHANTOMS
         self.side.setPlaceholderText("that of the field" if has_size else _SIZE)
-        if kind == _LAYER:
-            self._show_interpretation()
         self.keep()
-
-    def _show_interpretation(self) -> None:
-        layer = self.potential.layer
-        try:
-            field = input_field(layer, self.viewer.dims.point, self.setup.setup())
-        except InputError as error:
-            # Nothing to choose from yet is no mistake.
-            style = "" if layer is None else forms.PROBLEM_STYLE
-            self.interpretation.show_text(error_text(error), style)
-            return
-        self.interpretation.show_text(field.text, "" if is_field(layer) else forms.PROBLEM_STYLE)
 
 
 def _values_of(key: str) -> tuple[str, type[CheckedModel]]:

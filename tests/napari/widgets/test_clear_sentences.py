@@ -12,7 +12,6 @@ from napari.components import ViewerModel
 
 from helpers.reports import texts_of
 from napari_shadowinv._napari.form import StepsSection
-from napari_shadowinv._napari.simulate import input_field
 from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.errors import InputError
@@ -60,16 +59,6 @@ def test_steps_of_an_earlier_image_are_announced(qtbot: Any) -> None:
     assert steps._earlier.text() == ""
     steps.restore([])
     assert steps._earlier.text() == ""
-
-
-@pytest.mark.parametrize("dtype", [np.uint16, np.float64])
-def test_raw_counts_are_no_potential(viewer: ViewerModel, dtype: type) -> None:
-    counts = np.random.default_rng(2).poisson(300, (40, 50)).astype(dtype)
-    layer = viewer.add_image(counts, name="shot")
-    with pytest.raises(InputError, match="as a detector counts"):
-        input_field(layer, viewer.dims.point, None)
-    layer.data = counts / 7
-    assert "px²" in input_field(layer, viewer.dims.point, None).text
 
 
 def estimated(tool: Any, method: str, qtbot: Any) -> str:

@@ -85,11 +85,11 @@ def test_an_image_is_predicted_from_the_selected_potential(
     choose("predict_image")
     forward = docked(window, Simulate)
     assert forward.object.kind == "layer"
-    assert forward.potential.layer is potential
+    assert forward.field.layer is potential
     window.layers.selection.active = arrows
     choose("predict_image")
     assert "is selected: select the field or the potential of a result" in messages[-1]
-    assert forward.potential.layer is potential
+    assert forward.field.layer is potential
 
 
 def test_a_folder_is_chosen_and_watched(

@@ -14,19 +14,17 @@ from helpers.forms import enter
 from helpers.jobs import run_job
 from helpers.reports import texts_of
 from napari_shadowinv import InputError, Instrument, ProtonSetup
-from napari_shadowinv._napari.layer_metadata import metadata_for, role_of, source_of, unit_of
+from napari_shadowinv._napari.layer_metadata import role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.simulate import ForwardJob, GridFile, InputField, Simulate
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read_field_grid
-from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantom_models import BlobRecipe
 from napari_shadowinv.physics.phantoms import (
     coaxial_line,
     four_toroids,
-    gaussian_blob,
     paper_setup,
     wakefield,
     wakefield_setup,
@@ -78,7 +76,7 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     )
     assert unit_of(potential) != "px²"
     tool.object.set_kind("layer")
-    tool.potential.layer = potential
+    tool.field.layer = potential
     tool.setup.show_setup(proton_setup.model_dump())
     again = made().data
     inner = (slice(3, -3), slice(3, -3))
@@ -89,41 +87,22 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     tool.setup.picker.set_kind("none")
     np.testing.assert_allclose(made().data, again)
     assert messages == []
-    lost = viewer.add_image(potential.data, name="lost", metadata=metadata_for("potential", "µm"))
-    tool.potential.layer = lost
-    messages.clear()  # napari's own word on the units
-    tool.panel.button.click()
-    assert len(messages) == 1
-    assert "select the setup" in messages[0]
-    assert "select the setup" in tool.panel.status.text()
 
 
-def test_only_what_may_be_a_field_is_offered_and_it_says_what_it_is_taken_for(
-    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str], solved: Inversion,
+def test_only_fields_of_results_are_offered(
+    viewer: ViewerModel, opened: Any, messages: list[str], solved: Inversion,
     proton_setup: ProtonSetup, shot: Array,
 ) -> None:  # fmt: skip
     tool = opened(Simulate)
     tool.object.set_kind("layer")
-    assert "open a .shadowinv file" in tool.interpretation.text()
     tool.panel.button.click()
     assert len(messages) == 1
-    assert "there is no potential or result" in messages[0].lower()
+    assert "there is no result to start from" in messages[0].lower()
     assert tool.panel.status.text() == messages[0]
-    messages.clear()
-
     viewer.add_image(shot, name="counts")
-    viewer.add_image(shot, name="beam", metadata=metadata_for("source", "intensity"))
     add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True)
-    offered = [tool.potential.itemText(n) for n in range(tool.potential.count())]
-    assert len(offered) == 5  # potential, three of the field, and the image of unknown origin
-    assert "counts" in offered
-    assert "beam" not in offered
-    tool.potential.layer = viewer.layers["counts"]
-    assert "treated as a potential in px²" in tool.interpretation.text()
-    tool.object.set_kind("toroid")
-    tool.object.set_kind("layer")
-    assert role_of(tool.potential.layer) == "field"
-    assert tool.interpretation.text() == "The displacement of this result."
+    roles = [role_of(layer) for layer in tool.field.offered]
+    assert roles == ["potential", "field y", "field x", "field"]
     assert tool.setup.setup() == proton_setup
 
 
@@ -156,34 +135,11 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     np.testing.assert_allclose(image(), expected)
     tool.setup.show_setup(proton_setup.model_dump())
     np.testing.assert_allclose(image(), synthetic_image(solved.displacement))
-    # A potential in µm goes the same way.
-    potential = next(layer for layer in viewer.layers if role_of(layer) == "potential")
-    tool.potential.layer = potential
+    # Its potential stands for the same field.
+    tool.field.layer = next(layer for layer in viewer.layers if role_of(layer) == "potential")
     tool.deflector.setCurrentIndex(0)
     tool.setup.show_setup(slow.model_dump())
-    expected = predict_image(displacement_from_potential(solved.potential), proton_setup, slow)
-    np.testing.assert_allclose(image(), expected, atol=1e-9)
-    assert messages == []
-
-
-def test_a_potential_from_a_file_and_the_shot_in_view_of_a_stack_make_their_images(
-    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str]
-) -> None:
-    potentials = [gaussian_blob((40, 50), size, 6.0).potential for size in (10.0, 20.0)]
-    viewer.add_image(potentials[0], name="phi")
-    viewer.add_image(np.stack(potentials), name="run", metadata=metadata_for("potential", "px²"))
-    tool = opened(Simulate)
-    tool.setup.picker.set_kind("none")
-    tool.object.set_kind("layer")
-    for name, expected in (("phi", potentials[0]), ("run", potentials[1])):
-        viewer.dims.set_current_step(0, 1)
-        tool.potential.layer = viewer.layers[name]
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda name=name: f"{name} image" in viewer.layers, timeout=PATIENCE)
-        np.testing.assert_allclose(
-            viewer.layers[f"{name} image"].data,
-            synthetic_image(displacement_from_potential(expected)),
-        )
+    np.testing.assert_allclose(image(), predict_image(solved.displacement, proton_setup, slow))
     assert messages == []
 
 
@@ -231,12 +187,11 @@ def test_an_object_brings_the_beam_that_it_needs(
     assert "select the setup 'light'" in messages[0]
 
 
-def test_a_potential_and_its_object_make_the_same_image() -> None:
+def test_a_displacement_and_its_object_make_the_same_image() -> None:
     blob = BlobRecipe(amplitude=20, sigma=8)
-    phantom = blob.phantom((40, 50), None)
     by_object = run_job(ForwardJob(blob, shape=(40, 50)))
-    by_potential = run_job(ForwardJob(InputField(1e9 * phantom.potential, to_px2=1e-9)))
-    assert abs(by_object.image - by_potential.image).max() < 0.02
+    by_field = run_job(ForwardJob(InputField(blob.phantom((40, 50), None).displacement)))
+    np.testing.assert_array_equal(by_object.image, by_field.image)
 
 
 def test_a_3d_field_of_a_file_is_traced(tmp_path: Path) -> None:
@@ -364,7 +319,7 @@ def test_file_and_view_are_remembered(traced: Any, cube: Path) -> None:
     traced.object.form.restore({})
     traced.object.set_kind("toroid")
     traced.restore(state)
-    assert traced._object(None) == GridFile(file=cube, beam="x", right="y", centre=True)
+    assert traced._object() == GridFile(file=cube, beam="x", right="y", centre=True)
 
 
 def test_wrong_file_is_a_sentence(
