@@ -263,30 +263,28 @@ class FilmPack(panels.ToolPanel):
         Another file than the result's has none of them.
         """
         file = str(Path(self.path.path).expanduser().absolute()) if self.path.path else ""
-        layer, folder = self.packs.layer, Path(mkdtemp(dir=self._scratch))
+        layer = self.packs.layer
+        corrections: tuple[Any, ...] = ()
         metadata = {} if layer is None else about.metadata_of(layer)
         if layer is None or file not in ("", metadata.get("path")):
             if not file:
                 raise InputError("no pack is selected: choose a pack file, such as pack.toml")
             path = Path(file)
-            name = path.stem if path.stem != "pack" else path.parent.name
-            return PackJob(read_pack(path), file, name, folder)
-        doses = self._selected()[1]
+            pack, name = read_pack(path), path.stem if path.stem != "pack" else path.parent.name
+        else:
+            doses, name = self._selected()[1], name_of_result(layer)
+            pack = read_pack(Path(file)) if file else metadata.get("pack") or doses.pack
+            if len(pack.layers) == len(doses.usable):
+                corrections = self._corrections(layer, doses)
+        folder = Path(mkdtemp(dir=self._scratch))
+        return PackJob(pack, file or metadata.get("path", ""), name, folder, *corrections)
+
+    def _corrections(self, layer: Any, doses: FilmDoses) -> tuple[Any, ...]:
+        """Return the last arguments of a job: corners, painted pixels, and the film in view."""
         labels = self._partner(layer, packs.UNUSABLE)
         by_hand = None if labels is None else packs.painted_by_hand(labels.data, doses)
-        pack = read_pack(Path(file)) if file else metadata.get("pack") or doses.pack
-        if len(pack.layers) != len(doses.usable):
-            return PackJob(pack, file, name_of_result(layer), folder)
-        return PackJob(
-            pack,
-            metadata.get("path", ""),
-            name_of_result(layer),
-            folder,
-            self.corners.corners(doses) or metadata.get("corners"),
-            by_hand,
-            doses.scales,
-            plane_in_view(self.viewer, layer),
-        )
+        corners = self.corners.corners(doses) or about.metadata_of(layer).get("corners")
+        return corners, by_hand, doses.scales, plane_in_view(self.viewer, layer)
 
     def forget(self) -> None:
         self.panel.say("")
