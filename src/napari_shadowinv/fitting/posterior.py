@@ -19,7 +19,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import add
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.fft import dctn, idctn
@@ -37,6 +37,8 @@ from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.inversion.samples import Pairs, stratified_numbers
 from napari_shadowinv.physics.poisson import border_mean
+
+_T = TypeVar("_T")
 
 _BEAM_SEED = 1
 
@@ -177,18 +179,24 @@ class Posterior:
         return Sample(numbers, noise, force), self._linear.pull(residuals).plus(force)
 
     def _changes(self, slopes: Sequence[Unknowns], tolerance: float) -> list[Unknowns]:
-        """Solve for the change that undoes each slope, in threads.
+        """Solve for the change that undoes each slope, in threads."""
+        return self._of_each(lambda posterior, slope: posterior._change(slope, tolerance), slopes)
+
+    def _of_each(
+        self, function: Callable[[Posterior, _T], Unknowns], values: Sequence[_T]
+    ) -> list[Unknowns]:
+        """Call a function for each value, in threads.
 
         The first comes before all others, which know the modes that it has found.
         """
 
-        def change_alone(slope: Unknowns, after_step: Callable[[], None]) -> Unknowns:
+        def alone(value: _T, after_step: Callable[[], None]) -> Unknowns:
             posterior = self.reporting(after_step)
             posterior._modes = copy(self._modes)
-            return posterior._change(slope, tolerance)
+            return function(posterior, value)
 
-        first = [self._change(slope, tolerance) for slope in slopes[:1]]
-        works = [partial(change_alone, slope) for slope in slopes[1:]]
+        first = [function(self, value) for value in values[:1]]
+        works = [partial(alone, value) for value in values[1:]]
         threads = available_threads(self.scene.threads)
         return first + run_in_parallel(works, threads, self._after_step)
 
@@ -202,27 +210,33 @@ class Posterior:
         steps end at the least gain of the objective: directions that the data barely determine gain
         ½ by one standard deviation.
         """
+        if not samples:
+            return []
         scene = self.scene
 
-        def settled(scene: Scene, start: Unknowns) -> Unknowns:
+        def settled(posterior: Posterior, scene: Scene, start: Unknowns) -> Unknowns:
             end, *_ = settle(
                 scene,
                 start,
                 steps=steps,
                 least_gain=least_gain,
-                after_step=lambda _: self._after_step(),
-                modes=self._modes,
+                after_step=lambda _: posterior._after_step(),
+                modes=posterior._modes,
                 linear=replace(self._linear, scene=scene),
             )
             return end
 
-        base, solved = settled(scene, self._unknowns) if samples else self._unknowns, []
-        for sample in samples:
+        base = settled(self, scene, self._unknowns)
+
+        def change_of(posterior: Posterior, sample: Sample) -> Unknowns:
             images = scene.images + self._deviations * sample.noise
             noisy = replace(scene, images=images, force=sample.force)
-            end = settled(noisy, base.plus(sample.change))
-            solved.append(replace(sample, change=end.plus(base, -1)))
-        return solved
+            return settled(posterior, noisy, base.plus(sample.change)).plus(base, -1)
+
+        changes = self._of_each(change_of, samples)
+        return [
+            replace(sample, change=change) for sample, change in zip(samples, changes, strict=True)
+        ]
 
     def _draw_held(self, normal: FloatArray) -> Unknowns:
         scene, numbers = self.scene, self._unknowns.zeros()

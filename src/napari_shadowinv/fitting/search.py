@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import NamedTuple
@@ -408,7 +409,7 @@ def refine_minimum(
     `explained`.
     """
     minimum, steps = in_recorded_pixels(scene, minimum), 0
-    unknowns, modes = minimum.unknowns, minimum.modes
+    unknowns, modes = minimum.unknowns, copy(minimum.modes)  # others use them at the same time
     has_dense_rays = scene.imperfect.resembles_fields and not is_near
     usual = [SPACING_WITH_NUMBERS] if has_dense_rays else list(spacings)
     denser = usual if options.spacing is None else [options.spacing]
