@@ -11,7 +11,7 @@ each process so far.
 
 Images are those of the reference toroid, and of the burner's frames where they are present. Those
 of fits are rays counted as in fit.py, for minutes; `--only "fit, three"` counts those of one fit,
-`--only layers` those of which each is left out, too. `--only 4096` enlarges a burner's frame.
+`--only 4096` enlarges a burner's frame.
 """
 
 from __future__ import annotations
@@ -64,8 +64,6 @@ def works(folder: Path, only: str) -> dict[str, Work]:
         places = np.indices(size, dtype=np.float64)
         np.save(folder / f"{name} truth.npy", [field(*places) for field in case.fields])
         found[name] = {"fit": name, "noise": noise, "keywords": case.keywords}
-        if "layers" in title:
-            found[f"{name}, each left out"] = {**found[name], "leave_one_out": True}
     files = sorted((DATA / "burner").rglob("*.bmp"))
     if not files:
         return found
@@ -114,7 +112,6 @@ def fits() -> Iterator[tuple[str, Case, float, tuple[int, int]]]:
 def worker() -> None:
     """Do what is asked for line by line, and tell the seconds, and the error where there is one."""
     from napari_shadowinv import FitOptions, InversionOptions, fit, invert
-    from napari_shadowinv.fitting import leave_one_out
     from napari_shadowinv.inversion import plan_sites
     from napari_shadowinv.shot import shots_of
 
@@ -152,9 +149,6 @@ def worker() -> None:
         images = shots_of(shots["images"], strength=list(shots["strengths"]), **known)
         options = FitOptions(threads=work.get("threads"))
         begun = time.perf_counter()
-        if work.get("leave_one_out"):
-            leave_one_out(images, options=options)
-            return time.perf_counter() - begun, float("nan")
         result = fit(images, options=options)
         seconds = time.perf_counter() - begun
         pairs = zip(result.fields, truth, strict=True)

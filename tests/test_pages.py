@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import re
 import tomllib
 from pathlib import Path
@@ -121,3 +122,21 @@ def test_the_totals_of_the_tables_of_limits_are_those_of_inversions(limits: Any)
         errors = invert(shot, source=source, instrument=instrument).errors
         share = 100 * errors.total.rms / errors.rms
         assert share == pytest.approx(float(total), rel=0.06), instrument
+
+
+def test_the_loop_of_the_page_on_fits_names_the_film_that_changed() -> None:
+    """The page leaves out each film in turn; with a stronger object in one, its χ² is largest."""
+    first, *_, loop = (
+        block
+        for block in blocks(text_of("docs/fit.md"), "python")
+        if "ProtonSetup(" in block or "enumerate(films)" in block
+    )
+    names: dict[str, Any] = {"__name__": "page"}
+    chi2 = {}
+    for strength in ("", "1.1 * "):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(first + loop.replace("synthetic_image(", f"synthetic_image({strength}", 1), names)
+        chi2[strength] = [float(line.split()[-1]) for line in printed.getvalue().splitlines()[-3:]]
+    np.testing.assert_allclose(chi2[""], [1.04, 1.02, 1.03], atol=0.01)
+    np.testing.assert_allclose(chi2["1.1 * "], [1.8, 1.1, 2.3], atol=0.05)

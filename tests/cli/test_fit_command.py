@@ -18,7 +18,7 @@ from helpers.command_line import content, flat, interrupted, shadowinv
 from helpers.fit_images import of_each
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Assessment, Verdict
-from napari_shadowinv.fitting import Fit, LeaveOneOut, point_spread
+from napari_shadowinv.fitting import Fit, point_spread
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read, write
 from napari_shadowinv.io.files import sha256
@@ -302,10 +302,6 @@ MISTAKES = {
     "fit a.tif --set options.samples=2": ("options.samples: did you mean fit.options.samples?",),
     "fit shots.csv --energies 3": ("column 'energy'",),
     "fit dark.csv": ("line 3", "'brightness' is '0'"),
-    "fit two.csv --leave-one-out": ("received 2 images", "needs 3 or more"),
-    "fit a.tif b.tif b.tif --leave-one-out": ("neither strengths nor setups",),
-    "fit three.csv --leave-one-out --out fit.h5": ("fit.h5", "a format without it"),
-    "fit three.csv --leave-one-out --fiducials mesh.csv": ("--fiducials", "first"),
     "fit two.csv --compare": ("needs the setup",),
 }
 
@@ -318,7 +314,6 @@ def test_mistakes_give_one_sentence(
     Path("shots.csv").write_text("file\na.tif\n")
     Path("wrong.csv").write_text("file,strength\na.tif,1\nb.tif,two\n")
     Path("two.csv").write_text("file,strength\na.tif,1\nb.tif,2\n")
-    Path("three.csv").write_text("file,strength\na.tif,1\nb.tif,2\nb.tif,3\n")
     Path("mesh.csv").write_text("x,y,dx,dy,sigma\n20,10,0.5,-0.25,0.1\n")
     Path("small.csv").write_text("file,strength\na.tif,1\nsmall.tif,2\n")
     Path("dark.csv").write_text("file,strength,brightness\na.tif,1,1\nb.tif,2,0\n")
@@ -514,56 +509,6 @@ def test_fields_are_compared_and_the_likeliest_is_written() -> None:
 
 def test_incomparable_fields_are_refused(refused: Callable[..., None]) -> None:
     refused(*PAIR, "--compare", "--set=fit.fields=plasma", names=("plasma", "B; E; B,E"))
-
-
-# Static field
-
-
-def films() -> None:
-    """Write four images, one of them of a stronger object, and a table of their energies."""
-    noise = np.random.default_rng(1)
-    energies = (5.0, 7.0, 14.7, 10.0)
-    for name, energy, factor in zip("abcd", energies, (1, 1, 1.4, 1), strict=True):
-        setup = FIRST.model_copy(update={"energy": energy})
-        strength = factor * SECOND.momentum / setup.momentum
-        image = 1000 * synthetic_image(1.5 * strength * TRUTH) + noise.normal(0, 20, SHAPE)
-        tifffile.imwrite(f"{name}.tif", image.astype(np.float32))
-    rows = [f"{name}.tif,{energy}" for name, energy in zip("abcd", energies, strict=True)]
-    Path("films.csv").write_text("\n".join(["file,energy", *rows]))
-
-
-FILMS = ("fit", "films.csv", "--setup", "setup.toml", "--noise", 20, *set_options(samples=2))
-
-
-def test_left_out_images_are_written(folder: Path) -> None:
-    films()
-    before = set(content(folder))
-    result = shadowinv(*FILMS, *set_options(spacing=0.2), "--leave-one-out")
-    assert result.exit_code == 3, result.output
-    output = flat(result.stdout)
-    for words in ("Left out", "c, 14.7 MeV", "not explained"):
-        assert words in output
-    sentence = "the image at 14.7 MeV is not explained by one static field with the others"
-    assert f"NOT STATIC: a_fit.shadowinv was written, but {sentence}" in flat(result.stderr)
-    written = {f"a_fit{ending}.png" for ending in ("", "_left_out")}
-    assert set(content(folder)) - before == written | {"a_fit.shadowinv"}
-    fit, dataset = fit_in("a_fit.shadowinv")
-    left_out = LeaveOneOut.from_dataset(dataset)
-    np.testing.assert_array_equal(left_out.explained, [True, True, False, True])
-    np.testing.assert_array_equal(left_out.images, fit.images)
-    assert sentence in flat(shadowinv("info", "a_fit.shadowinv").stdout)
-
-
-def test_images_left_out_have_energies_without_a_setup(folder: Path) -> None:
-    films()
-    lines = ["file,energy,strength", "a.tif,5,1", "b.tif,7,0.844", "d.tif,10,0.706"]
-    Path("films.csv").write_text("\n".join(lines))
-    quick = set_options(spacing=0.3, max_iterations=3, samples=0)
-    result = shadowinv("fit", "films.csv", "--noise", 20, *quick, "--leave-one-out")
-    assert result.exit_code in (0, 3), result.output
-    for words in ("a (5 MeV)", "b (7 MeV)", "d (10 MeV)"):
-        assert words in flat(result.stdout)
-    assert fit_in("a_fit.shadowinv")[0].setups == ()
 
 
 def test_field_of_view_of_a_fit_is_in_its_table(

@@ -181,20 +181,6 @@ def test_the_value_alone_is_that_with_the_gradient(scene: Scene) -> None:
     assert scene.value(unknowns, counts) == scene.value_and_gradient(unknowns, counts)[0]
 
 
-def test_one_image_to_first_order_is_that_of_a_scene_of_it(scene: Scene) -> None:
-    scene = replace(scene, psf=[1.5, 0.1])
-    unknowns = some(scene)
-    counts = scene.ray_counts(unknowns)
-    linear = scene.linear(unknowns, counts)
-    first = unknowns.only([0])
-    part, alone = linear.only([0]), scene.only([0]).linear(first, counts[:1])
-    assert part is not None
-    change = random_like(first, 5)
-    np.testing.assert_array_equal(part.push(change), alone.push(change))
-    # The other point spread reaches less far, so an image of it has fewer pixels.
-    assert linear.only([1]) is None
-
-
 def test_the_hessian_is_symmetric_and_positive(scene: Scene) -> None:
     unknowns = some(scene)
     counts = scene.ray_counts(unknowns)

@@ -25,15 +25,3 @@ def test_sums_are_those_of_the_parts() -> None:
     first, second = some(1), some(2)
     np.testing.assert_array_equal(first.plus(second).flat(), first.flat() + second.flat())
     np.testing.assert_array_equal(first.plus(second, -3).flat(), first.flat() - 3 * second.flat())
-
-
-def test_some_images_have_their_rows_of_each_block() -> None:
-    unknowns = some(3)
-    second = unknowns.only([1])
-    for block, chosen in zip(unknowns[2:], second[2:], strict=True):
-        np.testing.assert_array_equal(chosen, block[1:])
-    doubled = second.plus(second)
-    merged = unknowns.with_images([1], doubled)
-    np.testing.assert_array_equal(merged.potentials, doubled.potentials)
-    for block, new in zip(unknowns[2:], merged[2:], strict=True):
-        np.testing.assert_array_equal(new, np.concatenate([block[:1], 2 * block[1:]]))

@@ -28,7 +28,6 @@ from napari_shadowinv.pipeline import (
     run,
     run_film,
     run_fit,
-    run_leave_one_out,
     write_layers,
 )
 from napari_shadowinv.pipeline.fit_run import read_row_images, refinement_choices, run_refinement
@@ -111,14 +110,6 @@ def refinement(folder: Path) -> Example:
     )
 
 
-def leave_one_out(folder: Path) -> Example:
-    paths = record(folder)
-    shots, recipe = fit_shots(paths), FIT.model_copy(update={"fit": FitChoices(options=PLAIN)})
-    result = run_fit(recipe, shots)
-    left_out = run_leave_one_out(recipe, shots)
-    return Example(write(Path("a.shadowinv"), left_out.added_to(result.to_dataset())), paths[2])
-
-
 def film_pack(folder: Path) -> Example:
     truth = simulate(folder, layers=3, shape=(60, 80), seed=2, b_peak=0.2, e_peak=0.0, strata=4)
     doses = run_film(read_pack(truth.pack))
@@ -146,7 +137,7 @@ def shot_of_stack(folder: Path) -> Example:
     return Example(read_stack(Path("a.shadowinv.zarr")).isel(shot=1).load(), paths[1])
 
 
-KINDS = (inversion, fit, refinement, leave_one_out, film_pack, film_layers, shot_of_stack)
+KINDS = (inversion, fit, refinement, film_pack, film_layers, shot_of_stack)
 
 
 @pytest.fixture(scope="module")

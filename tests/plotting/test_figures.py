@@ -15,14 +15,13 @@ from matplotlib.figure import Figure
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import Assessment, Verdict
-from napari_shadowinv.fitting import Fit, LeaveOneOut
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.plotting import (
     comparison_figure,
     fit_figure,
-    left_out_figure,
     report_figure,
     save_figure,
 )
@@ -263,13 +262,11 @@ def test_residuals_are_over_the_noise_of_each_image_or_pixel(make_fit: MakeFit) 
     fit = make_fit()
     pixels = np.linspace(0.01, 0.1, fit.images.size).reshape(fit.images.shape)
     for noise, sigma in ((np.array([0.02, 0.04]), [0.02, 0.04]), (pixels, pixels)):
-        for name, whole in (("fit", fit), ("left out", left_out_of(fit, limit=2.0))):
-            known = dataclasses.replace(whole, noise=noise)
-            figure = fit_figure(known) if name == "fit" else left_out_figure(known)
-            for k, index in enumerate((2, 5)):
-                drawn = np.ma.filled(panels(figure)[index].images[0].get_array(), np.nan)
-                expected = np.where(fit.mask[k], fit.residual[k] / sigma[k], np.nan)
-                np.testing.assert_allclose(drawn, expected)
+        figure = fit_figure(dataclasses.replace(fit, noise=noise))
+        for k, index in enumerate((2, 5)):
+            drawn = np.ma.filled(panels(figure)[index].images[0].get_array(), np.nan)
+            expected = np.where(fit.mask[k], fit.residual[k] / sigma[k], np.nan)
+            np.testing.assert_allclose(drawn, expected)
 
 
 def test_fields_and_error_bars_of_a_fit_are_in_si(
@@ -325,45 +322,6 @@ def test_a_fit_without_error_bars_or_misfit_is_no_error(make_fit: MakeFit) -> No
     figure = fit_figure(still)
     figure.canvas.draw()
     assert titles(figure)[-3:] == ["Deflection potential", "Displacement", "Cuts through the peak"]
-
-
-def left_out_of(fit: Fit, limit: float) -> LeaveOneOut:
-    count = len(fit.images)
-    return LeaveOneOut(
-        images=fit.images,
-        mask=fit.mask,
-        predicted=fit.reprojection,
-        residual=fit.residual,
-        brightness=fit.brightness,
-        chi2=fit.chi2,
-        alone=fit.chi2,
-        limit=np.append(np.full(count - 1, 2.0), limit),
-        rms=fit.chi2,
-        noise=fit.noise,
-        explanation="a sentence",
-        setups=fit.setups,
-    )
-
-
-@pytest.mark.parametrize("count", [3, 7])
-def test_each_image_left_out_has_its_prediction_and_its_residual(
-    make_fit: MakeFit, proton_setup: ProtonSetup, count: int
-) -> None:
-    strengths = tuple(np.linspace(1, 2, count))
-    fit = make_fit(strengths=strengths, setups=setups_of(proton_setup, count))
-    left_out = left_out_of(fit, limit=0.5)
-    figure = left_out_figure(left_out)
-    panel_titles = titles(figure)
-    assert len(panel_titles) == 3 * count
-    assert panel_titles.count("Prediction") == count
-    for k in range(count):
-        place = panel_titles.index(f"Image {k + 1}: {3 + k} MeV proton")
-        assert panel_titles[place + 2].startswith(f"Residual: χ² {fit.chi2[k]:.3g}")
-        residual = np.ma.filled(panels(figure)[place + 2].images[0].get_array(), np.nan)
-        np.testing.assert_allclose(residual, np.where(fit.mask[k], fit.residual[k] / 0.05, np.nan))
-    assert sum(title.endswith("not explained") for title in panel_titles) == 1
-    assert "a sentence" in [text.get_text() for text in figure.texts]
-    assert_nothing_overlaps(figure)
 
 
 def hatched(axes: Any) -> list[Any]:

@@ -14,11 +14,10 @@ from napari_shadowinv.cli._inputs import recipe_from
 from napari_shadowinv.cli._outputs import (
     Outputs,
     check_setup,
-    left_out_path,
     result_and_figure,
 )
 from napari_shadowinv.cli._settings import FILE_KEYS, FIT_SECTIONS, Settings, settings_of
-from napari_shadowinv.cli._summary import fact_rows, result_rows, two_columns
+from napari_shadowinv.cli._summary import result_rows
 from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import ResultKind
@@ -30,9 +29,7 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.pipeline.shot_table import ShotRow
     from napari_shadowinv.preprocessing import Recipe
-    from napari_shadowinv.shot import Shot
 
 EPILOG = """
 shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --set fit.fields=B,E
@@ -62,7 +59,7 @@ def fit(
 
     Rays may cross, images may be blurred, and the beam may be unknown.
     """
-    from napari_shadowinv.pipeline import run_comparison, run_fit, run_leave_one_out, write_recipe
+    from napari_shadowinv.pipeline import run_comparison, run_fit, write_recipe
     from napari_shadowinv.pipeline.fit_run import read_row_images
     from napari_shadowinv.pipeline.shot_table import shot_rows
 
@@ -72,13 +69,9 @@ def fit(
     first, outputs = split_address(rows[0].file)[0], Outputs(overwrite, quiet)
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
     result, figure = result_and_figure(first, target, figure)
-    figures = [figure]
-    if flags.leave_one_out:
-        _check_leave_one_out(len(rows), flags.fiducials, result)
-        figures.append(left_out_path(figure))
     inputs = [*images, flags.fiducials, flags.recipe]
     inputs += [file for row in rows for file in row.files.values()]
-    outputs.check_result(ResultKind.FIT, result, *figures, recipe=save_recipe, inputs=inputs)
+    outputs.check_result(ResultKind.FIT, result, figure, recipe=save_recipe, inputs=inputs)
     stated = settings_of(settings or (), FIT_SECTIONS, flags.by_key, FILE_KEYS[:1])
     recipe = recipe_from(flags, stated)
     outputs.protect_files_of(recipe)
@@ -87,28 +80,22 @@ def fit(
     check_setup(result, shots[0].setup, recipe.fit.fields if recipe.fit else None)
     outputs.warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     fields = _wanted_fields(recipe, stated, shots[0].setup) if flags.compare else set()
-    names, left_out = [str(row.file) for row in rows], None
+    names = [str(row.file) for row in rows]
     with work_callbacks(quiet) as callbacks:
         if flags.compare:
             fits = run_comparison(recipe, shots, **callbacks)
         else:
             fits = (run_fit(recipe, shots, **callbacks),)
         written = next((each for each in fits if _fields_of(each) == fields), fits[0])
-        if flags.leave_one_out:
-            left_out = run_leave_one_out(
-                recipe, _named(shots, rows), [*_fields_of(written)], **callbacks
-            )
-    outputs.write_result(written, names, result, figure, left_out)
+    outputs.write_result(written, names, result, figure)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, recipe.model_copy(update={"setup": common}), overwrite=overwrite)
     if flags.compare and not quiet:
         say(_comparison_table(fits))
-    if left_out is not None and not quiet:
-        say(two_columns("Left out", fact_rows(left_out.facts)))
     outputs.show("Fit", result_rows(written, outputs.printed, names=names))
-    outputs.exit_unless_sound(written, result, left_out)
+    outputs.exit_unless_sound(written, result)
 
 
 def _fields_of(fit: Fit) -> set[str]:
@@ -150,34 +137,3 @@ def _comparison_table(fits: Sequence[Fit]) -> Table:
         )
         table.add_row(names, chi2, evidence, fit.verdict)
     return table
-
-
-def _check_leave_one_out(count: int, fiducials: Path | None, result: Path) -> None:
-    """Refuse, before any work, to leave images out where inputs or outputs do not allow it."""
-    from napari_shadowinv.fitting.left_out import check_count
-
-    check_count(count)
-    if fiducials is not None:
-        raise InputError(
-            "received --leave-one-out and --fiducials, which apply to the first image only: use "
-            "one of them"
-        )
-    if result.suffix.lower() not in RESULT.suffixes:
-        raise InputError(
-            f"received --leave-one-out and {result}, a format without it: write a {RESULT.suffix} "
-            "file"
-        )
-
-
-def _named(shots: Sequence[Shot], rows: Sequence[ShotRow]) -> list[Shot]:
-    """Name shots by their files without folders and endings, unless two of them become equal.
-
-    The energy or wavelength of an image without a setup follows its name.
-    """
-    stems = [row.file.stem for row in rows]
-    names = stems if len({*stems}) == len(stems) else [str(row.file) for row in rows]
-    renamed = []
-    for name, shot, row in zip(names, shots, rows, strict=True):
-        beam = "" if shot.setup else row.beam_text
-        renamed.append(replace(shot, name=f"{name} ({beam})" if beam else name))
-    return renamed

@@ -129,9 +129,6 @@ class FitFlags(ShotFlags):
     compare: Annotated[
         bool, Option("--compare", help="Compare the fits of B, of E and of both.")
     ] = False
-    leave_one_out: Annotated[
-        bool, Option("--leave-one-out", help="Predict each image from the others.")
-    ] = False
 
     @property
     def by_key(self) -> dict[str, tuple[str, Any]]:

@@ -146,7 +146,6 @@ def _array_rows(array: AnyArray, dtype: str = "") -> _summary.Rows:
 def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
     """Describe a result of any kind: its facts, its origin and its options."""
     from napari_shadowinv.analysis import products_in
-    from napari_shadowinv.fitting import LeaveOneOut
 
     content = unpack_result(dataset)
     kind = f"{content.kind.noun} of shadowinv {dataset.attrs.get('package_version')}"
@@ -154,8 +153,6 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
         is_pradformat = dataset.attrs.get("format") == "pradformat"
         kind = "pradformat inversion" if is_pradformat else "field retrieved by another program"
     facts = list(content.facts)
-    if "left_out_chi2" in dataset:
-        facts += LeaveOneOut.from_dataset(dataset).facts
     shape = (dataset.sizes["y"], dataset.sizes["x"])
     has_verdict = content.headline.verdict is not None
     rows: _summary.Rows = [

@@ -32,7 +32,6 @@ from napari_shadowinv.physics.beam import setup_cautions
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from napari_shadowinv.fitting import LeaveOneOut
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.results import AnyResult
@@ -123,23 +122,15 @@ class Outputs:
         names: Sequence[str],
         out: Path,
         figure: Path,
-        left_out: LeaveOneOut | None = None,
     ) -> None:
-        """Write a result, then its figures, whose title is the names of its files."""
+        """Write a result, then its figure, whose title is the names of its files."""
         from napari_shadowinv.io import write
         from napari_shadowinv.io.files import name_of
-        from napari_shadowinv.plotting import left_out_figure, result_figure
+        from napari_shadowinv.plotting import result_figure
 
         title = ", ".join(name_of(name) for name in names)
-        dataset = result.to_dataset()
-        figures: dict[Path, Callable[[], Figure]] = {
-            figure: partial(result_figure, result, title=title)
-        }
-        if left_out is not None:
-            dataset = left_out.added_to(dataset)
-            figures[left_out_path(figure)] = partial(left_out_figure, left_out, title=title)
-        write(out, dataset, overwrite=self.overwrite)
-        self.write_figures(figures)
+        write(out, result, overwrite=self.overwrite)
+        self.write_figures({figure: partial(result_figure, result, title=title)})
 
     def write_figures(self, figures: Mapping[Path, Callable[[], Figure]]) -> None:
         """Draw and write figures; print a caution for each that fails: see `exit_unless_drawn`."""
@@ -168,21 +159,14 @@ class Outputs:
         if self.undrawn:
             raise Exit(EXIT_NO_FIGURE)
 
-    def exit_unless_sound(
-        self, result: Any, out: Path, left_out: LeaveOneOut | None = None
-    ) -> None:
-        """Exit with an error code if a result has a flaw, or a figure could not be written.
-
-        A static field that does not explain an image that was left out is a flaw, too.
-        """
+    def exit_unless_sound(self, result: Any, out: Path) -> None:
+        """Exit with an error code if a result has a flaw, or a figure could not be written."""
         doubts = {each.code: each.text for each in result.cautions}
         if result.kind is ResultKind.INVERSION:
             flaw = flaw_of(result.report.converged, None, doubts)
         else:
             flaw = flaw_of(True, getattr(result, "verdict", None), doubts)
-        if left_out is not None and not left_out.explained.all():
-            flaw, reason = "not static", left_out.explanation
-        elif flaw == _NOT_CONVERGED:
+        if flaw == _NOT_CONVERGED:
             report = result.report
             reason = (
                 f"its flux residual is {to_figures(report.residual)} (tolerance "
@@ -227,11 +211,6 @@ def figure_beside(result: Path) -> Path:
     if not result.name:
         raise InputError(f"{result} is a folder: expected the name of a file; add it to --out")
     return result.with_suffix(PNG.suffix)
-
-
-def left_out_path(figure: Path) -> Path:
-    """Return the file of the figure of images that were left out."""
-    return figure.with_name(f"{figure.stem}_left_out{figure.suffix}")
 
 
 def check_setup(result: Path, setup: Setup | None, fields: Sequence[str] | None = None) -> None:

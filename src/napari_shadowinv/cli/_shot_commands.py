@@ -13,7 +13,6 @@ from napari_shadowinv.cli._inputs import recipe_from, setup_for
 from napari_shadowinv.cli._outputs import (
     Outputs,
     check_setup,
-    left_out_path,
     result_and_figure,
 )
 from napari_shadowinv.cli._settings import FILE_KEYS, INVERSION_SECTIONS, settings_of
@@ -120,15 +119,14 @@ def rerun(
     target = out or Path(f"{result.stem}_again{RESULT.suffix}")
     again_out, figure = result_and_figure(result, target, figure)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
-    figures = [figure, *([left_out_path(figure)] if inputs.leaves_out else [])]
-    outputs.check_result(inputs.kind, again_out, *figures, inputs=[result, *inputs.files])
+    outputs.check_result(inputs.kind, again_out, figure, inputs=[result, *inputs.files])
     outputs.warn_of_setups(
         (shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots
     )
     with work_callbacks(quiet) as callbacks:
         again = inputs.run(**callbacks)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
-    outputs.write_result(again.content, names, again_out, figure, again.left_out)
+    outputs.write_result(again.content, names, again_out, figure)
     rows = [
         *[("file", name) for name in names],
         *[("changed", text) for text in again.changes or ("nothing",)],
@@ -137,7 +135,7 @@ def rerun(
         *fact_rows(again.content.facts, outputs.printed),
     ]
     outputs.show("Rerun", rows)
-    outputs.exit_unless_sound(again.content, again_out, again.left_out)
+    outputs.exit_unless_sound(again.content, again_out)
 
 
 @notify_errors

@@ -1,6 +1,4 @@
 from ._fit import compare, fit
-from ._leave_one_out import leave_one_out
-from .left_out import LeaveOneOut
 from .result import Basin, Fit, FitReport, FittedField
 from .shots import point_spread
 
@@ -9,9 +7,7 @@ __all__ = [
     "Fit",
     "FitReport",
     "FittedField",
-    "LeaveOneOut",
     "compare",
     "fit",
-    "leave_one_out",
     "point_spread",
 ]

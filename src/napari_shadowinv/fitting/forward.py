@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
@@ -77,19 +77,6 @@ class Scene(PriorTerms):
     held: frozenset[str] = frozenset()
     spread: FloatArray | None = None
     force: Unknowns | None = None
-
-    def only(self, numbers: Sequence[int]) -> Scene:
-        """Return some of the images, in this order; fields stay in the same unit."""
-        chosen = list(numbers)
-        return replace(
-            self,
-            images=self.images[chosen],
-            weights=self.weights[chosen],
-            strengths=self.strengths[chosen],
-            beams=self.beams[chosen],
-            psf=[self.psf[k] for k in chosen],
-            imperfect=self.imperfect.only(chosen),
-        )
 
     @cached_property
     def rays(self) -> RayModel:
@@ -442,14 +429,6 @@ class Linear:
     unknowns: Unknowns
     jacobians: list[csr_array]
     seen: list[_Seen]
-
-    def only(self, numbers: Sequence[int]) -> Linear | None:
-        """Return some of the images; None if another point spread reaches further than theirs."""
-        scene = self.scene.only(numbers)
-        if scene.rays.seen != self.scene.rays.seen:
-            return None
-        jacobians, seen = ([each[k] for k in numbers] for each in (self.jacobians, self.seen))
-        return Linear(scene, self.unknowns.only(numbers), jacobians, seen)
 
     def normal_times(self, change: Unknowns) -> Unknowns:
         """Return `pull` of `push` of a change of what is free."""

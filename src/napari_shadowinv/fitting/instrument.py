@@ -103,12 +103,6 @@ class Imperfect:
         """Whether fields can replace numbers nearly: beams of each image, but not a common one."""
         return bool(self.of_response) or "beam_between" in self.keys
 
-    def only(self, images: list[int]) -> Imperfect:
-        """Return what concerns some of the images."""
-        if self.other_strengths is None:
-            return self
-        return replace(self, other_strengths=self.other_strengths[images])
-
     def coarsen(self, factor: int) -> Imperfect:
         """Return the same in larger pixels."""
         shapes = tuple(each.coarsen(factor) for each in self.shapes)

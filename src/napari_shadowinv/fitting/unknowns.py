@@ -14,7 +14,6 @@ and that of all other numbers is a sum ½ Σ (θ / s)². Of a smooth object the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
@@ -26,8 +25,6 @@ from scipy.fft import dctn, idctn
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.fitting._ray_kernels import KNOT, add_ties, spline_tables
 from napari_shadowinv.fitting.rays import RayModel, at_rest
-
-_COMMON = 2  # blocks that the images share; the others have a row for each image
 
 
 class Unknowns(NamedTuple):
@@ -53,18 +50,6 @@ class Unknowns(NamedTuple):
         ends = [0, *accumulate(block.size for block in self)]
         parts = (flat[begin:end] for begin, end in pairwise(ends))
         return Unknowns(*(new.reshape(old.shape) for new, old in zip(parts, self, strict=True)))
-
-    def only(self, numbers: Sequence[int]) -> Unknowns:
-        """Return the unknowns of some of the images."""
-        chosen = list(numbers)
-        return Unknowns(*self[:_COMMON], *(block[chosen] for block in self[_COMMON:]))
-
-    def with_images(self, numbers: Sequence[int], part: Unknowns) -> Unknowns:
-        """Return the unknowns with the numbers of some images replaced."""
-        blocks = [block.copy() for block in self[_COMMON:]]
-        for block, new in zip(blocks, part[_COMMON:], strict=True):
-            block[list(numbers)] = new
-        return Unknowns(*part[:_COMMON], *blocks)
 
     def plus(self, other: Unknowns, times: float = 1.0) -> Unknowns:
         """Return the sum with a multiple of another."""

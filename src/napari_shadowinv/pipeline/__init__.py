@@ -3,7 +3,6 @@
 - apply a recipe to a shot: `run`; sites and sources that a window reuses: `Cache`
 - fit several images of one object by a recipe: `run_fit`; find the fields that explain them:
   `run_comparison`
-- test whether one static field explains them: `run_leave_one_out`
 - repeat a result from its provenance: module `rerun`
 - an experiment before its shot, by simulated shots: `plan_experiment`, `sweep_experiment`, with
   `ExperimentOptions`

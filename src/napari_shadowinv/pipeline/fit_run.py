@@ -1,6 +1,5 @@
 """From several images of one object to its fields by a recipe: `run_fit`, `run_comparison`.
 
-- whether one static field explains them: `run_leave_one_out`
 - the complete inputs of a fit: `collect_fit_inputs`
 - images of a table's rows or of flags: `read_row_images`; their setup: `row_setup`
 - an inversion refined by a fit that starts from its field: `run_refinement`
@@ -21,13 +20,11 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, LeaveOneOut, compare, fit, leave_one_out, point_spread
-from napari_shadowinv.fitting.left_out import check_count
-from napari_shadowinv.fitting.measurements import check_fiducials, displacements_of
+from napari_shadowinv.fitting import Fit, compare, fit, point_spread
+from napari_shadowinv.fitting.measurements import check_fiducials
 from napari_shadowinv.fitting.shots import (
     NearField,
     common_values,
-    names_of,
     value_of_first,
     values_of,
 )
@@ -204,37 +201,6 @@ def run_comparison(
         should_stop=should_stop,
     )
     return tuple(map(inputs.with_provenance, fits))
-
-
-def run_leave_one_out(
-    recipe: Recipe,
-    shots: Sequence[AnyShot],
-    fields: Sequence[str] | None = None,
-    *,
-    on_progress: OnProgress | None = None,
-    should_stop: ShouldStop | None = None,
-) -> LeaveOneOut:
-    """Predict each of three or more images of one object from a fit of the others, as `run_fit`.
-
-    The images are in the order of `shots`; they are processed in order of energy, so that results
-    do not depend on that order. `fields` are the object's; by default the recipe's.
-    """
-    check_count(len(shots))
-    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
-    fields = inputs.fields if fields is None else fields
-    strengths, _ = displacements_of(inputs.shots, names_of(inputs.shots), fields)
-    contents = [shot.image.tobytes() for shot in inputs.shots]
-    sizes = np.abs(strengths[:, 0])  # the most displaced first
-    order = sorted(range(len(contents)), key=lambda k: (-sizes[k], contents[k]))
-    left_out = leave_one_out(
-        [replace(inputs.shots[k], fiducials=None) for k in order],
-        fields=tuple(fields),
-        options=inputs.choices.options,
-        on_progress=on_progress,
-        should_stop=should_stop,
-    )
-    left_out = left_out.only([int(place) for place in np.argsort(order)])
-    return replace(left_out, setups=inputs.setups or (), names=names_of(inputs.shots))
 
 
 def collect_fit_inputs(

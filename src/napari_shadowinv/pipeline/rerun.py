@@ -21,13 +21,13 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind, to_figures
-from napari_shadowinv.fitting import Fit, LeaveOneOut
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset, read_shot
 from napari_shadowinv.io.files import join_address, split_address
 from napari_shadowinv.pipeline._film import run_film
-from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_leave_one_out, run_refinement
+from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import AnyShot, load_shot, run
 from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 from napari_shadowinv.provenance import Origin, Provenance
@@ -52,9 +52,7 @@ class Rerun:
     content : Inversion, Fit or FilmDoses
         The result.
     dataset : Dataset
-        All of it, with the images left out of a fit.
-    left_out : LeaveOneOut or None
-        The images left out of a fit, if the first result has them.
+        All of it.
     changes : tuple of str
         Changes of the version and the files.
     difference : str
@@ -63,7 +61,6 @@ class Rerun:
 
     content: AnyResult
     dataset: xarray.Dataset
-    left_out: LeaveOneOut | None
     changes: tuple[str, ...]
     difference: str
 
@@ -89,31 +86,24 @@ class RerunInputs:
         """Kind of the result."""
         return ResultKind.from_noun(self.provenance.kind)
 
-    @property
-    def leaves_out(self) -> bool:
-        """Whether the first result is a fit with each image left out in turn."""
-        return "left_out_chi2" in self.dataset
-
     def run(
         self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Rerun:
         """Repeat the result, and compare it with the first."""
         callbacks: dict[str, Any] = {"on_progress": on_progress, "should_stop": should_stop}
-        before, left_out = self.provenance, None
+        before = self.provenance
         content: AnyResult
         if before.pack is not None:
             content = run_film(before.pack, **callbacks)
         elif self.kind is ResultKind.FIT:
-            content, left_out = self._fit(**callbacks)
+            content = self._fit(**callbacks)
         else:
             content = self._invert(self.recipe, **callbacks)
         dataset = content.to_dataset()
-        if left_out is not None:
-            dataset = left_out.added_to(dataset)
         after = content.provenance
         changes = [*self.changes, *([] if after is None else _image_changes(before, after))]
         difference = _difference(self.dataset, dataset)
-        return Rerun(content, dataset, left_out, tuple(dict.fromkeys(changes)), difference)
+        return Rerun(content, dataset, tuple(dict.fromkeys(changes)), difference)
 
     def _invert(self, recipe: Recipe, **callbacks: Any) -> Inversion:
         (shot,) = self.shots
@@ -124,21 +114,17 @@ class RerunInputs:
         provenance = inversion.provenance.model_copy(update={"masks": masks_before})
         return replace(inversion, provenance=provenance)
 
-    def _fit(self, **callbacks: Any) -> tuple[Fit, LeaveOneOut | None]:
+    def _fit(self, **callbacks: Any) -> Fit:
         start, choices = self.provenance.start, self.recipe.fit
         if start is not None and choices is not None:
             inversion = self._invert(_with_dark(start.recipe, self.recipe.dark_file), **callbacks)
             setup = self.provenance.image.setup
-            return run_refinement(inversion, setup, choices, **callbacks), None
+            return run_refinement(inversion, setup, choices, **callbacks)
         fit = run_fit(self.recipe, self.shots, **callbacks)
-        left_out = None
-        if self.leaves_out:
-            fields = [field.name for field in fit.fields]
-            left_out = run_leave_one_out(self.recipe, self.shots, fields, **callbacks)
         assert fit.provenance is not None
         # Masks and rows were passed as arrays.
         origins = {"masks": self.provenance.masks, "fiducials": self.provenance.fiducials}
-        return replace(fit, provenance=fit.provenance.model_copy(update=origins)), left_out
+        return replace(fit, provenance=fit.provenance.model_copy(update=origins))
 
 
 def rerun(
@@ -157,8 +143,8 @@ def rerun(
     Parameters
     ----------
     result : path, Dataset, Inversion, Fit or FilmDoses
-        An inversion, a fit with its images left out, a film pack, or the dataset of
-        one shot of a stack, which is inverted without another shot to start from.
+        An inversion, a fit, a film pack, or the dataset of one shot of a stack, which is
+        inverted without another shot to start from.
     images : sequence of path, array_like or Shot, optional
         The images in their order. Default: the files that the provenance names, in the result's
         folder or the current one.

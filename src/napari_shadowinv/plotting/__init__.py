@@ -4,7 +4,6 @@
   `pack_figure`
 - products with their bands: `products_figure`; curves of one: `draw_curves`; axes of spectra:
   `make_logarithmic`
-- the test of one static field: `left_out_figure`
 - planned experiments: `plan_figure`, `sweep_figure`; their errors: `draw_errors`
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
 - a style of their own, whatever a user's matplotlibrc says: `own_style`
@@ -18,7 +17,7 @@ disturb the figures of a notebook.
 """
 
 from napari_shadowinv.plotting._film_figure import pack_figure
-from napari_shadowinv.plotting._fit_figure import fit_figure, left_out_figure
+from napari_shadowinv.plotting._fit_figure import fit_figure
 from napari_shadowinv.plotting._movie import stack_frames, write_film
 from napari_shadowinv.plotting._panels import own_style
 from napari_shadowinv.plotting._plan_figure import draw_errors, plan_figure, sweep_figure
@@ -39,7 +38,6 @@ __all__ = [
     "draw_curves",
     "draw_errors",
     "fit_figure",
-    "left_out_figure",
     "make_logarithmic",
     "own_style",
     "pack_figure",

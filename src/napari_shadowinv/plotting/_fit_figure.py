@@ -1,27 +1,22 @@
-"""Figures of fits, each on a page.
-
-- images and how they are explained, fields and verdict: `fit_figure`
-- the test of one static field, images left out: `left_out_figure`
-"""
+"""The figure of a fit on a page: images and how they are explained, fields and verdict."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.facts import Fact, Level
-from napari_shadowinv.fitting import Fit, FittedField, LeaveOneOut
+from napari_shadowinv.facts import Fact
+from napari_shadowinv.fitting import Fit, FittedField
 from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.significance import deviation_along
 from napari_shadowinv.physics.units import ShownField, intensity_limits, shown_fields
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR, Panel, PanelGrid
+from napari_shadowinv.plotting._panels import Panel, PanelGrid
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,7 +40,10 @@ def fit_figure(fit: Fit, *, title: str | None = None) -> Figure:
     columns = count if upright else len(kinds)
     rows = len(kinds) if upright else count
     sentences = [_panels.headline_sentence(fit.headline)]
-    grid, header, heading = _page(shape, rows + len(fit.fields), columns, sentences, title)
+    width, height = _panels.panel_size(shape)
+    grid = PanelGrid(rows + len(fit.fields), columns, width, height, foot=0.12, head=0.52)
+    header = _panels.wrapped(sentences, grid.letters)
+    heading = title and textwrap.shorten(title, int(grid.letters * 0.7), placeholder=" …")
     facts = fit.facts_with_names(())
     of_images = [fact for fact in facts if fact.key.startswith("image_")]
     footer = _panels.footer_lines(facts, fit.headline.text, grid.letters)
@@ -115,62 +113,3 @@ def _magnitude_error(field: FittedField, in_units: ShownField) -> FloatArray | N
     strongest = in_units.peak
     # Displacements become fields by a factor.
     return np.asarray(pixels * in_units.magnitude[strongest] / max(length[strongest], 1e-12))
-
-
-def left_out_figure(left_out: LeaveOneOut, *, title: str | None = None) -> Figure:
-    """Show how well the others predict each image that was left out.
-
-    Each row has the image, the prediction of the others, and the residual over the standard
-    deviation of each pixel's noise. On top: the images that one static field does not explain. The
-    setups name the images.
-    """
-    count, *shape = left_out.images.shape
-    side_by_side = -(-count // 6)  # rows of three panels
-    columns, rows = 3 * side_by_side, -(-count // side_by_side)
-    first_fact, *of_images = left_out.facts
-    setups = left_out.setups
-    sentences = [(first_fact.text, _panels.LEVEL_COLOURS[first_fact.level])]
-    grid, header, heading = _page(shape, rows, columns, sentences, title)
-    scale = _panels.image_scale(shape, setups[0] if setups else None)
-    text = "Each image as predicted by a fit of the others, without those that are not explained."
-    with _panels.new_page(grid, scale, heading, header, [(text, QUIET_COLOUR)]) as (figure, panels):
-        for k in range(count):
-            row, column = k % rows, k // rows
-            first = row * columns + column * 3
-            probe = f": {setups[k].probe}" if setups else ""
-            row_panels = panels[first : first + 3]
-            _draw_left_out(row_panels, left_out, k, f"Image {k + 1}{probe}", of_images[k])
-        for place, panel in enumerate(panels):
-            row, column = divmod(place, columns)
-            if column // 3 * rows + row >= count:
-                panel.axes.remove()
-    return figure
-
-
-def _page(
-    shape: Sequence[int],
-    rows: int,
-    columns: int,
-    sentences: list[tuple[str, str]],
-    title: str | None,
-) -> tuple[PanelGrid, list[tuple[str, str]], str | None]:
-    """Panels of one shape below a heading and sentences, wrapped to the page's width."""
-    width, height = _panels.panel_size(shape)
-    grid = PanelGrid(rows, columns, width, height, foot=0.12, head=0.52)
-    header = _panels.wrapped(sentences, grid.letters)
-    heading = title and textwrap.shorten(title, int(grid.letters * 0.7), placeholder=" …")
-    return grid, header, heading
-
-
-def _draw_left_out(
-    panels: list[Panel], left_out: LeaveOneOut, k: int, name: str, fact: Fact
-) -> None:
-    mean = float(left_out.images[k][left_out.mask[k]].mean())
-    limits = intensity_limits(left_out.images[k] / mean)
-    residual = left_out.normalised_residual[k]
-    panels[0].draw_intensity(left_out.images[k] / mean, name, limits, label="Intensity / mean")
-    panels[1].draw_intensity(left_out.predicted[k] / mean, "Prediction", limits, "Intensity / mean")
-    title = f"Residual: {fact.short}"
-    panels[2].draw_differences(residual, title, "Residual (σ)", 20.0)
-    if fact.level is not Level.SOUND:
-        panels[2].axes.set_title(title, color=ALARM_COLOUR)
