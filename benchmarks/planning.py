@@ -21,7 +21,7 @@ from instrument import COUNTS, IMPERFECTIONS, Shot, objects, truth
 from napari_shadowinv import Instrument, invert
 from napari_shadowinv.physics.phantom_models import BlobRecipe, ToroidRecipe
 from napari_shadowinv.physics.phantoms import paper_setup
-from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment, sweep_experiment
+from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
 from napari_shadowinv.pipeline.experiment_object import object_of_displacement
 
 INSTRUMENTS = {
@@ -113,16 +113,15 @@ def table_of_searches(draws: int, side: int) -> None:
 
 def table_of_counts(draws: int, side: int) -> None:
     counts = [100, 400, 1600, 6400]
-    sweep = sweep_experiment(
-        BlobRecipe(amplitude=15, sigma=side / 12),
-        vary={"counts": counts},
-        shape=(side, side),
-        instrument=Instrument(beam_rms=0.0),
-        options=ExperimentOptions(draws=draws),
-    )
     print("| counts a pixel | error made | reported | error × √counts |")
     print("|---|---|---|---|")
-    for count, plan in zip(counts, sweep.plans, strict=True):
+    for count in counts:
+        plan = plan_experiment(
+            BlobRecipe(amplitude=15, sigma=side / 12),
+            shape=(side, side),
+            instrument=Instrument(beam_rms=0.0),
+            options=ExperimentOptions(draws=draws, counts=count),
+        )
         scaled = plan.error.median * np.sqrt(count)
         print(f"| {count} | {plan.error.median:.2%} | {plan.total.median:.2%} | {scaled:.3f} |")
     print()

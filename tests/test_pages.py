@@ -16,7 +16,7 @@ import tifffile
 import xarray
 
 from helpers.command_line import run_line
-from helpers.pages import ROOT, WRITTEN_PAGES, blocks, text_of
+from helpers.pages import ROOT, WRITTEN_PAGES, blocks, run_python, text_of
 from napari_shadowinv import Instrument, invert, read
 from napari_shadowinv.physics.setup import SPECIES, setup_from_dict
 
@@ -140,3 +140,10 @@ def test_the_loop_of_the_page_on_fits_names_the_film_that_changed() -> None:
         chi2[strength] = [float(line.split()[-1]) for line in printed.getvalue().splitlines()[-3:]]
     np.testing.assert_allclose(chi2[""], [1.04, 1.02, 1.03], atol=0.01)
     np.testing.assert_allclose(chi2["1.1 * "], [1.8, 1.1, 2.3], atol=0.05)
+
+
+def test_the_loop_of_the_page_on_plans_shows_what_a_beam_is_worth() -> None:
+    names = run_python(text_of("docs/planning.md"))
+    names["plt"].close("all")
+    errors = [100 * plan.error.median for plan in names["plans"]]
+    np.testing.assert_allclose(errors, [7, 17, 78], atol=0.6)

@@ -51,17 +51,6 @@ def test_a_plan_says_which_beam_it_assumes(folder):
     assert "assumed: record" not in stated
 
 
-def test_a_sweep_has_a_row_for_each_value(folder):
-    answer = shadowinv(
-        *("plan", "blob:amplitude=15,sigma=6", *QUICK, "--set=instrument.beam_rms=0"),
-        *("--sweep", "counts=100,1600", "--out", "counts.csv"),
-    )
-    assert answer.exit_code in (0, 3), answer.output
-    with (folder / "counts.csv").open() as file:
-        few, many = csv.DictReader(file)
-    assert float(few["error"]) > 2 * float(many["error"])
-
-
 def test_particles_are_traced_through_a_field_on_a_grid(folder, refused):
     places = np.linspace(-6e-5, 6e-5, 33)
     z, y, x = np.meshgrid(places, places, places, indexing="ij")
@@ -114,8 +103,6 @@ def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):
         (("plan", "blob", "--energies", "3,15"), "--energies is '3,15': it needs a setup"),
         (("plan", "toroid", "--setup", "setup.toml", "--energies", "3;15"), "separated by commas"),
         (("plan", "blob", "--size", "200"), "expected height and width"),
-        (("plan", "blob", "--sweep", "counts"), "expected NAME=VALUES"),
-        (("plan", "blob", "--sweep", "count=1,2"), "did you mean 'counts'"),
         (("plan", "blob", "--counts", "-1"), "--counts is -1"),
         (("plan", "blob", "--set=instrument.background=2"), "instrument.background is '2'"),
         (("plan", "blob", "--deflector", "plasma"), "does not apply to blob, a phantom"),

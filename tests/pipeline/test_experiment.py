@@ -12,7 +12,7 @@ from napari_shadowinv.facts import Verdict
 from napari_shadowinv.physics import FieldGrid
 from napari_shadowinv.physics.phantom_models import BlobRecipe, FourToroidsRecipe, ToroidRecipe
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
-from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment, sweep_experiment
+from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
 from napari_shadowinv.pipeline.experiment_object import (
     Grid,
     PlannedObject,
@@ -259,14 +259,7 @@ def small_plan(**choices) -> ExperimentPlan:
 
 
 def test_more_counts_lower_the_error_by_their_root():
-    sweep = sweep_experiment(
-        BlobRecipe(amplitude=10, sigma=6),
-        vary={"counts": [100, 1600]},
-        shape=(64, 64),
-        instrument=EXACT,
-        options=ExperimentOptions(draws=8),
-    )
-    few, many = (plan.error.median for plan in sweep.plans)
+    few, many = (small_plan(counts=counts, draws=8).error.median for counts in (100, 1600))
     assert few / many == pytest.approx(4, rel=0.25)
 
 
@@ -320,16 +313,15 @@ def test_a_plan_stops_on_request():
         plan_experiment(BlobRecipe(), shape=(64, 64), should_stop=lambda: True)
 
 
-def test_progress_counts_the_draws_of_a_whole_sweep():
+def test_progress_counts_the_draws():
     steps = []
-    sweep_experiment(
+    plan_experiment(
         BlobRecipe(amplitude=15, sigma=6),
-        vary={"counts": [100, 200]},
         shape=(48, 48),
         options=ExperimentOptions(draws=2, threads=1),
         on_progress=lambda progress: steps.append((progress.step, progress.total)),
     )
-    assert steps == [(0, 4), (1, 4), (2, 4), (2, 4), (3, 4), (4, 4)]
+    assert steps == [(0, 2), (1, 2), (2, 2)]
 
 
 @pytest.mark.parametrize(
@@ -364,21 +356,6 @@ def test_wrong_inputs_are_refused_in_a_sentence(choices, message):
 def test_wrong_options_are_refused_in_a_sentence(choices, message):
     with pytest.raises(InputError, match=message):
         ExperimentOptions(**choices)
-
-
-@pytest.mark.parametrize(
-    ("vary", "message"),
-    [
-        ({"count": [1, 2]}, "did you mean 'counts'"),
-        ({"counts": [100]}, "two or more"),
-        ({"counts": [100, -5]}, "must be greater than 0"),
-        ({"energy": [3, 5]}, "without a setup"),
-        ({"counts": [1, 2], "blur": [0, 1]}, "2 quantities"),
-    ],
-)
-def test_a_wrong_sweep_is_refused_in_a_sentence(vary, message):
-    with pytest.raises(InputError, match=message):
-        sweep_experiment(BlobRecipe(), vary=vary, shape=(64, 64))
 
 
 # Results

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, create_model
+from pydantic import Field
 from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv._napari import form as forms
@@ -35,9 +35,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level, percent
 from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.options import Instrument, InversionOptions
-from napari_shadowinv.physics.beam import (
-    numbers_in_unit,
-)
 from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.particle_flight import check_particles
@@ -47,7 +44,7 @@ from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.physics.tracing import trace
 from napari_shadowinv.physics.units import intensity_limits
-from napari_shadowinv.pipeline.experiment import SWEPT, plan_experiment, sweep_experiment
+from napari_shadowinv.pipeline.experiment import plan_experiment
 from napari_shadowinv.pipeline.experiment_object import (
     PlannedObject,
     object_of_displacement,
@@ -56,13 +53,12 @@ from napari_shadowinv.pipeline.experiment_object import (
     shape_of_text,
 )
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
-from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
+from napari_shadowinv.pipeline.experiment_result import ExperimentPlan
 from napari_shadowinv.pipeline.inversion_run import plane_of
 from napari_shadowinv.plotting import draw_errors
 
 _IMAGE, _PLAN = "image", "plan"  # tasks
 _GRID, _LAYER = "grid", "layer"  # objects that are no phantoms
-_NOTHING = ""  # of the quantities
 _SHAPE = 200, 200
 _SIZE = " x ".join(map(str, _SHAPE))
 _PLOT_HEIGHT_PX = 260
@@ -197,24 +193,18 @@ class ForwardJob(Job):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlanJob(Job):
-    """A plan of an experiment, or a sweep of one of its quantities."""
+    """A plan of an experiment."""
 
     object: SimulatedObject
     setups: tuple[Setup, ...]
     shape: tuple[int, int] | None
     instrument: Instrument
     options: ExperimentOptions
-    quantity: str = ""  # none
-    values: tuple[float, ...] = ()
 
-    def run(
-        self, on_progress: OnProgress, should_stop: ShouldStop
-    ) -> ExperimentPlan | ExperimentSweep:
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> ExperimentPlan:
         choices = {"shape": self.shape, "instrument": self.instrument, "options": self.options}
         keywords: Any = {**choices, "on_progress": on_progress, "should_stop": should_stop}
         setups, target = self.setups or None, self._object(on_progress, should_stop)
-        if self.quantity:
-            return sweep_experiment(target, setups, vary={self.quantity: self.values}, **keywords)
         return plan_experiment(target, setups, **keywords)
 
     def _object(self, *callbacks: Any) -> PhantomRecipe | PlannedObject:
@@ -227,9 +217,8 @@ class PlanJob(Job):
         field = self.object
         return object_of_displacement(field.displacement, field.setup, title=field.title)
 
-    def layers(self, content: ExperimentPlan | ExperimentSweep) -> LayerData:
+    def layers(self, plan: ExperimentPlan) -> LayerData:
         """Describe the image of the first draw."""
-        plan = content.plans[content.best] if isinstance(content, ExperimentSweep) else content
         setup = plan.setups[0] if plan.setups else None
         image, name = plan.images[0], f"{plan.title}, planned"
         return [shot_layer(image, name, setup, intensity_limits(image), unit="counts")]
@@ -290,17 +279,11 @@ class Simulate(panels.ToolPanel):
             "by commas. Empty: one image with the setup's.",
         )
         self.instrument, self.options = InstrumentForm(), forms.ModelForm(ExperimentOptions)
-        self.quantity = forms.ModelPicker(
-            "Vary",
-            {_NOTHING: ("nothing", None), **{key: _values_of(key) for key in SWEPT}},
-            "Quantity of the experiment that is varied.",
-        )
         column(
             plan,
             forms.labelled("Energies", self.energies),
             forms.section("Instrument", self.instrument),
             forms.section("Simulated shots", self.options),
-            self.quantity,
         )
         self.task = forms.ModelPicker(
             "Simulate",
@@ -312,7 +295,7 @@ class Simulate(panels.ToolPanel):
     def _connect(self) -> None:
         self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
         self.field.picked.connect(self._follow_layer)
-        parts = (self.object, self.task, self.setup, self.instrument, self.options, self.quantity)
+        parts = (self.object, self.task, self.setup, self.instrument, self.options)
         for part in parts:
             part.changed.connect(self._on_change)
         for line in (self.side, self.energies):
@@ -339,7 +322,6 @@ class Simulate(panels.ToolPanel):
             "energies": self.energies,
             "instrument": self.instrument,
             "options": self.options,
-            "quantity": self.quantity,
         }
 
     def state(self) -> dict[str, Any]:
@@ -357,11 +339,6 @@ class Simulate(panels.ToolPanel):
         shape = shape_of_text(size, "the size") if size else None
         if self.task.kind == _IMAGE:
             return self._image_job(target, setup, shape or _SHAPE)
-        key, sweep = self.quantity.kind, self.quantity.model()
-        values: list[float] = []
-        if sweep is not None:
-            text = sweep.values  # type: ignore[attr-defined]
-            values = numbers_in_unit(text, SWEPT[key].unit, "Values")
         instrument = validate(Instrument, self.instrument.state(), "instrument")
         options: Any = self.options.model()
         return PlanJob(
@@ -370,8 +347,6 @@ class Simulate(panels.ToolPanel):
             shape=shape,
             instrument=instrument,
             options=options,
-            quantity=key,
-            values=tuple(values),
         )
 
     def _object(self) -> SimulatedObject:
@@ -432,7 +407,7 @@ class Simulate(panels.ToolPanel):
 
     def show_result(self, finished: Finished, job: ForwardJob | PlanJob) -> None:
         content = finished.content
-        subject = job.subject if isinstance(job, ForwardJob) else job.quantity or _PLAN
+        subject = job.subject if isinstance(job, ForwardJob) else _PLAN
         self.results = self._last.layers_for_next(subject)
         self.results.show(finished.layer_data)
         if isinstance(job, ForwardJob):
@@ -471,12 +446,3 @@ class Simulate(panels.ToolPanel):
         has_size = is_plan and kind not in PHANTOMS
         self.side.setPlaceholderText("that of the field" if has_size else _SIZE)
         self.keep()
-
-
-def _values_of(key: str) -> tuple[str, type[CheckedModel]]:
-    """Return title and entries of a quantity that can be varied."""
-    swept = SWEPT[key]
-    unit = f", in {swept.unit} or with a unit" if swept.unit else ""
-    tip = f"Values of the quantity, separated by commas{unit}."
-    field: Any = Field(title="Values", description=tip)
-    return swept.title, create_model(key, __base__=CheckedModel, values=(str, field))

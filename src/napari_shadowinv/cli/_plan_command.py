@@ -20,7 +20,6 @@ from napari_shadowinv.cli._terminal import EXIT_NOT_CONVERGED, notify_errors, wo
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import split_address
 from napari_shadowinv.options import Instrument
-from napari_shadowinv.physics.beam import numbers_in_unit
 from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 
@@ -36,14 +35,13 @@ HELP = {
     "size": "Height and width, such as 200x200.",
     "recorded_with": "TOML file of the object's setup.",
     "counts": "Mean counts a pixel. Default: 1000.",
-    "sweep": "A curve, such as counts=100,300,1000.",
-    "out": "Table (.csv) of draws or sweep.",
+    "out": "Table (.csv) of draws.",
 }
 SECTIONS: Sections = {"plan": ExperimentOptions, "instrument": Instrument, "view": GridView}
 EPILOG = """
 shadowinv plan toroid:peak=60 --setup setup.toml --energies 5,15 --instrument film,TNSA
 
-shadowinv plan shot.shadowinv --setup next.toml --sweep counts=100,300,1000
+shadowinv plan shot.shadowinv --setup next.toml --counts 300
 
 Phantoms: toroid, four_toroids, coaxial, wakefield, blob.
 
@@ -62,7 +60,6 @@ class PlanFlags:
     size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None
     recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None
     deflector: _flags.Deflector = None
-    sweep: Annotated[str | None, Option(metavar="NAME=VALUES", help=HELP["sweep"])] = None
 
 
 @notify_errors
@@ -79,9 +76,9 @@ def plan(
     """Simulate shots of an experiment, and report whether the field would be determined."""
     from napari_shadowinv.io.files import replacing
     from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES
-    from napari_shadowinv.pipeline.experiment import plan_experiment, sweep_experiment
+    from napari_shadowinv.pipeline.experiment import plan_experiment
     from napari_shadowinv.pipeline.experiment_object import setups_of_text, shape_of_text
-    from napari_shadowinv.plotting import plan_figure, sweep_figure
+    from napari_shadowinv.plotting import plan_figure
 
     page, outputs = figure or figure_beside(out), Outputs(overwrite, quiet)
     outputs.check(
@@ -97,24 +94,17 @@ def plan(
     target: Any = _object(object, flags, setups, stated)
     choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
     outputs.warn_of_setups((each, shape) for each in setups or ())
-    result: Any
-    draw: Any
     with work_callbacks(quiet) as callbacks:
-        choices |= callbacks
-        if flags.sweep is None:
-            result, draw = plan_experiment(target, setups, **choices), plan_figure
-        else:
-            vary = _sweep(flags.sweep)
-            result, draw = sweep_experiment(target, setups, vary=vary, **choices), sweep_figure
+        result = plan_experiment(target, setups, **choices, **callbacks)
     with replacing(out, overwrite) as temporary:
         cells = [
             {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
             for row in result.rows()
         ]
         write_cells(temporary, [*cells[0]], cells)
-    outputs.write_figures({page: partial(draw, result)})
+    outputs.write_figures({page: partial(plan_figure, result)})
     rows = [headline_row(result.headline), *fact_rows(result.facts)]
-    outputs.show("Plan" if flags.sweep is None else "Sweep", rows)
+    outputs.show("Plan", rows)
     if not result.is_determined:
         raise Exit(EXIT_NOT_CONVERGED)
     outputs.exit_unless_drawn()
@@ -165,10 +155,3 @@ def _object(
         deflector=flags.deflector,
         title=Path(text).name,
     )
-
-
-def _sweep(text: str) -> dict[str, list[float]]:
-    name, equals, values = text.partition("=")
-    if not equals:
-        raise InputError(f"--sweep is '{text}': expected NAME=VALUES, such as counts=100,300,1000")
-    return {name.strip().replace("-", "_"): numbers_in_unit(values, "", "--sweep")}

@@ -4,8 +4,7 @@
 - fit several images of one object by a recipe: `run_fit`; find the fields that explain them:
   `run_comparison`
 - repeat a result from its provenance: module `rerun`
-- an experiment before its shot, by simulated shots: `plan_experiment`, `sweep_experiment`, with
-  `ExperimentOptions`
+- an experiment before its shot, by simulated shots: `plan_experiment`, with `ExperimentOptions`
 - recipes as files: `read_recipe`, `write_recipe`
 """
 

@@ -1,5 +1,5 @@
 from ._film import run_film
-from .experiment import plan_experiment, sweep_experiment
+from .experiment import plan_experiment
 from .experiment_options import ExperimentOptions
 from .files import read_recipe, write_recipe
 from .film_files import read_pack, write_layers
@@ -22,7 +22,6 @@ __all__ = [
     "run_comparison",
     "run_film",
     "run_fit",
-    "sweep_experiment",
     "write_layers",
     "write_recipe",
 ]

@@ -1,27 +1,24 @@
-"""An experiment before its shot: `plan_experiment`, `sweep_experiment`.
+"""An experiment before its shot: `plan_experiment`.
 
 Shots are simulated with imperfections drawn from the stated instrument, and inverted (one image) or
 fitted (several). The errors made, the errors reported and the verdicts say whether the field would
 be determined, its limits, and the gain by a change.
-
-- the quantities that can be varied: `SWEPT`
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import OnProgress, Progress, Reporter, ShouldStop
-from napari_shadowinv._system.validation import as_model, check_instance, suggestion, validate
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict, percent
@@ -32,17 +29,13 @@ from napari_shadowinv.inversion import invert
 from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inversion_compiled
 from napari_shadowinv.inversion.error_budget import ErrorBudget
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
-from napari_shadowinv.physics.beam import BeamSetup, unit_in_title
+from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.poisson import potential_from_displacement
-from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
+from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.pipeline.experiment_object import PlannedObject, object_of_phantom
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
-from napari_shadowinv.pipeline.experiment_result import (
-    ExperimentPlan,
-    ExperimentSweep,
-    PlannedShot,
-)
+from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, PlannedShot
 from napari_shadowinv.pipeline.experiment_shots import ExperimentInputs, ShotSimulator
 from napari_shadowinv.shot import shots_of
 
@@ -112,116 +105,6 @@ def plan_experiment(
     return _plan(inputs, Reporter(on_progress, should_stop))
 
 
-def sweep_experiment(
-    object: PlannedObject | PhantomRecipe,
-    setups: Setup | Sequence[Setup] | None = None,
-    *,
-    vary: Mapping[str, Sequence[float]],
-    shape: tuple[int, int] | None = None,
-    instrument: Instrument | None = None,
-    options: ExperimentOptions | None = None,
-    on_progress: OnProgress | None = None,
-    should_stop: ShouldStop | None = None,
-) -> ExperimentSweep:
-    """Plan an experiment for several values of one quantity.
-
-    Parameters
-    ----------
-    object, setups, shape, instrument, options, on_progress, should_stop
-        As for `plan_experiment`. The object stays the same.
-    vary : mapping of str to sequence of float
-        The quantity that is varied, one of `SWEPT`: "counts", "energy" of the last image,
-        "object_image_distance", a number of the instrument such as "beam_rms" or "blur"; with its
-        values, two or more, in the unit of that field.
-
-    Returns
-    -------
-    ExperimentSweep
-        Each value has the same draws of the imperfections, so that a difference is one of the
-        quantity.
-
-    Raises
-    ------
-    InputError
-        As `plan_experiment`, and if the quantity is unknown or a value out of range.
-    InversionCancelled
-        If `should_stop` returned true.
-    """
-    if len(vary) != 1:
-        raise InputError(f"received {len(vary)} quantities to vary: expected one with its values")
-    ((quantity, values),) = vary.items()
-    if quantity not in SWEPT:
-        raise InputError(f"the quantity to vary is '{quantity}': {suggestion(quantity, SWEPT)}")
-    numbers = [float(value) for value in values]
-    if len(set(numbers)) < 2:
-        raise InputError(
-            f"received {len(set(numbers))} values of {quantity}: expected two or more that differ"
-        )
-    inputs = _checked_inputs(object, setups, shape, instrument, options)
-    changed = [_with_value(inputs, quantity, value) for value in numbers]
-    plans = [
-        _plan(each, Reporter(_shifted(on_progress, number, len(changed)), should_stop))
-        for number, each in enumerate(changed)
-    ]
-    swept = SWEPT[quantity]
-    return ExperimentSweep(quantity, swept.title, swept.unit, tuple(numbers), tuple(plans))
-
-
-class Swept(NamedTuple):
-    """A quantity that can be varied: its name, its unit, and the model that has it."""
-
-    title: str
-    unit: str
-    owner: str
-
-
-def _swept() -> dict[str, Swept]:
-    quantities = {}
-    for owner, (model, names) in _OWNERS.items():
-        for name in names:
-            title = model.model_fields[_FIELDS.get(name, name)].title or name
-            title = f"{title} error" if name in _FIELDS else title
-            quantities[name] = Swept(title.partition(" (")[0], unit_in_title(title), owner)
-    for model in SETUPS.values():
-        quantity = model.beam_quantity()
-        quantities[quantity.name] = Swept(quantity.noun.capitalize(), quantity.unit, "last setup")
-    return quantities
-
-
-# Names of fields that two models have.
-_FIELDS = {"energy_error": "energy"}
-_OWNERS: dict[str, tuple[type[BaseModel], Sequence[str]]] = {
-    "options": (
-        ExperimentOptions,
-        ("counts", "reference_counts", "beam_structure", "psf", "source_size", "resolution"),
-    ),
-    "setup": (BeamSetup, ("source_object_distance", "object_image_distance")),
-    "instrument": (
-        Instrument,
-        (
-            *("beam_rms", "beam_length", "beam_between", "energy_error", "background"),
-            *("gamma", "blur", "absorption", "registration", "other_field"),
-        ),
-    ),
-}
-SWEPT: dict[str, Swept] = _swept()
-"""Quantities that `sweep_experiment` can vary, by their keys."""
-
-
-def _shifted(on_progress: OnProgress | None, number: int, count: int) -> OnProgress | None:
-    """Count the shots of all values of a sweep together."""
-    if on_progress is None:
-        return None
-
-    def report(progress: Progress) -> None:
-        if progress.total is not None:
-            step = number * progress.total + progress.step
-            progress = replace(progress, step=step, total=count * progress.total)
-        on_progress(progress)
-
-    return report
-
-
 def _checked_inputs(
     object: Any, setups: Any, shape: Any, instrument: Any, options: Any
 ) -> ExperimentInputs:
@@ -282,35 +165,6 @@ def _refuse_unsuitable(inputs: ExperimentInputs) -> None:
             "received a beam with components of references, which is not simulated: state its "
             "r.m.s. and its length"
         )
-
-
-def _with_value(inputs: ExperimentInputs, quantity: str, value: float) -> ExperimentInputs:
-    owner, name = SWEPT[quantity].owner, _FIELDS.get(quantity, quantity)
-    if owner == "options":
-        stated = inputs.options.model_dump(exclude_unset=True)
-        changed = replace(inputs, options=validate(ExperimentOptions, {**stated, name: value}, ""))
-    elif owner == "instrument":
-        stated = inputs.instrument.stated
-        changed = replace(inputs, instrument=validate(Instrument, {**stated, name: value}, ""))
-    else:
-        setups = inputs.setups
-        last = setups[-1]
-        if last is None:
-            raise InputError(f"received values of {quantity} without a setup: give the setups")
-        if not hasattr(last, name):
-            raise InputError(
-                f"received values of {quantity}, which {last.beam} has not: give setups that have "
-                "it"
-            )
-        chosen = setups[-1:] if owner == "last setup" else setups
-        unchanged = setups[: len(setups) - len(chosen)]
-        changed_setups = [
-            validate(type(setup), {**setup.model_dump(), name: value}, "")  # type: ignore
-            for setup in chosen
-        ]
-        changed = replace(inputs, setups=(*unchanged, *changed_setups))
-    _refuse_unsuitable(changed)
-    return changed
 
 
 def _plan(inputs: ExperimentInputs, report: Reporter) -> ExperimentPlan:

@@ -1,6 +1,5 @@
 """Results of a planned experiment: `ExperimentPlan`, of `PlannedShot`.
 
-- a quantity of the experiment that is varied: `ExperimentSweep`
 - the gain by a change of a stated number: `Gain`
 """
 
@@ -336,79 +335,4 @@ class ExperimentPlan(Summarised):
                 **{f"part_{name}": shot.parts.get(name, math.nan) for name in self.parts},
             }
             for shot in self.shots
-        ]
-
-
-@dataclass(frozen=True, eq=False)
-class ExperimentSweep:
-    """Plans of an experiment in which one quantity is varied.
-
-    Attributes
-    ----------
-    quantity, title, unit : str
-        Its key, its name and its unit.
-    values : tuple of float
-        Its values, in order.
-    plans : tuple of ExperimentPlan
-        One for each value, by the same draws.
-    """
-
-    quantity: str
-    title: str
-    unit: str
-    values: tuple[float, ...]
-    plans: tuple[ExperimentPlan, ...]
-
-    @property
-    def is_determined(self) -> bool:
-        """Whether the field would be determined with any of the values."""
-        return any(plan.is_determined for plan in self.plans)
-
-    @property
-    def best(self) -> int:
-        """Index of the value with the smallest error made."""
-        return int(np.argmin([plan.error.median for plan in self.plans]))
-
-    @property
-    def headline(self) -> Headline:
-        """Error made at the first, the best and the last value in one line."""
-        chosen = dict.fromkeys([0, self.best, len(self.values) - 1])
-        texts = ", ".join(
-            f"{percent(self.plans[k].error.median)} at {self.value_text(k)}" for k in chosen
-        )
-        level = Level.SOUND if self.is_determined else Level.DOUBTFUL
-        return Headline(level, f"error made: {texts}; smallest at {self.value_text(self.best)}")
-
-    @property
-    def facts(self) -> tuple[Fact, ...]:
-        """A fact for each value."""
-        return tuple(
-            Fact(
-                f"value_{k + 1}",
-                self.value_text(k),
-                f"error made {plan.error.text}, reported {percent(plan.total.median)}; determined "
-                f"in {round(plan.determined_share * len(plan.shots))} of {len(plan.shots)} shots",
-                Level.SOUND if plan.is_determined else Level.DOUBTFUL,
-            )
-            for k, plan in enumerate(self.plans)
-        )
-
-    def value_text(self, index: int) -> str:
-        """Return a value with the quantity's title and unit."""
-        return f"{self.title} {self.values[index]:.4g} {self.unit}".rstrip()
-
-    def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each value, for a table."""
-        return [
-            {
-                self.quantity: value,
-                "error": plan.error.median,
-                "error_low": plan.error.low,
-                "error_high": plan.error.high,
-                "peak_error": plan.peak_error.median,
-                "reported_error": plan.total.median,
-                "determined": plan.determined_share,
-                "silent": plan.silent,
-            }
-            for value, plan in zip(self.values, self.plans, strict=True)
         ]

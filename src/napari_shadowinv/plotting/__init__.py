@@ -4,7 +4,7 @@
   `pack_figure`
 - products with their bands: `products_figure`; curves of one: `draw_curves`; axes of spectra:
   `make_logarithmic`
-- planned experiments: `plan_figure`, `sweep_figure`; their errors: `draw_errors`
+- planned experiments: `plan_figure`; their errors: `draw_errors`
 - fields side by side: `comparison_figure`; a figure's file: `save_figure`
 - a style of their own, whatever a user's matplotlibrc says: `own_style`
 - a stack as a movie: `write_film`
@@ -20,7 +20,7 @@ from napari_shadowinv.plotting._film_figure import pack_figure
 from napari_shadowinv.plotting._fit_figure import fit_figure
 from napari_shadowinv.plotting._movie import stack_frames, write_film
 from napari_shadowinv.plotting._panels import own_style
-from napari_shadowinv.plotting._plan_figure import draw_errors, plan_figure, sweep_figure
+from napari_shadowinv.plotting._plan_figure import draw_errors, plan_figure
 from napari_shadowinv.plotting._product_figure import (
     draw_curves,
     make_logarithmic,
@@ -47,6 +47,5 @@ __all__ = [
     "result_figure",
     "save_figure",
     "stack_frames",
-    "sweep_figure",
     "write_film",
 ]

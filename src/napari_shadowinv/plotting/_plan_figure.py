@@ -1,26 +1,18 @@
-"""Figures of planned experiments: `plan_figure`, and of one quantity varied, `sweep_figure`.
-
-- their errors on given axes: `draw_errors`
-"""
+"""The figure of a planned experiment: `plan_figure`; its errors on given axes: `draw_errors`."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.units import intensity_limits, shown_fields
-from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, ExperimentSweep
+from napari_shadowinv.pipeline.experiment_result import ExperimentPlan
 from napari_shadowinv.plotting import _panels
-from napari_shadowinv.plotting._panels import GOOD_COLOUR, LEVEL_COLOURS, QUIET_COLOUR
+from napari_shadowinv.plotting._panels import LEVEL_COLOURS, QUIET_COLOUR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-_LOG_RANGE = 8.0  # of values; larger ones have a logarithmic axis
 
 
 def plan_figure(plan: ExperimentPlan) -> Figure:
@@ -43,69 +35,8 @@ def plan_figure(plan: ExperimentPlan) -> Figure:
     return figure
 
 
-def sweep_figure(sweep: ExperimentSweep) -> Figure:
-    """Show the error of a planned experiment as a curve over the quantity that is varied.
-
-    The band holds 68 % of the draws; the dashed line is the error that is reported. Below stands
-    the share of the draws whose field is determined.
-    """
-    with _panels.styled_figure((6.4, 4.8), layout="constrained") as figure:
-        above, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1])
-        values, plans = _draw_sweep(above, sweep)
-        above.legend()
-        above.set_title(plans[0].title)
-        shares = [100 * plan.determined_share for plan in plans]
-        below.plot(values, shares, "s-", color=QUIET_COLOUR)
-        below.set_ylim(-5, 105)
-        below.set_ylabel("determined\n(% of draws)")
-        below.set_xlabel(_axis_of(sweep))
-    return figure
-
-
-def draw_errors(
-    axes: Axes, content: ExperimentPlan | ExperimentSweep, ink: str = QUIET_COLOUR
-) -> None:
-    """Draw the errors made and reported, of each draw of a plan or of each value of a sweep.
-
-    The ink is the colour of the errors reported.
-    """
-    if isinstance(content, ExperimentSweep):
-        _draw_sweep(axes, content, ink)
-        axes.set_xlabel(_axis_of(content))
-    else:
-        _draw_draws(axes, content, ink)
-    axes.legend(fontsize=7)
-
-
-def _draw_sweep(
-    axes: Axes, sweep: ExperimentSweep, ink: str = QUIET_COLOUR
-) -> tuple[FloatArray, list[ExperimentPlan]]:
-    """Draw the errors over the values; return these in their order, and the plans."""
-    order = np.argsort(sweep.values)
-    values = np.array(sweep.values)[order]
-    plans = [sweep.plans[k] for k in order]
-    spreads = [plan.error for plan in plans]
-    low, high = ([100 * getattr(each, end) for each in spreads] for end in ("low", "high"))
-    axes.fill_between(values, low, high, color=GOOD_COLOUR, alpha=0.2, label="68 % of the draws")
-    medians = [100 * each.median for each in spreads]
-    axes.plot(values, medians, "o-", color=GOOD_COLOUR, label="error made")
-    totals = [100 * plan.total.median for plan in plans]
-    axes.plot(values, totals, "--", color=ink, label="error reported")
-    axes.set_ylabel("error of the field (%, r.m.s.)")
-    axes.set_ylim(bottom=0)
-    if values[0] > 0 and values[-1] / values[0] > _LOG_RANGE:
-        axes.set_xscale("log")
-        axes.minorticks_off()
-    axes.set_xticks(values, [f"{value:.4g}" for value in values])
-    return values, plans
-
-
-def _axis_of(sweep: ExperimentSweep) -> str:
-    return f"{sweep.title} ({sweep.unit})" if sweep.unit else sweep.title
-
-
-def _draw_draws(axes: Axes, plan: ExperimentPlan, ink: str) -> None:
-    """Errors made and reported in each draw; draws that are not determined in another colour."""
+def draw_errors(axes: Axes, plan: ExperimentPlan, ink: str = QUIET_COLOUR) -> None:
+    """Draw the errors made and reported in each draw; the ink is the colour of those reported."""
     from matplotlib.ticker import MaxNLocator
 
     numbers = [shot.number for shot in plan.shots]
@@ -116,6 +47,7 @@ def _draw_draws(axes: Axes, plan: ExperimentPlan, ink: str) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("draw (blue: depends on the beam, orange: doubtful)")
     axes.set_ylabel("error of the field (%)")
+    axes.legend(fontsize=7)
 
 
 def _draw_parts(axes: Axes, plan: ExperimentPlan) -> None:

@@ -248,16 +248,6 @@ def test_a_plan_shows_its_verdict_and_the_first_image(
     assert not tool.plot.isHidden()
 
 
-def test_a_sweep_draws_the_error_at_each_value(tool: Any, qtbot: Any) -> None:
-    tool.quantity.set_kind("counts")
-    enter(tool.quantity.form.entries["values"], "100, 1600")
-    finished(tool, qtbot)
-    line = tool.plot.figure.axes[0].lines[0]
-    np.testing.assert_array_equal(line.get_xdata(), [100, 1600])
-    few, many = line.get_ydata()
-    assert few > 2 * many
-
-
 @pytest.mark.parametrize(
     ("energies", "size", "message"),
     [("3; 15", "64 x 64", "separated by commas"), ("", "64", "expected height and width")],
