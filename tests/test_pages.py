@@ -147,3 +147,20 @@ def test_the_loop_of_the_page_on_plans_shows_what_a_beam_is_worth() -> None:
     names["plt"].close("all")
     errors = [100 * plan.error.median for plan in names["plans"]]
     np.testing.assert_allclose(errors, [7, 17, 78], atol=0.6)
+
+
+def test_the_luminescence_of_a_plate_is_that_of_its_formulas() -> None:
+    (block,) = (each for each in blocks(text_of("docs/reading.md"), "python") if "psl =" in each)
+    names: dict[str, Any] = {}
+    exec(block, names)
+    assert names["psl"][1, 1] == pytest.approx(0.0625 * 10**2.5)
+    np.testing.assert_array_equal(names["mask"], [[True, True], [True, False]])
+    rows = re.findall(r"^\| BAS-(\w+) ((?:\| [\d.]+ ){4})\|$", text_of("docs/reading.md"), re.M)
+    after_an_hour = {}
+    for plate, cells in rows:
+        first, early, second, late = map(float, cells.split("|")[1:])
+        assert first + second == pytest.approx(1)
+        after_an_hour[plate] = first * np.exp(-60 / early) + second * np.exp(-60 / late)
+    expected = {"MS": 0.8558, "SR": 0.4252, "TR": 0.5008, "MP": 0.4527}
+    assert after_an_hour == pytest.approx(expected, abs=5e-5)
+    assert names["left"] == pytest.approx(after_an_hour["TR"])

@@ -1,11 +1,10 @@
-"""Films, CR-39 and image plates: from their scans to doses, counts and luminescence.
+"""Films and CR-39: from their scans to doses and counts.
 
 - corners of films on a scan as tables: `read_corners`, `write_corners`
 - doses: `Calibration`, `dose`, `combined_dose`, `net_optical_density`
 - packs: `Pack`; `napari_shadowinv.pipeline.run_film` evaluates them by the modules `scans`,
   `registration` and `unfolding`
 - CR-39: `Tracks`, `TrackImage`
-- image plates: `fuji_luminescence`, `ge_luminescence`, `fading`
 """
 
 import lazy_loader

@@ -6,23 +6,15 @@ from .calibration import (
     dose,
     net_optical_density,
 )
-from .other_detectors import (
-    Luminescence,
-    TrackImage,
-    Tracks,
-    fading,
-    fuji_luminescence,
-    ge_luminescence,
-)
 from .pack import FilmType, Material, Pack, PackLayer, Slab, Stopping
 from .scans import read_corners, write_corners
+from .tracks import TrackImage, Tracks
 
 __all__ = [
     "Calibration",
     "CombinedDose",
     "DoseMap",
     "FilmType",
-    "Luminescence",
     "Material",
     "Pack",
     "PackLayer",
@@ -32,9 +24,6 @@ __all__ = [
     "Tracks",
     "combined_dose",
     "dose",
-    "fading",
-    "fuji_luminescence",
-    "ge_luminescence",
     "net_optical_density",
     "read_corners",
     "write_corners",

@@ -37,7 +37,7 @@ from napari_shadowinv._system.safety import as_file_errors, check_regular, check
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film.other_detectors import Tracks
+from napari_shadowinv.film.tracks import Tracks
 from napari_shadowinv.io.files import check_promise
 
 _HEADER, _FRAME, _TRACK = struct.Struct("<4i2f6i"), struct.Struct("<10i"), 9
