@@ -27,7 +27,6 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import RunOptions
-from napari_shadowinv.stack import stack_statistics
 
 # %% [markdown]
 # ## The shots
@@ -98,21 +97,22 @@ for name, status in zip(result.name.values, result.status.values, strict=True):
 # Everything stays lazy until it is drawn.
 
 # %%
-done = read(night / "night.shadowinv.zarr")
-statistics = stack_statistics(done).compute()
+store = read(night / "night.shadowinv.zarr")
+done = store.isel(shot=store.status == 1)
+angles = (done.deflection_angle**2).sum("component").max(("y", "x")) ** 0.5
 
 figure = Figure(figsize=(9, 2.8), layout="constrained")
 mean, spread, peaks = figure.subplots(1, 3)
 pixel = 1e3 * setup.object_pixel_size
 extent = (-0.5 * pixel, (shape[1] - 0.5) * pixel, (shape[0] - 0.5) * pixel, -0.5 * pixel)
-for axes, name, title in (
-    (mean, "potential_si_mean", "Mean of the shots"),
-    (spread, "potential_si_std", "Standard deviation"),
+for axes, values, title in (
+    (mean, done.potential_si.mean("shot"), "Mean of the shots"),
+    (spread, done.potential_si.std("shot", ddof=1), "Standard deviation"),
 ):
-    picture = axes.imshow(1e9 * statistics[name], extent=extent)
+    picture = axes.imshow(1e9 * values, extent=extent)
     figure.colorbar(picture, ax=axes, label="Potential (nm)", shrink=0.75)
     axes.set(title=title, xlabel="x (mm)", ylabel="y (mm)")
-peaks.plot(statistics.shot, 1e6 * statistics.deflection_angle_peak, "o-")
+peaks.plot(done.shot, 1e6 * angles, "o-")
 peaks.set(title="Strongest deflection", xlabel="Shot", ylabel="Angle (µrad)", ylim=(0, None))
 figure.savefig(night / "night.png", dpi=120)
 

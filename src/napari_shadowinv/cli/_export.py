@@ -11,6 +11,7 @@ import numpy as np
 
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv._system.tables import write_cells
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
@@ -20,6 +21,7 @@ from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import STATUS_NAMES, StackStore, read_stack
 from napari_shadowinv.io.store_shots import open_shots, parse_shots
+from napari_shadowinv.physics.setup import SETUPS
 from napari_shadowinv.physics.units import display_unit
 from napari_shadowinv.pipeline.rerun import provenance_of
 
@@ -107,14 +109,12 @@ def _write_field(path: Path, shot: xarray.Dataset, setup: Any, overwrite: bool) 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
     """Write one row per shot, done or not, with the peak magnitude of each field."""
-    from napari_shadowinv.stack import stack_statistics
-
-    content = StackStore(store)
-    statistics = stack_statistics(read_stack(store))
+    content, dataset = StackStore(store), read_stack(store)
+    in_si = [field.name for kind in SETUPS.values() for field in kind.si_fields]
     peaks = {
-        f"{name} ({display_unit(values.attrs['units'])})": np.asarray(values)
-        for name, values in statistics.data_vars.items()
-        if str(name).endswith("_peak")
+        f"{name}_peak ({display_unit(dataset[name].attrs['units'])})": _peaks(dataset, name)
+        for name in dict.fromkeys(["potential", "displacement", *in_si])
+        if name in dataset
     }
     headings = {column.key: column.heading for column in content.columns} | {"reason": "reason"}
     statuses, reports, count = content.statuses(), content.reports(), len(content.names)
@@ -128,6 +128,16 @@ def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> 
     with replacing(out, overwrite) as temporary:
         write_cells(temporary, ["shot", "name", "status", *headings.values(), *peaks], cells)
     return out
+
+
+def _peaks(dataset: xarray.Dataset, name: str) -> FloatArray:
+    """Return the largest magnitude of a field in each shot; NaN until a shot is done."""
+    squared = dataset[name].astype(np.float64) ** 2
+    if "component" in squared.dims:
+        squared = squared.sum("component", skipna=False)
+    if "mask" in dataset:
+        squared = squared.where(dataset["mask"] | squared.isnull(), 0.0)
+    return np.asarray(squared.max(("y", "x"), skipna=False) ** 0.5)
 
 
 def protect_store(store: Path, output: Path) -> None:

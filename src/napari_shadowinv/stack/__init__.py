@@ -5,10 +5,9 @@
 - read a shot's file, or one of its colour channels: `read_pixels`
 - watch a folder and invert each shot as soon as it arrives: `watch_stack`
 - what a run reports: `RunStatus`
-- mean, spread and peaks across shots: `stack_statistics`
 """
 
-from napari_shadowinv.stack._lazy import invert_stack, stack_statistics
+from napari_shadowinv.stack._lazy import invert_stack
 from napari_shadowinv.stack._plan import STORED
 from napari_shadowinv.stack._run import RunStatus, run_stack
 from napari_shadowinv.stack._shots import read_pixels
@@ -22,6 +21,5 @@ __all__ = [
     "invert_stack",
     "read_pixels",
     "run_stack",
-    "stack_statistics",
     "watch_stack",
 ]
