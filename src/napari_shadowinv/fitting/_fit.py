@@ -113,7 +113,7 @@ def fit(
     rng = np.random.default_rng(options.seed)
     data = collect_data(shots, fields=fields, instrument=instrument, options=options)
     ensure_compiled(on_progress, should_stop)
-    on_step = report_steps("fit", on_progress, should_stop)
+    on_step = _report_steps(on_progress, should_stop)
     seconds: dict[str, float] = {}
     with measure_time("starts", seconds):
         minima = _search(data, on_step, should_stop)
@@ -193,7 +193,7 @@ def _with_smoothness(
     is_near = data.near is not None
     scene, best = estimate_smoothness(minima.scene, minima.best, rng, on_step, is_near=is_near)
     if data.counted:
-        scene = reweight_counts(data, scene, best)
+        scene = _reweight_counts(data, scene, best)
         best = settle_minimum(scene, best, on_step)
     return replace(minima, scene=scene, ends=[best, *minima.ends[1:]])
 
@@ -250,12 +250,10 @@ def _with_cause(
     return replace(pattern, cause=rivals.cause(), tried=rivals.tried)
 
 
-def report_steps(
-    task: str, on_progress: OnProgress | None, should_stop: ShouldStop | None
-) -> OnStep:
-    """Return a callback that reports each step of a task with its number."""
+def _report_steps(on_progress: OnProgress | None, should_stop: ShouldStop | None) -> OnStep:
+    """Return a callback that reports each step with its number."""
     report, numbers = Reporter(on_progress, should_stop), count(1)
-    return lambda stage, objective: report(task, next(numbers), None, stage, objective)
+    return lambda stage, objective: report("fit", next(numbers), None, stage, objective)
 
 
 def compare(
@@ -317,7 +315,7 @@ def compare(
     return tuple(sorted(fits, key=rank))
 
 
-def reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
+def _reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:
     """Return the weights of counts from the expected instead of the recorded counts."""
     unknowns = minimum.in_pixels(1)
     expected = scene.model(unknowns)

@@ -283,7 +283,9 @@ class Fit(Summarised):
     @property
     def normalised_residual(self) -> FloatArray:
         """The residual over σ, shape (L, H, W); NaN where masked."""
-        return normalise_residual(self.residual, self.mask, self.noise)
+        is_plane = self.noise.ndim == self.residual.ndim
+        noise = self.noise if is_plane else self.noise[:, None, None]
+        return np.where(self.mask, self.residual / noise, np.nan)
 
     def _picture(self) -> FloatArray:
         return np.where(self.used, np.hypot(*self.fields[0].displacement), np.nan)
@@ -524,9 +526,9 @@ class Fit(Summarised):
             report=_report_schema().validate_python(json.loads(attributes["report"])),
             options=FitOptions.model_validate_json(attributes["options"]),
             instrument=Instrument.model_validate_json(attributes["instrument"]),
-            setups=setups_in(dataset),
+            setups=_setups(dataset),
             provenance=Provenance.of(attributes, dataset.variables),
-            noise=noise_in(dataset, "noise"),
+            noise=_noise(dataset),
         )
 
 
@@ -571,13 +573,7 @@ def _solution_facts(fit: Fit) -> Iterator[Fact]:
         yield Fact("converged", "Converged", text, Level.FAILED, short="NOT converged")
 
 
-def normalise_residual(residual: FloatArray, mask: BoolArray, noise: FloatArray) -> FloatArray:
-    """Return a residual over the noise, NaN where masked; see `Fit` for the shapes."""
-    noise = noise if noise.ndim == residual.ndim else noise[:, None, None]
-    return np.where(mask, residual / noise, np.nan)
-
-
-def setups_in(dataset: xarray.Dataset) -> tuple[Setup, ...]:
+def _setups(dataset: xarray.Dataset) -> tuple[Setup, ...]:
     """Return the setups of the images in the dataset of a fit."""
     setups = json.loads(dataset.attrs.get("setups", "[]"))
     return tuple(setup_from_dict(values, "the dataset's setups") for values in setups)
@@ -607,11 +603,11 @@ def merge_fields(names: Sequence[str], parts: Sequence[xarray.Dataset]) -> xarra
     return merged
 
 
-def noise_in(dataset: xarray.Dataset, name: str) -> FloatArray:
+def _noise(dataset: xarray.Dataset) -> FloatArray:
     """Return the noise of the images in a dataset, or of their pixels."""
-    noise, shape = numbers_of(dataset, name), dataset["images"].shape
+    noise, shape = numbers_of(dataset, "noise"), dataset["images"].shape
     if noise.shape not in (shape, shape[:1]):
-        raise ValueError(f"{name} has shape {noise.shape}, expected {shape[:1]} or {shape}")
+        raise ValueError(f"noise has shape {noise.shape}, expected {shape[:1]} or {shape}")
     return noise
 
 

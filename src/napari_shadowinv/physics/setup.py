@@ -2,7 +2,7 @@
 
 - describe an experiment: `ProtonSetup`, `OpticalSetup`; any of them: `Setup`, by kind `SETUPS`
 - causes of deflections and quantities of beams, of all kinds: `deflector_titles`,
-  `beam_quantities`; of some setups: `beam_values`
+  `beam_quantities`
 - get it back from a file's content: `setup_from_dict`; with larger pixels: `bin_setup`
 - convert pixels to SI and back: methods of `BeamSetup`; path-integrated fields: of `ProtonSetup`;
   line integrals of the refractive index or the density: of `OpticalSetup`
@@ -25,7 +25,7 @@ proportional to it (∫ln η dz, ∫n dz) are relative to the place where the po
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -438,16 +438,6 @@ def beam_quantities() -> dict[str, BeamQuantity]:
     """Return the quantities that differ between beams, by name, for all kinds of setup."""
     quantities = (kind.beam_quantity() for kind in SETUPS.values())
     return {quantity.name: quantity for quantity in quantities}
-
-
-def beam_values(setups: Sequence[Setup]) -> tuple[BeamQuantity, tuple[float, ...]] | None:
-    """Return the quantity that differs between beams, and its values; None without setups.
-
-    Setups of several kinds have no such quantity.
-    """
-    if len({type(setup) for setup in setups}) != 1:
-        return None
-    return setups[0].beam_quantity(), tuple(setup.beam_value for setup in setups)
 
 
 def setup_from_dict(mapping: Mapping[str, Any], where: str = "setup") -> Setup:
