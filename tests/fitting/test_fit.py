@@ -13,7 +13,7 @@ from helpers.fit_images import Displacement, bump, counted, distance, noisy, on_
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Verdict
-from napari_shadowinv.fitting import Fit, compare, fit
+from napari_shadowinv.fitting import Fit, fit
 from napari_shadowinv.fitting.measurements import strengths_of
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.beam import displacement_from_potential
@@ -350,23 +350,3 @@ def test_nothing_is_taken_twice() -> None:
         fit(shots_of([first, second, 3 * first], strength=[1, 0.9, 0.8]), options=PLAIN)
     with pytest.raises(InputError, match="the source is image 2 itself"):
         fit(shots_of([first, second], strength=[1, 0.9], source=second), options=PLAIN)
-
-
-def test_a_field_that_is_not_there_does_not_make_the_images_likelier() -> None:
-    """Images of B alone, at three energies: B before both, E far behind."""
-    setups = [
-        ProtonSetup(
-            source_object_distance=0.01, object_image_distance=0.3, pixel_size=2e-5, energy=energy
-        )
-        for energy in (5, 10, 20)
-    ]
-    weaker = [setups[0].momentum / setup.momentum for setup in setups]
-    images = [counted(lambda y, x: s * WEAK(y, x), SIZE) for s in weaker]  # noqa: B023
-    options = FitOptions(samples=0, spacing=0.25)
-    shots = shots_of(noisy(images, NOISE), setup=setups, noise=NOISE, source=np.ones(SIZE))
-    fits = compare(shots, options=options)
-    assert [len(each.fields) for each in fits] == [1, 2, 1]
-    assert fits[0].fields[0].name == "B"
-    evidence = [each.report.log_evidence for each in fits]
-    assert abs(evidence[1] - evidence[0]) < 10
-    assert evidence[2] < evidence[0] - 100

@@ -2,7 +2,6 @@
 
 - fit fields, and the beam, to one or several images of one object: `fit`, with `FitOptions`
 - the answer: `Fit`, with a `facts.Verdict` on whether it may be believed
-- which fields explain the images: `compare`
 - the width of the point spread from the beam's source and the detector: `point_spread`
 """
 

@@ -1,4 +1,4 @@
-from ._fit import compare, fit
+from ._fit import fit
 from .result import Basin, Fit, FitReport, FittedField
 from .shots import point_spread
 
@@ -7,7 +7,6 @@ __all__ = [
     "Fit",
     "FitReport",
     "FittedField",
-    "compare",
     "fit",
     "point_spread",
 ]

@@ -1,4 +1,4 @@
-"""The forward model fitted to images: `fit`, and choices of fields compared: `compare`."""
+"""The forward model fitted to images: `fit`."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from napari_shadowinv._system.progress import (
     run_in_parallel,
 )
 from napari_shadowinv._system.validation import as_model
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.exploration import PosteriorSummary, adapt, explore, find_basins
 from napari_shadowinv.fitting.forward import Scene
@@ -45,7 +44,7 @@ from napari_shadowinv.fitting.search import (
     search,
     settle_minimum,
 )
-from napari_shadowinv.fitting.shots import Shots, list_shots
+from napari_shadowinv.fitting.shots import Shots
 from napari_shadowinv.fitting.starts import collect_starts
 from napari_shadowinv.fitting.summary import field_errors, report_of, summarise
 from napari_shadowinv.fitting.verdict import VerdictLimits
@@ -254,65 +253,6 @@ def _report_steps(on_progress: OnProgress | None, should_stop: ShouldStop | None
     """Return a callback that reports each step with its number."""
     report, numbers = Reporter(on_progress, should_stop), count(1)
     return lambda stage, objective: report("fit", next(numbers), None, stage, objective)
-
-
-def compare(
-    shots: Shots,
-    *,
-    choices: Sequence[Sequence[str]] = (("B",), ("E",), ("B", "E")),
-    decisive: float = 10.0,
-    instrument: Instrument | None = None,
-    options: FitOptions | None = None,
-    on_progress: OnProgress | None = None,
-    should_stop: ShouldStop | None = None,
-) -> tuple[Fit, ...]:
-    """Fit several choices of fields to the same images, to see which explains them.
-
-    Parameters
-    ----------
-    shots, instrument, options, on_progress, should_stop
-        As for `fit`; each shot has its setup.
-    choices : sequence of sequence of str, default B alone, E alone, both
-        Possible causes of the deflection.
-    decisive : float, default 10
-        Difference of the logarithms of evidence.
-
-    Returns
-    -------
-    tuple of Fit
-        One for each choice, the likeliest first, by ``report.log_evidence``; of those nearer to the
-        likeliest than what is decisive, that with the fewest fields comes first.
-
-    Raises
-    ------
-    InputError
-        As `fit`, and if no setups are given.
-    """
-    listed = list_shots(shots)
-    if any(shot.setup is None or shot.strength is not None for shot in listed):
-        raise InputError(
-            "comparing fields needs the setup of each image, and no strengths: how much each field "
-            "displaces follows from the setups"
-        )
-    with_evidence = as_model(FitOptions, options, "options").model_copy(update={"evidence": True})
-    fits = [
-        fit(
-            listed,
-            fields=choice,
-            instrument=instrument,
-            options=with_evidence,
-            on_progress=on_progress,
-            should_stop=should_stop,
-        )
-        for choice in choices
-    ]
-    evidences = {each: each.report.log_evidence or 0.0 for each in fits}
-    least = max(evidences.values()) - decisive
-
-    def rank(one: Fit) -> tuple[float, float]:
-        return (len(one.fields) if evidences[one] > least else np.inf), -evidences[one]
-
-    return tuple(sorted(fits, key=rank))
 
 
 def _reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:

@@ -20,7 +20,7 @@ from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, compare, fit, point_spread
+from napari_shadowinv.fitting import Fit, fit, point_spread
 from napari_shadowinv.fitting.measurements import check_fiducials
 from napari_shadowinv.fitting.shots import (
     NearField,
@@ -187,20 +187,40 @@ def run_comparison(
     recipe: Recipe,
     shots: Sequence[AnyShot],
     *,
+    decisive: float = 10.0,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> tuple[Fit, ...]:
-    """Fit each of the `compared_fields`, otherwise as `run_fit`; the likeliest comes first."""
+    """Fit each of the `compared_fields` to the same images, otherwise as `run_fit`.
+
+    The likeliest comes first, by ``report.log_evidence``; of those nearer to it than what is
+    `decisive`, that with the fewest fields. An `InputError` also refuses images without setups.
+    """
     inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
-    fits = compare(
-        inputs.shots,
-        choices=compared_fields(inputs.setups),
-        instrument=recipe.instrument,
-        options=inputs.choices.options,
-        on_progress=on_progress,
-        should_stop=should_stop,
-    )
-    return tuple(map(inputs.with_provenance, fits))
+    if any(shot.setup is None or shot.strength is not None for shot in inputs.shots):
+        raise InputError(
+            "comparing fields needs the setup of each image, and no strengths: how much each field "
+            "displaces follows from the setups"
+        )
+    options = inputs.choices.options.model_copy(update={"evidence": True})
+    fits = [
+        fit(
+            inputs.shots,
+            fields=choice,
+            instrument=recipe.instrument,
+            options=options,
+            on_progress=on_progress,
+            should_stop=should_stop,
+        )
+        for choice in compared_fields(inputs.setups)
+    ]
+    evidences = {each: each.report.log_evidence or 0.0 for each in fits}
+    least = max(evidences.values()) - decisive
+
+    def rank(one: Fit) -> tuple[float, float]:
+        return (len(one.fields) if evidences[one] > least else np.inf), -evidences[one]
+
+    return tuple(map(inputs.with_provenance, sorted(fits, key=rank)))
 
 
 def collect_fit_inputs(
