@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -165,22 +164,6 @@ def test_the_setups_know_energy_depth_and_pixel(truth: Truth, doses, tmp_path: P
     first, last = doses.times_of_flight[:: COUNT - 1]
     assert 0.4e-9 < first < 0.42e-9
     assert last < first
-
-
-def test_layers_in_pradformat_hold_their_setups(truth: Truth, doses, tmp_path: Path) -> None:
-    table = write_layers(doses, tmp_path / "layers", form="pradformat")[-1]
-    for layer, row in enumerate(table_rows(table)):
-        layer_image = read(row.file)
-        used = doses.usable[layer]
-        np.testing.assert_array_equal(layer_image.image[used], doses.fluence[layer][used])
-        assert layer_image.setup.energy == pytest.approx(doses.energies[layer])
-        assert layer_image.setup.object_pixel_size == pytest.approx(
-            truth.scene.pixel_size, rel=1e-3
-        )
-        assert row.setup is None
-    bare = replace(doses, setups=())
-    with pytest.raises(InputError, match="pradformat needs a setup"):
-        write_layers(bare, tmp_path / "other", form="pradformat")
 
 
 def test_it_is_written_and_read(doses, tmp_path: Path) -> None:

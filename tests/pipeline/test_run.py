@@ -7,6 +7,7 @@ import typing
 from pathlib import Path
 from typing import Any
 
+import h5py
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -31,7 +32,6 @@ from napari_shadowinv.cli._settings import (
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import number_of_sites
 from napari_shadowinv.io import read_shot
-from napari_shadowinv.io.pradformat import write_shot
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
@@ -437,7 +437,17 @@ def test_a_setup_of_the_shot_precedes_the_recipe_and_that_of_its_file_does_not(
     ours, file, theirs = (
         paper_setup().model_copy(update={"energy": energy}) for energy in (3.0, 9.0, 15.0)
     )
-    write_shot(tmp_path / "shot.h5", image, file, "shot")
+    with h5py.File(tmp_path / "shot.h5", "w") as written:
+        written["image"] = image
+        written.attrs.update(
+            object_type="radiograph",
+            pradformat_version="0.2.0",
+            pixel_width=file.object_pixel_size * file.magnification,
+            source_object_dist=file.source_object_distance,
+            object_image_dist=file.object_image_distance,
+            spec_name="p+",
+            spec_energy=1e6 * file.energy,
+        )
     recorded = read_shot(tmp_path / "shot.h5")
     recipe, shot = Recipe(setup=theirs, options=OPTIONS), Shot(image, ours)
     assert collect_inputs(recipe, shot).shot.setup == ours

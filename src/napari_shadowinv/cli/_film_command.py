@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from typer import Option
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.film_doses import FilmDoses
 
-LayersFormat = Literal["tiff", "pradformat"]
 # Help of options, where it is longer than a line.
 HELP = {
     "pack": "TOML file with the layers of the pack and their scans.",
@@ -41,21 +39,10 @@ Exit codes: 0 written; 1 no figure; 2 invalid input, nothing written; 130 cancel
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class LayerFlags:
-    """Flags of the layers' images."""
-
-    layers: Annotated[Path | None, Option(help=HELP["layers"])] = None
-    layers_format: Annotated[
-        LayersFormat, Option(metavar="tiff|pradformat", help="Format of the layers' images.")
-    ] = "tiff"
-
-
 @notify_errors
-@_flags.takes_flags
 def film(
-    flags: LayerFlags,
     pack: Annotated[Path | None, _flags.argument(help=HELP["pack"])] = None,
+    layers: Annotated[Path | None, Option(help=HELP["layers"])] = None,
     corners: Annotated[Path | None, Option("--save-corners", help=HELP["corners"])] = None,
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
@@ -97,7 +84,7 @@ def film(
         )
     result, figure = result_and_figure(pack, out, figure)
     outputs.check_result(ResultKind.FILM_DOSES, result, figure)
-    table = None if flags.layers is None else flags.layers / LAYERS_TABLE
+    table = None if layers is None else layers / LAYERS_TABLE
     replaced = table if table is not None and table.exists() else None
     outputs.check([(corners, SITES.suffixes), (replaced, SITES.suffixes)], [])
     content = read_pack(pack)
@@ -105,8 +92,8 @@ def film(
     with work_callbacks(quiet) as callbacks:
         doses = run_film(content, **callbacks)
     outputs.write_result(doses, [str(pack)], result, figure)
-    if flags.layers is not None:
-        files = write_layers(doses, flags.layers, form=flags.layers_format, overwrite=overwrite)
+    if layers is not None:
+        files = write_layers(doses, layers, overwrite=overwrite)
         outputs.files.append(files[-1])
     if corners is not None:
         corners_by_film = {

@@ -162,6 +162,8 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
 
     Of a fit's other parts, only the verdict is kept, in the description.
     """
+    import h5py
+
     check_pradformat_fields(json.loads(dataset.attrs.get("fields", "[]")))
     refuse_missing(dataset, "result of an inversion", ("displacement", "potential"))
     setup = check_pradformat_setup(setup_from_dataset(dataset))
@@ -172,7 +174,14 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         "object_type": "inversion",
         "inversion_type": "simple",
         "dr": setup.object_pixel_size,
-        **_beam_attributes(setup),
+        "pradformat_version": _VERSION,
+        "source_object_dist": setup.source_object_distance,
+        "object_image_dist": setup.object_image_distance,
+        "spec_name": _SYMBOLS[setup.species],
+        "spec_mass": setup.particle.mass,
+        "spec_charge": setup.particle.charge,
+        "spec_energy": setup.energy * constants.mega,
+        "file_date": datetime.now(UTC).date().isoformat(),
     }
     method = ResultKind.of(dataset.attrs).noun.capitalize()
     verdict = dataset.attrs.get("verdict")
@@ -186,38 +195,6 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         attributes["provenance"] = provenance.to_json()
         if provenance.images and provenance.image.file:
             attributes["radiograph_filename"] = provenance.image.file
-    _write_object(path, datasets, attributes)
-
-
-def write_shot(path: Path, image: AnyArray, setup: Setup, description: str) -> None:
-    """Write an image, proportional to the fluence, as a pradformat radiograph."""
-    proton_setup = check_pradformat_setup(setup)
-    attributes = {
-        "object_type": "radiograph",
-        "pixel_width": proton_setup.object_pixel_size * proton_setup.magnification,
-        **_beam_attributes(proton_setup),
-        "description": description,
-    }
-    _write_object(path, {"image": image}, attributes)
-
-
-def _beam_attributes(setup: Any) -> dict[str, Any]:
-    """Return the attributes of the beam and the distances that every object has."""
-    return {
-        "pradformat_version": _VERSION,
-        "source_object_dist": setup.source_object_distance,
-        "object_image_dist": setup.object_image_distance,
-        "spec_name": _SYMBOLS[setup.species],
-        "spec_mass": setup.particle.mass,
-        "spec_charge": setup.particle.charge,
-        "spec_energy": setup.energy * constants.mega,
-        "file_date": datetime.now(UTC).date().isoformat(),
-    }
-
-
-def _write_object(path: Path, datasets: dict[str, AnyArray], attributes: dict[str, Any]) -> None:
-    import h5py
-
     with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
         for name, values in datasets.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=4)

@@ -24,8 +24,7 @@ from napari_shadowinv.film.pack import FILM_TYPES
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_toml, replacing, write
 from napari_shadowinv.io.files import in_counting_order, make_folder, write_toml
-from napari_shadowinv.io.formats import PRADFORMAT, SCAN_SUFFIXES, SITES, TIFF
-from napari_shadowinv.io.pradformat import write_shot
+from napari_shadowinv.io.formats import SCAN_SUFFIXES, SITES, TIFF
 
 LAYERS_TABLE = f"layers{SITES.suffix}"
 _COLUMNS = ("file", "mask", "setup", "energy", "strength", "exclude")
@@ -61,7 +60,6 @@ def write_layers(
     doses: FilmDoses,
     folder: Path,
     *,
-    form: Literal["tiff", "pradformat"] = "tiff",
     overwrite: bool = False,
 ) -> list[Path]:
     """Write the fluence of each layer as an image, its mask, its setup, and a table of them.
@@ -76,8 +74,6 @@ def write_layers(
         Result of `run_film`.
     folder : Path
         Created if it does not exist.
-    form : {"tiff", "pradformat"}
-        Format of the images. Files in pradformat contain their setups.
 
     Returns
     -------
@@ -88,31 +84,19 @@ def write_layers(
     ------
     FileFormatError
         If a file exists, unless `overwrite`, or cannot be written.
-    InputError
-        If the doses have no setup, which pradformat needs.
     """
     make_folder(folder)
-    setups = doses.setups
-    if form == "pradformat" and not setups:
-        raise InputError("pradformat needs a setup: give the pack's distances, or write TIFF")
-    rows = []
+    setups, rows = doses.setups, []
     for k, used in enumerate(doses.usable):
         name = f"layer_{k + 1:02d}"
-        row = {"mask": f"{name}_mask{TIFF.suffix}"}
+        row = {"mask": f"{name}_mask{TIFF.suffix}", "file": f"{name}{TIFF.suffix}"}
         fluence = np.where(used, doses.fluence[k], 0.0)
         write(folder / row["mask"], used.astype(np.float32), overwrite=overwrite)
-        if form == "pradformat":
-            row["file"] = f"{name}{PRADFORMAT.suffix}"
-            description = f"Film {k + 1} of a pack, fluence in protons per m² and MeV"
-            with replacing(folder / row["file"], overwrite) as temporary:
-                write_shot(temporary, fluence, setups[k], description)
-        else:
-            row["file"] = f"{name}{TIFF.suffix}"
-            write(folder / row["file"], fluence, overwrite=overwrite)
-        if setups and form == "tiff":
+        write(folder / row["file"], fluence, overwrite=overwrite)
+        if setups:
             row["setup"] = f"{name}.toml"
             write_toml(folder / row["setup"], setups[k].model_dump(), overwrite)
-        elif not setups:
+        else:
             row["energy"] = f"{doses.energies[k]:.6g}"
             row["strength"] = f"{doses.strengths[k]:.6g}"
         if not used.any():
