@@ -72,8 +72,8 @@ class Calibration:
     --------
     >>> grey = np.array([[40000.0], [4000.0], [400.0]])
     >>> film = Calibration(np.array([1.0, 10.0, 100.0]), np.repeat(grey, 3, axis=1))
-    >>> film.optical_density([1.0, 10.0, 100.0]), film.dose_range()
-    (array([0., 1., 2.]), (1.0, 100.0))
+    >>> film.curve()
+    (array([0., 1., 2.]), array([  1.,  10., 100.]))
     """
 
     doses: FloatArray
@@ -155,6 +155,8 @@ class Calibration:
     def curve(self, channel: str = "red") -> tuple[FloatArray, FloatArray]:
         """Return net optical density and dose of one channel, both strictly increasing, shape (m,).
 
+        The density is linear in the logarithm of the dose between films; `dose` is its inverse.
+
         Neighbours that noise put in the wrong order count as one film, with their mean density and
         geometric mean dose.
         """
@@ -174,11 +176,6 @@ class Calibration:
             )
         return density, 10 ** (np.add.reduceat(logarithms, blocks[:-1]) / count)
 
-    def dose_range(self, channel: str = "red") -> tuple[float, float]:
-        """Return the smallest and the largest dose that a channel can measure."""
-        doses = self.curve(channel)[1]
-        return float(doses[0]), float(doses[-1])
-
     def log_error(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
         """Return the standard deviation of the logarithm of a dose measured in one pixel."""
         column = _channel_index(channel)
@@ -190,15 +187,6 @@ class Calibration:
         slope = np.gradient(np.log(table_doses), density)
         error = np.maximum(spread, 1e-4) * slope  # of the density, where the table has none
         return np.asarray(np.interp(np.log(np.asarray(doses, float)), np.log(table_doses), error))
-
-    def optical_density(self, doses: ArrayLike, channel: str = "red") -> FloatArray:
-        """Return the net optical density of doses, constant beyond the range's ends.
-
-        It is linear in the logarithm of the dose between films; `dose` is its inverse.
-        """
-        density, table_doses = self.curve(channel)
-        logarithms = np.log10(np.asarray(doses, float))
-        return np.asarray(np.interp(logarithms, np.log10(table_doses), density))
 
 
 def net_optical_density(
