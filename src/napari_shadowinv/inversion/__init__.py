@@ -1,7 +1,7 @@
 """Inversion of an image to its deflection potential.
 
 - invert an image: `invert`
-- prepare the sites once for many images with one source: `plan_sites`; how many: `count_sites`
+- prepare the sites once for many images with one source: `plan_sites`
 - results: `Inversion`, with a `Report`, and the `Cells` that the solver found
 """
 

@@ -1,4 +1,4 @@
-from ._invert import count_sites, invert, plan_sites
+from ._invert import invert, plan_sites
 from .error_bars import ErrorSamples, Maximum, Quantity
 from .error_budget import ErrorBudget
 from .result import Cells, Inversion, Report
@@ -11,7 +11,6 @@ __all__ = [
     "Maximum",
     "Quantity",
     "Report",
-    "count_sites",
     "invert",
     "plan_sites",
 ]

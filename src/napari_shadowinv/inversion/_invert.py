@@ -1,4 +1,4 @@
-"""Inversion of an image to its deflection potential: `invert`, `plan_sites`, `count_sites`."""
+"""Inversion of an image to its deflection potential: `invert`, `plan_sites`."""
 
 from __future__ import annotations
 
@@ -121,16 +121,6 @@ def _plan(
         threads=options.threads,
     ).levels
     return SitePlan(domain.source, levels, domain.mask, domain.margin, domain.unit, measured)
-
-
-def count_sites(
-    source: ArrayLike, options: InversionOptions, *, mask: ArrayLike | None = None
-) -> int:
-    """Return the largest number of sites that `plan_sites` places, including a margin."""
-    if options.boundary != "free":
-        height, width = np.shape(source)
-        return normalise.number_of_sites((height, width), options)
-    return _site_domain(source, options, mask).n_sites
 
 
 class _SiteDomain(NamedTuple):
