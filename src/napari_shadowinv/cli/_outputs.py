@@ -77,13 +77,14 @@ class Outputs:
         self,
         kind: ResultKind,
         result: Path,
-        *figures: Path,
+        figure: Path,
+        *,
         recipe: Path | None = None,
         inputs: Iterable[Path | None] = (),
     ) -> None:
-        """Add a result with its figures and its recipe, as `check` does."""
-        pages: list[Output] = [(figure, FIGURE_SUFFIXES) for figure in figures]
-        self.check([(result, suffixes_for(kind)), *pages, (recipe, (".toml",))], inputs)
+        """Add a result with its figure and its recipe, as `check` does."""
+        page = figure, FIGURE_SUFFIXES
+        self.check([(result, suffixes_for(kind)), page, (recipe, (".toml",))], inputs)
 
     def protect(self, inputs: Iterable[Path | None]) -> None:
         """Refuse to overwrite an input, even with --overwrite, or to write a file twice."""
