@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from helpers.fit_images import without_causes
 from helpers.pages import run_python, text_of
 from helpers.public_data import public_file, public_names
 from napari_shadowinv._typing import FloatArray
@@ -96,11 +97,10 @@ def blank_pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.fixture
-def no_causes(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_causes() -> Iterator[None]:
     """Seek no causes of a misfit, which takes longer than the fit."""
-    monkeypatch.setattr(
-        "napari_shadowinv.fitting._fit._with_cause", lambda data, minima, pattern, on_step: pattern
-    )
+    with without_causes():
+        yield
 
 
 def invert_exactly(shape: tuple[int, int], **report: object) -> Inversion:

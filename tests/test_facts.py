@@ -12,6 +12,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
+from helpers.fit_images import without_causes
 from napari_shadowinv import (
     FitOptions,
     InputError,
@@ -54,14 +55,17 @@ def inversion(image):
 def hasty(image):
     """A fit of one image that has hardly begun."""
     options = FitOptions(samples=0, max_iterations=2, spacing=0.25)
-    return fit(shots_of([image], noise=0.01), options=options)
+    with without_causes():
+        return fit(shots_of([image], noise=0.01), options=options)
 
 
 @pytest.fixture(scope="module")
 def fitted(image):
     """A fit of two images, with samples."""
     options = FitOptions(samples=3, max_iterations=20, spacing=0.25)
-    return fit(shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01), options=options)
+    shots = shots_of([image, image[::-1]], strength=[1, 0.8], noise=0.01)
+    with without_causes():
+        return fit(shots, options=options)
 
 
 @pytest.fixture(scope="module")

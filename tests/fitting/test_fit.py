@@ -231,6 +231,7 @@ def test_an_object_that_has_moved_between_the_images_is_told(
     assert result.chi2[1] > 2
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
     """Where rays cross over much of the image, that is too little."""
     strong = bump(3.2, 8, (23, 27))
@@ -271,6 +272,7 @@ def test_a_mask_of_all_images_is_the_mask_of_each() -> None:
     assert distance(by_all.fields[0].displacement, truth) < 0.1
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_a_fit_that_runs_out_of_steps_says_so() -> None:
     image = noisy([counted(bump(1.2, 8, (22, 29)), SIZE)], 0.004)[0]
     for steps in (1, 100):

@@ -114,11 +114,8 @@ def test_dead_pixels_are_left_out(shots: list[FloatArray]) -> None:
     np.testing.assert_allclose(result.chi2, np.array(used) / NOISE**2)
 
 
-@pytest.mark.parametrize("shift", [(0.3, -0.4), (1.2, -2.0)])
-def test_a_shifted_image_is_brought_back(
-    shots: list[FloatArray], shift: tuple[float, float]
-) -> None:
-    frame = (shift[0], 1, 0, shift[1], 0, 1)
+def test_a_shifted_image_is_brought_back(shots: list[FloatArray]) -> None:
+    frame = (1.2, 1, 0, -2.0, 0, 1)
     result = fitted(noisy([shots[0], shot(1, frame=frame)], NOISE), align="shift")
     np.testing.assert_allclose(result.frames[1], frame, atol=0.1)
     np.testing.assert_array_equal(result.frames[0], [0, 1, 0, 0, 0, 1])
@@ -174,6 +171,7 @@ def test_counts_are_weighted_by_what_is_expected(shots: list[FloatArray]) -> Non
     assert result.reprojection.mean() == pytest.approx(np.mean(counts), rel=0.02)
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_answers_to_few_counts_are_compared_by_what_is_expected() -> None:
     """As if the noise had been given; dim pixels count too much if weighted by their counts."""
     size = (64, 64)

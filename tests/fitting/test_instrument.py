@@ -8,7 +8,15 @@ from functools import cache
 import numpy as np
 import pytest
 
-from helpers.fit_images import bump, counted, distance, fit_images, noisy, on_pixels
+from helpers.fit_images import (
+    bump,
+    counted,
+    distance,
+    fit_images,
+    noisy,
+    on_pixels,
+    without_causes,
+)
 from napari_shadowinv import Instrument, ProtonSetup
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.facts import Verdict, percent
@@ -21,11 +29,14 @@ from napari_shadowinv.instrument.shapes import Shapes
 from napari_shadowinv.options import BeamPrior, FitOptions
 from napari_shadowinv.shot import shots_of
 
+pytestmark = pytest.mark.usefixtures("no_causes")
+
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
 NOISE = 0.03
 RING = bump(3.0, 5.5, (23, 29), tall=1.2)
 FEW = FitOptions(samples=4, max_iterations=20, spacing=0.25, threads=1)
+HASTY = FEW.model_copy(update={"samples": 2, "max_iterations": 5})
 EXACT_BEAM = {"beam_rms": 0.0}
 
 
@@ -49,20 +60,21 @@ def fitted(images: FloatArray, instrument: Instrument | None, **keywords: object
 @pytest.fixture(scope="module")
 def plain() -> Fit:
     """Fit of images of a perfect instrument, which is taken for perfect."""
-    return fitted(shots(), Instrument(**EXACT_BEAM))
+    with without_causes():
+        return fitted(shots(), Instrument(**EXACT_BEAM))
 
 
 @pytest.fixture(scope="module")
 def assumed() -> Fit:
     """Fit of the same images with the usual assumption of a beam."""
-    return fitted(shots(), Instrument())
+    with without_causes():
+        return fitted(shots(), Instrument(), options=HASTY)
 
 
 def error(result: Fit) -> float:
     return distance(result.fields[0].displacement, on_pixels(RING, SIZE))
 
 
-@pytest.mark.usefixtures("no_causes")
 @pytest.mark.parametrize(
     ("imperfection", "instrument", "key"),
     [
@@ -84,7 +96,6 @@ def test_two_energies_determine_what_is_stated(
     assert aware.total_error > aware.errors.shares["noise"] > 0
 
 
-@pytest.mark.usefixtures("no_causes")
 def test_a_point_spread_wider_than_stated_is_found() -> None:
     images = shots(blur=1.6)
     aware = fitted(images, Instrument(**EXACT_BEAM, blur=1.3), psf=1.0)
@@ -95,7 +106,7 @@ def test_a_point_spread_wider_than_stated_is_found() -> None:
 
 def test_an_instrument_without_numbers_changes_no_bit(assumed: Fit) -> None:
     for instrument in (None, Instrument(energy=0.05)):
-        other = fitted(shots(), instrument)
+        other = fitted(shots(), instrument, options=HASTY)
         np.testing.assert_array_equal(other.fields[0].displacement, assumed.fields[0].displacement)
         assert (other.verdict, other.total_error) == (assumed.verdict, assumed.total_error)
 
@@ -147,7 +158,7 @@ def test_the_mean_of_an_inexact_beam_is_not_known(instrument: dict[str, float]) 
 
 def test_errors_have_a_part_for_all_that_is_stated() -> None:
     instrument = Instrument(beam=BeamPrior(rms=0.02, length=0.5, between=0.01), background=0.02)
-    result = fitted(shots(), instrument)
+    result = fitted(shots(), instrument, options=HASTY)
     parts = result.errors.shares
     assert parts.keys() - {"edge"} == {"noise", "beam", "background"}
     assert list(parts.values()) == sorted(parts.values(), reverse=True)
@@ -203,7 +214,7 @@ def test_energy_adds_to_the_errors_of_fields_in_si_units_alone() -> None:
         for energy in (3.0, 8.0)
     ]
     images = noisy([counted(lambda y, x, a=a: a * RING(y, x), SIZE) for a in (1, 0.61)], NOISE)
-    keywords = {"strength": None, "setup": setups}
+    keywords = {"strength": None, "setup": setups, "options": HASTY}
     result = fitted(images, Instrument(energy=0.1), **keywords)
     (field,) = result.fields
     in_pixels, in_si = (result.peak_error(field, setup) for setup in (None, setups[0]))
@@ -217,12 +228,11 @@ def test_energy_adds_to_the_errors_of_fields_in_si_units_alone() -> None:
 
 
 def test_stated_correlation_of_noise_widens_the_errors(assumed: Fit) -> None:
-    correlated = fitted(shots(), Instrument(noise_correlation=1.0))
+    correlated = fitted(shots(), Instrument(noise_correlation=1.0), options=HASTY)
     by_noise = [result.errors.shares["noise"] for result in (correlated, assumed)]
     assert by_noise[0] == pytest.approx(np.sqrt(4 * np.pi) * by_noise[1])
 
 
-@pytest.mark.usefixtures("no_causes")
 def test_each_fit_states_its_sensitivities(plain: Fit) -> None:
     """By as much as fits of changed images move."""
     names = {name.partition(",")[0] for name in plain.errors.sensitivities}

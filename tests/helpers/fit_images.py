@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import fields
 from typing import Any
 
 import numpy as np
+import pytest
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting import Fit, fit
+from napari_shadowinv.fitting import Fit, _fit, fit
 from napari_shadowinv.fitting.forward import Linear
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.shot import Shot, shots_of
@@ -26,6 +28,7 @@ __all__ = [
     "of_each",
     "on_pixels",
     "together",
+    "without_causes",
 ]
 
 _PARTS = 4  # of a pixel, each way, in which light is spread
@@ -124,6 +127,14 @@ def hessian_times(linear: Linear, change: Unknowns) -> Unknowns:
     only_free = linear.scene._only_free
     free = only_free(change)
     return only_free(linear.scene.prior.times(free)).plus(linear.normal_times(free))
+
+
+@contextmanager
+def without_causes() -> Iterator[None]:
+    """Seek no causes of a misfit in fits: for fixtures that several tests share."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_fit, "_with_cause", lambda data, minima, pattern, on_step: pattern)
+        yield
 
 
 def fit_images(images: Any, **keywords: Any) -> Fit:
