@@ -58,7 +58,6 @@ from napari_shadowinv.preprocessing import (
     polynomial_source,
     remove_background,
 )
-from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.shot import Shot
 
 SHAPE = (40, 52)
@@ -89,7 +88,9 @@ def assert_same(one: Any, other: Any, rtol: float = 0.0) -> None:
 
 
 def test_without_steps_it_is_invert(image: FloatArray) -> None:
-    assert_same(run(Recipe(options=OPTIONS), image), invert(image, options=OPTIONS))
+    free = InversionOptions(boundary="free", flux="known")
+    for options in (OPTIONS, InversionOptions(), free):  # the latter choose their sites
+        assert_same(run(Recipe(options=options), image), invert(image, options=options))
     beam = np.full_like(image, 90)
     mask = np.ones(SHAPE, bool)
     mask[5, 7] = False
@@ -171,20 +172,6 @@ def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step,
         ratio = inversion.source[used] / moved.image[used]
         # The source sees the same solid angle, up to the curvature within rotated pixels.
         np.testing.assert_allclose(ratio, ratio.mean(), rtol=2e-4)
-
-
-def test_masks_of_random_pixels_are_kept_whole_beside_the_result(image: FloatArray) -> None:
-    mask, source_mask = np.random.default_rng(0).random((2, *image.shape)) > 0.1
-    source_mask[8:12, 8:14] = False
-    recipe = Recipe(source=PolynomialEstimate(degree=0), options=OPTIONS)
-    dataset = run(recipe, Shot(image, mask=mask, source_mask=source_mask)).to_dataset()
-    provenance = Provenance.of(dataset.attrs, dataset.variables)
-    assert provenance is not None
-    origin = provenance.image
-    for index, expected in ((origin.mask, mask), (origin.source_mask, source_mask)):
-        kept = provenance.mask_of(index)
-        assert kept is not None
-        np.testing.assert_array_equal(kept.mask(), expected)
 
 
 @pytest.mark.parametrize("n_bad", [0, 9])
@@ -331,14 +318,6 @@ def test_cache_spares_work_without_changing_results(image: FloatArray) -> None:
     assert preview.provenance is not None
     assert preview.provenance.image.notes == ("previewed",)
     assert_same(run(recipe, image, cache=cache), first)
-
-
-def test_run_and_invert_have_the_same_default_sites(image: FloatArray) -> None:
-    for options in (InversionOptions(), InversionOptions(boundary="free", flux="known")):
-        assert_same(
-            run(Recipe(options=options), Shot(image, source=image.mean() + 0 * image)),
-            invert(image, source=image.mean() + 0 * image, options=options),
-        )
 
 
 @pytest.mark.parametrize(
