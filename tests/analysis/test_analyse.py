@@ -332,7 +332,8 @@ def test_masked_pixels_under_a_line_are_reported(ring: Phantom):
     image = 400 * synthetic_image(ring.displacement)
     mask = np.ones(image.shape, bool)
     mask[28:36, 5:20] = False
-    inversion = invert(np.random.default_rng(0).poisson(image), mask=mask)
+    counts = np.random.default_rng(0).poisson(image)
+    inversion = invert(counts, mask=mask, options={"n_sites": 900})
     (result,) = analyse(inversion, LINE, samples=20)
     caution = next(fact for fact in result.facts if fact.key == "mask")
     assert "of the line is at masked pixels" in caution.text

@@ -109,7 +109,7 @@ def test_thin_filaments_are_measured_without_the_error_of_pixels():
     exact = np.array([measured(potential, displacement)[name].value for name in NUMBERS])
     image = synthetic_image(displacement)
     source = np.full(image.shape, 100.0)
-    (clean,) = analyse(invert(100 * image, source=source), Filaments(), setup=SETUP)
+    (clean,) = analyse(invert(100 * image, source=source), Filaments(), setup=SETUP, samples=20)
     np.testing.assert_allclose([clean[name].value for name in NUMBERS], exact, rtol=0.015)
     noisy_image = np.random.default_rng(1).poisson(100 * image).astype(float)
     (noisy,) = analyse(invert(noisy_image, source=source), Filaments(), setup=SETUP)

@@ -34,7 +34,6 @@ from napari_shadowinv.pipeline import run
 from napari_shadowinv.preprocessing import (
     ESTIMATES,
     LowPassFilter,
-    PolynomialEstimate,
     Recipe,
     polynomial_source,
 )
@@ -61,14 +60,14 @@ def pair():
 PHANTOMS = {phantom.__name__: phantom for phantom in (focusing, strong, pair)}
 
 
-@pytest.fixture(scope="module", params=PHANTOMS)
-def phantom(request):
-    return PHANTOMS[request.param]()
-
-
 @pytest.fixture(scope="module")
-def image(phantom):
-    return synthetic_image(phantom.displacement)
+def image():
+    return synthetic_image(focusing().displacement)
+
+
+@pytest.fixture(scope="module", params=PHANTOMS)
+def each_image(request):
+    return synthetic_image(PHANTOMS[request.param]().displacement)
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +127,7 @@ def repeated(image, noise):
 
 @pytest.mark.parametrize(
     ("every_image", "noise"),
-    [*((name, gaussian) for name in PHANTOMS), *((name, counting) for name in EVERY_IMAGE)],
+    [("focusing", gaussian), *((name, counting) for name in EVERY_IMAGE)],
     indirect=["every_image"],
 )
 def test_noise_is_the_scatter_of_repeats(repeats, every_image, noise):
@@ -139,10 +138,14 @@ def test_noise_is_the_scatter_of_repeats(repeats, every_image, noise):
         assert inversion.errors.noise.rms == pytest.approx(scatter, rel=0.3)
 
 
-@pytest.mark.parametrize("noise", [gaussian, counting])
-def test_noise_at_the_peak_is_the_scatter_there(repeats, image, noise):
-    inversions, moves = repeats(image, noise, count=50)
-    place = np.unravel_index(np.hypot(*moves.mean(axis=0)).argmax(), image.shape)
+@pytest.mark.parametrize(
+    ("every_image", "noise"),
+    [("focusing", gaussian), ("strong", counting), ("pair", counting)],
+    indirect=["every_image"],
+)
+def test_noise_at_the_peak_is_the_scatter_there(repeats, every_image, noise):
+    inversions, moves = repeats(every_image, noise, count=50)
+    place = np.unravel_index(np.hypot(*moves.mean(axis=0)).argmax(), every_image.shape)
     at_peak = np.hypot(*moves[:, :, *place].T).std(ddof=1)
     estimated = np.mean([inversion.errors.noise.at_peak for inversion in inversions])
     # At one pixel, 50 repeats determine the scatter to 10 %.
@@ -199,9 +202,9 @@ def test_discretisation_is_the_change_by_many_more_sites(every_image):
         assert true / 2 < few.errors.discretisation.rms < 2 * true
 
 
-def test_the_solvers_part_is_the_change_by_a_better_solution(image):
+def test_the_solvers_part_is_the_change_by_a_better_solution(each_image):
     loose, exact = (
-        invert(image, options=InversionOptions(n_sites=2000, tolerance=tolerance))
+        invert(each_image, options=InversionOptions(n_sites=2000, tolerance=tolerance))
         for tolerance in (0.02, 1e-9)
     )
     true = rms(loose.displacement - exact.displacement)
@@ -209,22 +212,15 @@ def test_the_solvers_part_is_the_change_by_a_better_solution(image):
     assert exact.errors.effects["solver"].rms < 1e-3 * true
 
 
-def test_the_error_by_an_unmeasured_beam_is_that_by_other_beams(image):
+def test_the_error_by_an_unmeasured_beam_is_that_by_other_beams(each_image):
     """Beams that are drawn here, in another way, with the same spectrum."""
     options = InversionOptions(n_sites=900)
-    unchanged = invert(
-        image, options=options, instrument=Instrument(beam=BeamPrior(rms=0.02, length=0.2))
-    )
-    rng = np.random.default_rng(4)
-    length = 0.2 * min(image.shape)
+    prior = BeamPrior(rms=0.02, length=0.2)
+    unchanged = invert(each_image, options=options, instrument=Instrument(beam=prior))
     moved = []
-    for _ in range(12):
-        white = rng.normal(size=[3 * side for side in image.shape])
-        smooth = gaussian_filter(white, length / np.sqrt(2), mode="wrap")
-        smooth = smooth[: image.shape[0], : image.shape[1]]
-        smooth -= smooth.mean()
-        beam = 1 + 0.02 * smooth / smooth.std()
-        inversion = invert(image, source=beam, options=options)
+    for seed in range(12):
+        beam = smooth_beam(each_image.shape, 0.02, seed, length=0.2)
+        inversion = invert(each_image, source=beam, options=options)
         moved.append(inversion.displacement - unchanged.displacement)
     true = float(np.sqrt(np.mean([rms(change) ** 2 for change in moved])))
     assert unchanged.errors.beam.rms == pytest.approx(true, rel=0.35)
@@ -239,10 +235,10 @@ def test_a_recorded_beam_has_a_sensitivity_and_no_error(image):
     assert assumed.beam == pytest.approx(np.multiply(5, recorded.beam_sensitivity), rel=1e-6)
 
 
-def smooth_beam(shape, variation, seed):
-    """Return a beam that varies over a quarter of the shorter side."""
+def smooth_beam(shape, variation, seed, length=0.25):
+    """Return a beam that varies over a share of the shorter side."""
     white = np.random.default_rng(seed).normal(size=[3 * side for side in shape])
-    smooth = gaussian_filter(white, min(shape) / 4 / np.sqrt(2), mode="wrap")
+    smooth = gaussian_filter(white, length * min(shape) / np.sqrt(2), mode="wrap")
     smooth = smooth[: shape[0], : shape[1]] - smooth[: shape[0], : shape[1]].mean()
     return 1 + variation * smooth / smooth.std()
 
@@ -365,17 +361,17 @@ def test_the_larger_difference_of_beams_counts(stated, recorded, basis):
     assert any(part.startswith(title) for part in errors.parts)
 
 
-def test_accuracy_decides_on_the_sites_and_is_kept(image):
-    finest = invert(image, options=InversionOptions(n_sites=4 * image.size))
+def test_accuracy_decides_on_the_sites_and_is_kept(each_image):
+    finest = invert(each_image, options=InversionOptions(n_sites=4 * each_image.size))
     counts = []
     for accuracy in (0.1, 0.02, 0.005):
-        inversion = invert(image, options=InversionOptions(accuracy=accuracy))
+        inversion = invert(each_image, options=InversionOptions(accuracy=accuracy))
         counts.append(inversion.report.n_sites)
         off = rms(inversion.displacement - finest.displacement) / rms(finest.displacement)
         assert off < 1.5 * accuracy
         assert inversion.report.sites_reason
     assert counts == sorted(counts)
-    assert image.size // 16 < counts[0] <= counts[2] <= image.size
+    assert each_image.size // 16 < counts[0] <= counts[2] <= each_image.size
 
 
 @pytest.mark.parametrize("power", [0.5, 1.0])
@@ -505,7 +501,7 @@ def test_noise_that_was_smoothed_is_not_passed_off_as_measured():
     assert "error_noise" not in error_facts(filtered) | error_facts(stated)
 
 
-@pytest.mark.parametrize("blur", [0.7, 1.0, 2.0])
+@pytest.mark.parametrize("blur", [0.7, 2.0])
 def test_correlated_noise_is_the_scatter_of_repeats(repeats, blur):
     clean = synthetic_image(focusing().displacement)
 
@@ -597,25 +593,9 @@ def test_each_shot_of_a_stack_has_the_sites_that_it_needs(tmp_path):
         report = json.loads(str(store.report.values[index]))
         assert report["n_sites"] == expected.report.n_sites
         assert report["sites_reason"] == expected.report.sites_reason
+        assert report["errors"]["beam"] is None  # as it was recorded
         for stack in (store, lazy):
             np.testing.assert_array_equal(stack.potential[index], expected.potential)
-
-
-def test_every_way_to_an_inversion_knows_whether_the_beam_was_measured(tmp_path):
-    image = synthetic_image(pair().displacement)
-    options = InversionOptions(n_sites=900)
-    uniform = Recipe(options=options)
-    estimated = Recipe(options=options, source=PolynomialEstimate(degree=1))
-    assert run(uniform, image).errors.beam is not None
-    assert run(estimated, image).errors.beam is not None
-    recorded = run(uniform, Shot(image, source=np.ones(image.shape))).errors
-    assert recorded.beam is None
-    assert recorded.beam_sensitivity.rms > 0
-    for beam, is_measured in (({}, False), ({"source": np.ones(image.shape)}, True)):
-        out = tmp_path / f"{is_measured}.shadowinv.zarr"
-        store = run_stack(Shot(image[None], **beam), out, Recipe(options=options))
-        (report,) = (json.loads(str(text)) for text in store.report.values)
-        assert (report["errors"]["beam"] is None) == is_measured
 
 
 @pytest.mark.parametrize("method", ESTIMATES)
@@ -630,10 +610,14 @@ def test_each_estimate_of_a_source_is_a_beam_that_nobody_measured(method, tmp_pa
     bare = np.hypot(*(np.indices(image.shape) - 31.5)) > 20 if estimate.uses_mask else None
     recipe = Recipe(source=estimate, setup=setup, options=InversionOptions(n_sites=400))
     shot = run(recipe, Shot(image, source_mask=bare)).errors
-    store = run_stack(Shot(image[None], source_mask=bare), tmp_path / "s.shadowinv.zarr", recipe)
-    of_stack = json.loads(str(store.report.values[0]))["errors"]
+    if method in ("kriged", "polynomial"):  # a stack asks all of them in the same way
+        shots = Shot(image[None], source_mask=bare)
+        store = run_stack(shots, tmp_path / "s.shadowinv.zarr", recipe)
+        of_stack = json.loads(str(store.report.values[0]))["errors"]
+        assert of_stack["beam_basis"] == shot.beam_basis
+        assert of_stack["beam_variation"] == pytest.approx(shot.beam_variation, rel=1e-6)
     if method == "kriged":
-        assert shot.beam_basis == of_stack["beam_basis"] == "outside"
+        assert shot.beam_basis == "outside"
         return
     assert (shot.beam_basis, shot.beam_scale) == ("assumed", ASSUMED_BEAM.length)
     # An estimate from the image leaves a part of an uneven beam.
@@ -641,8 +625,6 @@ def test_each_estimate_of_a_source_is_a_beam_that_nobody_measured(method, tmp_pa
     assert (shot.beam_variation == ASSUMED_BEAM.rms == 0.05) == is_whole
     assert 0.005 < shot.beam_variation < 0.06
     assert shot.beam.rms > shot.noise.rms
-    assert of_stack["beam_basis"] == "assumed"
-    assert of_stack["beam_variation"] == pytest.approx(shot.beam_variation, rel=1e-6)
 
 
 def test_an_estimate_passed_as_an_array_is_declared(image):
@@ -657,7 +639,7 @@ def test_an_estimate_passed_as_an_array_is_declared(image):
         invert(image, plan=plan_sites(estimated, options), options=options, measured=False)
 
 
-@pytest.mark.parametrize("width", [0.8, 2.0, 4.0])
+@pytest.mark.parametrize("width", [0.8, 4.0])
 def test_the_error_by_noise_follows_a_stated_correlation(width):
     """The scatter of repeats; over 4 px the correlation is too long to be measured."""
     blob = phantoms.gaussian_blob((96, 96), 34.0, 10.5)

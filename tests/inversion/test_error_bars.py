@@ -190,19 +190,6 @@ def test_samples_start_from_the_images_weights(counts, plan):
     assert max(result.iterations) < invert(counts, plan=plan).report.iterations
 
 
-def test_neither_threads_nor_later_samples_change_a_bit(counts, plan):
-    serial, parallel = (
-        samples_of(counts, 2 * WIDTH + 3, plan=plan, options=InversionOptions(threads=threads))
-        for threads in (1, 3)
-    )
-    for name in ("potential_mean", "potential_std", "displacement_mean", "displacement_std"):
-        np.testing.assert_array_equal(getattr(serial, name), getattr(parallel, name))
-    fewer = samples_of(counts, 3, plan=plan)
-    assert fewer.residuals == serial.residuals
-    reseeded = samples_of(counts, 3, plan=plan, options=InversionOptions(seed=1))
-    assert not np.allclose(reseeded.potential_std, fewer.potential_std, rtol=1e-3)
-
-
 def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, plan):
     choices = {
         "plan": plan,
@@ -222,12 +209,6 @@ def test_noise_too_strong_for_a_linear_response_is_reported(clean, plan):
     result = invert(clean, plan=plan, options=OPTIONS).uncertainty(5, noise=1.5, noise_only=True)
     assert result.errors.samples.linearity.nonlinearity > 0.3
     assert result.cautions[-1].code == "samples"
-
-
-def test_each_sample_is_zero_in_the_mean_over_the_border(counts, plan):
-    assert border_mean(samples_of(counts, 3, plan=plan).potential_mean) == pytest.approx(
-        0, abs=1e-10
-    )
 
 
 def test_samples_below_zero_are_clipped(clean):

@@ -18,6 +18,7 @@ from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob
 
 SHAPE = (60, 80)
 TASKS = Path("/proc/self/task")
+DOUBTS = {"misfit", "no-deflection", "folds", "edge"}  # about a solution
 
 
 @pytest.fixture(scope="module")
@@ -217,13 +218,6 @@ def test_values_of_masked_pixels_do_not_matter(image):
     ]
     for inversion in inversions[1:]:
         np.testing.assert_array_equal(inversion.potential, inversions[0].potential)
-
-
-def test_a_plan_keeps_its_mask(image):
-    mask = ~handwriting(SHAPE)
-    plan = plan_sites(np.ones(SHAPE), mask=mask)
-    alone = invert(image, source=np.ones(SHAPE), mask=mask)
-    np.testing.assert_array_equal(invert(image, plan=plan).potential, alone.potential)
 
 
 def test_caustics_are_not_marked_for_noise():
@@ -450,6 +444,7 @@ def test_the_papers_toroid_is_retrieved(image_of, peak_field, peak_percent, l2_p
     options = InversionOptions(negative="clip", n_sites=image.size)
     inversion = invert(image, source=np.ones_like(image), options=options)
     assert inversion.report.converged
+    assert not DOUBTS & {caution.code for caution in inversion.cautions}
     assert 100 * abs(peak(inversion.displacement) / peak(true) - 1) <= peak_percent
     assert 100 * relative_error(inversion.displacement, true) <= l2_percent
 
@@ -458,6 +453,7 @@ def test_the_donut_is_retrieved():
     image, true = load_donut()
     inversion = invert(image, options=InversionOptions(n_sites=image.size))
     assert inversion.report.converged
+    assert not DOUBTS & {caution.code for caution in inversion.cautions}
     assert 100 * abs(peak(inversion.displacement) / peak(true) - 1) <= 1.5
     assert 100 * relative_error(inversion.displacement, true) <= 2.4
 

@@ -6,7 +6,6 @@ so that an inversion takes a few tenths of a second.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -17,16 +16,13 @@ from scipy import ndimage
 
 from helpers.fit_images import Displacement as Field
 from helpers.fit_images import counted, on_pixels
-from helpers.public_data import load_donut, public_file, public_names
-from helpers.toroid import noisy_toroid_image, toroid_image
-from napari_shadowinv._typing import FloatArray
+from helpers.public_data import public_file, public_names
 from napari_shadowinv.facts import Verdict, percent
 from napari_shadowinv.inversion import invert, solution_checks
 from napari_shadowinv.inversion.error_budget import ErrorEstimate
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.solution_checks import (
-    image_residual,
     mark_caustics,
 )
 from napari_shadowinv.io import read
@@ -106,14 +102,6 @@ def noisy(image: Array, share: float, seed: int = 1) -> Array:
 
 
 # One definition of the image residual
-
-
-def test_the_residual_is_the_rms_over_the_used_pixels_relative_to_their_mean():
-    image = np.array([[4.0, 4.0], [8.0, 1e6]])
-    off = np.array([[1.0, -1.0], [2.0, 1e9]])
-    mask = np.array([[True, True], [True, False]])
-    expected = np.sqrt((1 + 1 + 4) / 3) / (16 / 3)
-    assert image_residual(image, image - off, mask) == pytest.approx(expected)
 
 
 def test_the_report_has_the_residual_of_the_used_pixels():
@@ -311,7 +299,7 @@ BEYOND = {
 def test_what_lies_beyond_the_edge_is_in_the_total(name, boundary):
     field, sides = BEYOND[name]
     image = noisy(traced(field, beyond=30), 0.03)
-    options = InversionOptions(negative="clip", **boundary)
+    options = InversionOptions(negative="clip", n_sites=3000, **boundary)
     inversion = invert(image, source=np.ones(image.shape), options=options)
     true = on_pixels(field, (SIDE, SIDE))
     error = float(np.sqrt(((inversion.displacement - true) ** 2).sum(axis=0).mean()))
@@ -325,23 +313,13 @@ def test_what_lies_beyond_the_edge_is_in_the_total(name, boundary):
 @pytest.mark.parametrize(("strength", "share"), [(0.6, 0.0), (-0.6, 0.1), (0.02, 0.03)])
 def test_an_object_inside_has_no_error_by_the_edge(boundary, strength, share):
     image = noisy(traced(gaussian(strength), beyond=30), share)
-    options = InversionOptions(negative="clip", boundary=boundary)
+    options = InversionOptions(negative="clip", n_sites=3000, boundary=boundary)
     errors = invert(image, source=np.ones(image.shape), options=options).errors
     by_edge = errors.parts.get("edge", ErrorEstimate(0.0, 0.0))
     assert by_edge.rms < 0.01 * errors.rms
 
 
 # Good images
-
-
-@pytest.mark.parametrize("peak", [24, 97, 194])
-@pytest.mark.parametrize("image_of", [toroid_image, noisy_toroid_image])
-def test_the_papers_toroid_gets_no_doubts(peak: int, image_of: Callable[[float], FloatArray]):
-    assert signs(image_of(peak)) == []
-
-
-def test_the_donut_gets_no_doubts():
-    assert signs(load_donut()[0]) == []
 
 
 @pytest.mark.parametrize("name", public_names("prns") + public_names("pradformat"))
@@ -423,18 +401,6 @@ def test_a_mask_beside_the_peak_is_reported():
     length = np.hypot(*inversion.displacement)
     assert length[~mask].max() < length[mask].max()
     assert "masked-peak" in codes_of(inversion)
-
-
-@pytest.mark.parametrize(("under", "is_reported"), [(0.9, False), (1.1, True)])
-def test_a_field_stronger_under_a_mask_than_outside_is_reported(under, is_reported):
-    mask = np.ones((60, 60), bool)
-    mask[10:20, 10:20] = False
-    displacement = np.zeros((2, 60, 60))
-    displacement[0, 15, 15] = under
-    displacement[1, 40, 45] = 1.0
-    text = solution_checks._peak_at_mask(displacement, mask)
-    assert ("up to 1.1 px under the mask, 1 px outside" in text) == is_reported
-    assert bool(text) == is_reported
 
 
 def test_the_headline_and_errors_leave_masked_pixels_out():

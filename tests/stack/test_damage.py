@@ -14,6 +14,6 @@ def test_damage_at_random_is_noticed(tmp_path, compiled):
     assert spec.loader is not None
     damage = sys.modules["damage"] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(damage)
-    counts = damage.count_outcomes(36, 3, tmp_path)
+    counts = damage.count_outcomes(24, 3, tmp_path)
     for name in ("bit of a chunk", "lost chunk", "shortened chunk", "bit of a result file"):
-        assert counts[name] == {"noticed": 6}, name
+        assert counts[name] == {"noticed": 4}, name

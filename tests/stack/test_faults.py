@@ -39,7 +39,7 @@ def wait_for(condition, what: str):
     end = time.monotonic() + PATIENCE
     while not (value := condition()):
         assert time.monotonic() < end, f"waited {PATIENCE} s for {what}"
-        time.sleep(0.02)
+        time.sleep(0.1)  # conditions that read a store take time from the workers
     return value
 
 
