@@ -12,7 +12,6 @@ import pytest
 
 from compare import fields, images, page, runner
 from compare.catalogue import OURS, SOLVERS, STAND_IN
-from compare.environments import telling_line
 from compare.runner import Limits, Worker
 from napari_shadowinv import synthetic_image
 
@@ -113,24 +112,6 @@ def test_solved_images_are_not_solved_again(folder: Path) -> None:
     assert results == {"toroid 97 32": {"error_percent": 1.0}}
 
 
-def test_larger_images_are_skipped_after_three_limits() -> None:
-    effort = runner.Effort(60.0)
-    effort.images.update({64: 9, 128: 9})
-    effort.exhausted.update({64: 2, 128: 3})
-    assert effort.reason_to_skip(64) == ""
-    assert "128² px" in effort.reason_to_skip(256)
-
-
-def test_images_are_skipped_when_the_time_of_a_size_is_over() -> None:
-    effort = runner.Effort(60.0)
-    effort.images.update({64: 9})
-    effort.seconds.update({64: 61.0})
-    assert "were over" in effort.reason_to_skip(64)
-    assert effort.reason_to_skip(128) == ""
-    effort.left.update({64: 5})
-    assert "64² px" in effort.reason_to_skip(128)
-
-
 @pytest.mark.parametrize("name", ["toroid 97", "opposite pair"])
 def test_counted_rays_agree_with_the_forward_model(name: str) -> None:
     field = fields.paper_fields()[name]
@@ -149,11 +130,6 @@ def test_waves_are_zero_at_the_border_and_invertible() -> None:
     (yy, xy), (yx, xx) = slopes[0], slopes[1]
     least = (yy + xx) / 2 - np.hypot((yy - xx) / 2, (yx + xy) / 2)
     assert 0.35 < 1 + least.min() < 0.5
-
-
-def test_installation_failure_is_its_telling_line() -> None:
-    output = "ERROR: subprocess\n  fatal: unable to access 'x'\nERROR: Failed building wheel"
-    assert telling_line(output) == "fatal: unable to access 'x'"
 
 
 def test_page_is_that_of_the_results() -> None:

@@ -133,14 +133,6 @@ def test_the_format_is_recognised_and_read(names, tmp_path, kind):
     assert metadata == {"bits": 8 * pixels.itemsize}
 
 
-def test_the_setup_converts_and_projects(names):
-    setup = names["XRaySetup"].example()
-    assert setup.deflection_angle(1.0) == pytest.approx(1e-6 * 11.0 / 1.0)
-    harder = setup.model_copy(update={"photon_energy": 16.0})
-    assert harder.angle_ratio(setup, "electron density") == 0.25
-    assert harder.probe == "X-rays of 16 keV"
-
-
 @pytest.fixture
 def result_files(tmp_path, inversion, make_fit):
     paths = [tmp_path / "inversion.shadowinv", tmp_path / "fit.shadowinv"]

@@ -16,6 +16,7 @@ from helpers.command_line import flat, shadowinv
 from napari_shadowinv import InputError, ProtonSetup, fit, invert, predict_image, run_stack
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.io import read, read_shot, write
+from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -80,6 +81,11 @@ def test_inversion_of_a_new_kind_has_its_fields(setups, images, tmp_path):
     assert dataset["areal_electron_density"].attrs["units"] == "m⁻²"
     output = flat(shadowinv("info", path).output)
     assert "X-rays of 8 keV" in output
+
+
+def test_pradformat_refuses_a_new_kind(setups):
+    with pytest.raises(InputError, match="received kind 'x-ray'"):
+        check_pradformat_setup(setups[0])
 
 
 def test_projection_scales_with_the_wavelength_squared(setups):

@@ -8,11 +8,7 @@ import pytest
 from helpers.exact_fields import SETUP, field_of
 from napari_shadowinv.analysis import LineProfile, Region, analyse
 from napari_shadowinv.analysis.paths import (
-    circle_path,
-    edge_midpoints,
     interpolate_cubic,
-    path_directions,
-    sample_path,
 )
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.error_bars import Quantity
@@ -81,29 +77,6 @@ def test_cubic_interpolation_is_exact_for_cubic_polynomials():
     plane = y**3 - 2 * y * x**2 + x**3 + 5
     exact = places[:, 0] ** 3 - 2 * places[:, 0] * places[:, 1] ** 2 + places[:, 1] ** 3 + 5
     np.testing.assert_allclose(interpolate_cubic(plane, places), exact)
-
-
-def test_pieces_of_a_path_add_up_to_its_edges():
-    outline = np.array([(0.0, 0.0), (3.0, 4.0), (3.0, -2.0), (0.0, 0.0)])
-    middles, pieces = edge_midpoints(outline, 0.5)
-    assert np.hypot(*pieces.T).max() <= 0.5 + 1e-12
-    np.testing.assert_allclose(pieces.sum(axis=0), 0, atol=1e-12)
-    area = abs((middles[:, 1] * pieces[:, 0]).sum())
-    assert area == pytest.approx(9.0)  # ∮ x dy
-
-
-def test_directions_follow_the_edges_of_a_path():
-    path = [(0, 0), (0, 4), (3, 4)]
-    _, distance = sample_path(path, 1.0)
-    directions = path_directions(path, distance)
-    np.testing.assert_allclose(directions[:4], [[0, 1]] * 4)
-    np.testing.assert_allclose(directions[-3:], [[1, 0]] * 3)
-
-
-def test_circle_path_has_the_area_of_its_circle():
-    y, x = circle_path((4.0, 7.0), 3.0).T
-    area = (x[:-1] * y[1:] - x[1:] * y[:-1]).sum() / 2
-    assert area == pytest.approx(9 * np.pi, rel=1e-12)
 
 
 @pytest.mark.parametrize(

@@ -103,12 +103,6 @@ def test_finer_pixels_double_the_displacement(scene: Scene) -> None:
     np.testing.assert_allclose(middles, 2 * once, atol=0.03)
 
 
-def test_blocks_of_each_plane_are_added() -> None:
-    planes = np.arange(32.0).reshape(1, 4, 8)
-    np.testing.assert_array_equal(block_sums(planes, 2)[0], [[18, 26, 34, 42], [82, 90, 98, 106]])
-    assert block_sums(planes, 4).sum() == planes.sum()
-
-
 @pytest.mark.parametrize("factor", [2, 4])
 def test_larger_pixels_keep_the_information_of_an_image(scene: Scene, factor: int) -> None:
     """χ² of a constant misfit, Σ misfit²/σ²: a mean of n pixels has σ²/n."""
@@ -194,12 +188,6 @@ def test_descending_finds_the_field_that_made_the_images(scene: Scene) -> None:
     assert values[-1] == pytest.approx(value)
     at_start, _ = target.value_and_gradient(scene.nothing(), target.ray_counts(scene.nothing()))
     assert value < 0.01 * at_start
-
-
-def test_descending_takes_no_more_steps_than_allowed(scene: Scene) -> None:
-    truth = bump(scene, 1.0)
-    target = replace(scene, images=scene.model(truth, scene.ray_counts(truth)))
-    assert descend(target, scene.nothing(), iterations=4, least_gain=0)[2] <= 4
 
 
 def test_settling_reaches_where_a_long_descent_ends(scene: Scene) -> None:

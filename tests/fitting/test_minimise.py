@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting.conjugate_gradients import SoftModes, eigensystem, product, solve
+from napari_shadowinv.fitting.conjugate_gradients import SoftModes, eigensystem, solve
 from napari_shadowinv.fitting.descent import minimise
 
 
@@ -217,7 +217,3 @@ def test_eigensystem_is_that_of_lapack(size: int) -> None:
     np.testing.assert_allclose(matrix @ vectors, vectors * values, atol=1e-11)
     diagonal = np.diag(np.arange(1.0, size + 1))
     np.testing.assert_allclose(eigensystem(diagonal)[0], np.arange(1, size + 1), atol=1e-14)
-
-
-def test_product_is_the_scalar_product() -> None:
-    assert product(np.array([1.0, 2, 3]), np.array([4.0, -5, 6])) == 12

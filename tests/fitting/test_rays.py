@@ -245,31 +245,19 @@ def test_the_gradient_is_the_jacobians_transpose_times_the_pull() -> None:
     np.testing.assert_array_less(np.abs(pulled - flat(pulls)), 2 * rounding * size + 1e-12)
 
 
-def test_what_is_not_wanted_of_a_jacobian_is_zero_and_the_rest_the_same() -> None:
+def test_what_is_not_wanted_of_derivatives_is_zero_and_the_rest_the_same() -> None:
     model = model_of()
     potential, beam = wavy(model, FOLDED), model.around(uneven())
-    counts = model.ray_counts(potential)
-    complete = model.jacobian(TracedBeam(potential, counts, beam, turned())).toarray()
-    less = model.jacobian(
-        TracedBeam(potential, counts, beam, turned()), of_beam=False, of_frame=False
-    ).toarray()
-    size = potential.size
-    np.testing.assert_allclose(less[:, :size], complete[:, :size], atol=1e-14)
-    assert complete[:, size:].any(axis=0).sum() > beam.size / 2
-    assert not less[:, size:].any()
-
-
-def test_what_is_not_wanted_of_a_gradient_is_zero_and_the_rest_the_same() -> None:
-    model = model_of()
-    potential, beam = wavy(model, FOLDED), model.around(uneven())
-    counts, pull = model.ray_counts(potential), np.random.default_rng(2).normal(size=SIZE)
-    complete = model.gradient(TracedBeam(potential, counts, beam), pull)
-    less = model.gradient(TracedBeam(potential, counts, beam), pull, of_beam=False, of_frame=False)
-    assert complete.beam.any()
-    assert complete.frame.any()
-    assert not less.beam.any()
-    assert not less.frame.any()
-    np.testing.assert_allclose(less.potential, complete.potential, rtol=1e-12, atol=1e-12)
+    traced = TracedBeam(potential, model.ray_counts(potential), beam, turned())
+    pull = np.random.default_rng(2).normal(size=SIZE)
+    few = {"of_beam": False, "of_frame": False}
+    jacobians = (model.jacobian(traced, **each).toarray() for each in ({}, few))
+    gradients = (flat(model.gradient(traced, pull, **each))[None] for each in ({}, few))
+    for (complete, less), rounding in ((jacobians, 1e-14), (gradients, 1e-12)):
+        size = potential.size
+        np.testing.assert_allclose(less[:, :size], complete[:, :size], rtol=1e-12, atol=rounding)
+        assert complete[:, size:].any(axis=0).sum() > beam.size / 2
+        assert not less[:, size:].any()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])

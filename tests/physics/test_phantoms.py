@@ -102,13 +102,6 @@ def test_axes_of_an_ellipse() -> None:
     assert diagonal[26, 26] > diagonal[26, 14]
 
 
-def test_phantoms_add_up() -> None:
-    toroid, ellipse = PHANTOMS["toroid"], PHANTOMS["ellipse"]
-    both = toroid + ellipse
-    np.testing.assert_array_equal(both.potential, toroid.potential + ellipse.potential)
-    np.testing.assert_array_equal(both.displacement, toroid.displacement + ellipse.displacement)
-
-
 def test_ellipse_pair_has_no_symmetry_and_no_fold() -> None:
     pair = ellipse_pair((80, 80))
     determinant = jacobian_determinant(pair.displacement)

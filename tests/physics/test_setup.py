@@ -7,7 +7,6 @@ import math
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import pytest
@@ -15,19 +14,11 @@ import tomli_w
 from pydantic import TypeAdapter
 
 import napari_shadowinv
-from napari_shadowinv.cli._summary import setup_text
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.inversion.variables import dataset_from_field
-from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.physics.beam import (
-    BeamSetup,
-    Deflector,
-    MainField,
-    SIField,
     displacement_from_potential,
 )
 from napari_shadowinv.physics.phantoms import paper_setup
-from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import (
     SETUPS,
     SPECIES,
@@ -36,7 +27,6 @@ from napari_shadowinv.physics.setup import (
     Setup,
     setup_from_dict,
 )
-from napari_shadowinv.physics.units import shown_fields
 
 PROTON = {
     "kind": "proton",
@@ -154,28 +144,22 @@ def test_magnetic_force_is_velocity_cross_field(proton: ProtonSetup) -> None:
         np.testing.assert_allclose(angle, expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("unit", ["T m", "MG um"])
-def test_round_trip_of_the_magnetic_field(proton: ProtonSetup, unit: str) -> None:
-    field = np.random.default_rng(0).normal(size=(2, 4, 5))
-    displacement = proton.displacement_from_path_integrated_b(field, unit)
-    np.testing.assert_allclose(proton.path_integrated_b(displacement, unit), field)
-
-
-def test_round_trip_of_the_electric_field(proton: ProtonSetup) -> None:
-    field = np.random.default_rng(1).normal(size=(2, 4, 5))
-    displacement = proton.displacement_from_path_integrated_e(field)
-    np.testing.assert_allclose(proton.path_integrated_e(displacement), field, rtol=1e-14)
+def test_round_trips_of_fields_and_line_integrals(
+    proton: ProtonSetup, optical: OpticalSetup
+) -> None:
+    rng = np.random.default_rng(0)
+    vectors, plane = rng.normal(size=(2, 4, 5)), rng.normal(size=(4, 5))
+    for unit in ("T m", "MG um"):
+        moved = proton.displacement_from_path_integrated_b(vectors, unit)
+        np.testing.assert_allclose(proton.path_integrated_b(moved, unit), vectors)
+    for convert, invert, values in (
+        (proton.path_integrated_e, proton.displacement_from_path_integrated_e, vectors),
+        (optical.line_integrated_log_index, optical.normalized_potential_from_log_index, plane),
+        (optical.line_integrated_density, optical.normalized_potential_from_density, plane),
+    ):
+        np.testing.assert_allclose(convert(invert(values)), values, rtol=1e-14)
     # A field along +x pushes a proton to +x.
     assert proton.displacement_from_path_integrated_e([0.0, 1.0])[1] > 0
-
-
-def test_round_trips_of_the_line_integrals_of_light(optical: OpticalSetup) -> None:
-    phi = np.random.default_rng(2).normal(size=(4, 5))
-    for convert, invert in (
-        (optical.line_integrated_log_index, optical.normalized_potential_from_log_index),
-        (optical.line_integrated_density, optical.normalized_potential_from_density),
-    ):
-        np.testing.assert_allclose(invert(convert(phi)), phi, rtol=1e-14)
 
 
 def test_potential_in_metres_gives_the_displacement_in_pixels(proton: ProtonSetup) -> None:
@@ -352,57 +336,6 @@ def test_setup_kinds_are_named_only_where_they_are_defined() -> None:
         if path.suffix in (".py", ".pyi") and kinds.search(path.read_text(encoding="utf-8"))
     }
     assert mentioning == set(NAMED_IN)
-
-
-class NeutralSetup(BeamSetup):
-    """A beam that a force deflects: a kind of setup that the package does not know."""
-
-    title: ClassVar = "neutral atoms"
-    beam: ClassVar = "atoms"
-    beam_field: ClassVar = "energy"
-    deflectors: ClassVar = (Deflector("F", "force", "force (F)"),)
-    si_fields: ClassVar = (
-        *BeamSetup.si_fields,
-        SIField("path_integrated_force", "N m", "Path-integrated force", is_vector=True),
-    )
-    main_field: ClassVar = MainField("path_integrated_force", "Force", "|∫F dz|", ("Fy", "Fx"))
-    kind: Literal["neutral"] = "neutral"
-    energy: float
-
-    @property
-    def probe(self) -> str:
-        return f"atoms of {self.energy:g} J"
-
-    @classmethod
-    def example(cls) -> Self:
-        return cls(energy=2e-3, source_object_distance=1, object_image_distance=1, pixel_size=1e-6)
-
-    def default_deflector(self, recorded_with: Any) -> str:
-        return "force"
-
-    def angle_ratio(self, recorded_with: Any, deflector: str) -> float:
-        return recorded_with.energy / self.energy
-
-    def path_integrated_force(self, displacement: Any) -> Any:
-        return 2 * self.energy * self.deflection_angle(displacement)
-
-
-def test_new_setup_kind_provides_all_that_others_need() -> None:
-    setup: Any = NeutralSetup.example()
-    displacement = np.ones((2, 4, 5))
-    force = setup.path_integrated_force(displacement)
-    dataset = dataset_from_field(displacement, None, setup)
-    np.testing.assert_array_equal(dataset["path_integrated_force"], force)
-    assert dataset["path_integrated_force"].attrs["units"] == "N m"
-    (field,) = shown_fields([displacement], setup)
-    assert (field.name, field.unit, field.components) == ("Force", "nN·m", ("Fy", "Fx"))
-    np.testing.assert_allclose(field.vectors, force * 1e9)
-    faster = setup.model_copy(update={"energy": 4e-3})
-    moved = transferred_displacement(displacement, setup, faster)
-    np.testing.assert_allclose(moved, displacement / 2)
-    assert setup_text(setup).startswith("atoms of 0.002 J, magnification 2")
-    with pytest.raises(InputError, match="received kind 'neutral'"):
-        check_pradformat_setup(setup)
 
 
 @pytest.mark.parametrize("kind", SETUPS)

@@ -225,13 +225,14 @@ def test_resolution_unlike_a_scanner_is_doubted(changed, numbers, is_doubtful) -
     assert not _pixel_cautions(pack.model_copy(update={"pixel_size": 1e-4}), 1e-4)
 
 
-def test_scans_saved_again_by_a_picture_program_are_doubted(truth: Truth, changed) -> None:
+def test_scans_saved_again_by_a_picture_program_are_doubted(truth: Truth, doses, changed) -> None:
     pack = changed()
     for file in truth.files:
         scan_again(pack, file.name, tifffile.imread(file), per_inch=72)
-    doses = run_film(read_pack(pack))
-    assert "72 dots per inch (pixels of 352.8 µm)" in sentences_of(doses)
-    assert "pixel size" in sentences_of(doses)
+    by_program = run_film(read_pack(pack))
+    assert "72 dots per inch (pixels of 352.8 µm)" in sentences_of(by_program)
+    codes = [{caution.code for caution in each.cautions} for each in (by_program, doses)]
+    assert ["film-pixels" in each for each in codes] == [True, False]
 
 
 @pytest.mark.parametrize("way", [np.s_[::-1, ::-1], np.s_[:, ::-1]])

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from napari_shadowinv import InversionOptions
-from napari_shadowinv.inversion import Inversion, invert
+from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
 from napari_shadowinv.pipeline import Cache, run
@@ -91,17 +90,6 @@ def test_seconds_of_all_stages_are_told(shot: Array) -> None:
     assert set(report.seconds) == {"source", "prepare", "sites", "transport", "read-out", "errors"}
     assert report.seconds["sites"] > 0
     assert not report.cautions
-
-
-def test_report_leaves_masked_pixels_out_of_the_peak(shot: Array) -> None:
-    inversion = invert(shot, options=FEW)
-    mask = np.ones(shot.shape, bool)
-    mask[36:44, 8:16] = False
-    displacement = np.where(mask, inversion.displacement, 100.0)
-    masked = replace(inversion, mask=mask, displacement=displacement)
-    (text,) = [fact.text for fact in masked.facts if fact.key == "displacement"]
-    largest = np.hypot(*inversion.displacement)[mask].max()
-    assert float(text.removeprefix("peak |d| ").split()[0]) == pytest.approx(largest, rel=0.01)
 
 
 def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:

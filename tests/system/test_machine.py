@@ -27,17 +27,11 @@ def fill(start, stop, values):
     values[start:stop] = np.arange(start, stop)
 
 
+@pytest.mark.parametrize("uneven", [False, True])
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_ranges_cover_everything_once(threads):
+def test_ranges_cover_everything_once(threads, uneven):
     values = np.full(1001, -1)
-    in_ranges(fill, 1001, threads, values, smallest=10)
-    np.testing.assert_array_equal(values, np.arange(1001))
-
-
-@pytest.mark.parametrize("threads", [1, 2, 5])
-def test_uneven_ranges_cover_everything_once(threads):
-    values = np.full(1001, -1)
-    in_ranges(fill, 1001, threads, values, smallest=10, uneven=True)
+    in_ranges(fill, 1001, threads, values, smallest=10, uneven=uneven)
     np.testing.assert_array_equal(values, np.arange(1001))
 
 

@@ -116,11 +116,3 @@ def test_a_step_after_the_end_of_all_functions_is_no_request_to_stop() -> None:
     for after_step in callbacks:
         after_step(2)
     assert received == [1, 1]
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_two_functions_return_their_own_results(threads: int) -> None:
-    received: list[int] = []
-    first, second = partial(step_on, 3, 20), partial(step_on, 5, 10)
-    assert run_in_parallel([first, second], threads, received.append) == [9, 25]
-    assert sorted(received) == [3] * 20 + [5] * 10
