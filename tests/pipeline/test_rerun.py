@@ -118,6 +118,7 @@ def fit_of_arrays(folder: Path) -> Example:
     recipe = Recipe(steps=STEPS, fit=FitChoices(options=HASTY))
     result = run_fit(recipe, [replace(first, fiducials=rows), *others])
     assert result.provenance is not None
+    assert result.provenance.recipe.fit.brightness == "free"
     np.testing.assert_array_equal(result.provenance.fiducial_rows, rows)
     return Example(write(Path("a.shadowinv"), result), paths[1])
 
