@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tifffile
-from scipy.ndimage import binary_erosion
 
 import simulated_pack
 from napari_shadowinv.film import Pack, PackLayer, Slab
@@ -162,59 +160,12 @@ def test_a_film_lies_where_its_corners_are(tmp_path: Path) -> None:
         np.testing.assert_allclose(inertia, expected, atol=1.5)
 
 
-def test_scans_tell_the_doses_by_the_table(tmp_path: Path) -> None:
-    options = {"handwriting": False, "notch": False, "noise": False}
-    pack = simulate(tmp_path, layers=2, shape=SHAPE, rotations=0, shifts=0, b_peak=1.5, **options)
-    table = np.genfromtxt(tmp_path / "HDV2.csv", delimiter=",", skip_header=2)
-    blank = np.median(tifffile.imread(tmp_path / "unexposed.tif")[40:-40, 40:-40], axis=(0, 1))
-    for k, file in enumerate(pack.files):
-        film = tifffile.imread(file)[40:-40, 40:-40]
-        assert film.shape == (*SHAPE, 3)
-        for channel, column in enumerate((3, 5, 7)):
-            table_density = np.log10(blank[channel] / table[:, column])
-            film_density = np.log10(blank[channel] / film[..., channel])
-            doses = 10 ** np.interp(film_density, table_density, np.log10(table[:, 1]))
-            np.testing.assert_allclose(doses[1:-1, 1:-1], pack.dose(k)[1:-1, 1:-1], rtol=5e-3)
-
-
 def test_noise_is_that_of_whole_protons_and_of_grain() -> None:
     rng = np.random.default_rng(0)
     counts = simulated_pack._counted(np.full((300, 400), 40.0), 0.05, rng)
     assert counts.mean() == pytest.approx(40, rel=1e-3)
     expected = 40 * 0.05 + (simulated_pack.GRAIN * 40) ** 2
     assert counts.var() == pytest.approx(expected, rel=0.02)
-
-
-def test_scans_have_16_bits_and_marks_only_if_requested(truth: Truth) -> None:
-    for k, file in enumerate(truth.files):
-        with tifffile.TiffFile(file) as tiff:
-            tags = tiff.pages[0].tags
-            assert tags["XResolution"].value == (300, 1)
-            assert tags["ResolutionUnit"].value == 2
-            scan = tiff.asarray()
-        assert scan.dtype == np.uint16
-        assert scan.shape == (*truth.doses[k].shape, 3)
-        assert 500 < scan.min() < scan.max() < 65_535
-        place = truth.placements[k]
-        for marks, least in ((truth.notch[k], 62_000), (truth.writing[k], 45_000)):
-            inner = np.argwhere(binary_erosion(marks)) - truth.scene.middle
-            places = np.round(place.on_scan(inner)).astype(int)
-            bright = np.median(scan[tuple(places.T)], axis=0)
-            # Notches show the bed; a pen is black or white.
-            assert (bright > least).all() or (bright < 10_000).all()
-
-
-def test_the_pack_is_described(truth: Truth) -> None:
-    pack = tomllib.loads(truth.pack.read_text(encoding="utf-8"))
-    distances = {"source_object_distance": 0.01, "object_image_distance": 0.1}
-    assert pack["setup"] == {"kind": "proton"} | distances
-    files = [pack["films"]["HDV2"][name] for name in ("calibration", "unexposed")]
-    files += [layer["file"] for layer in pack["layers"]]
-    assert len(files) == 5
-    assert all((truth.folder / file).is_file() for file in files)
-    # 97 µm of base, 12 µm of active layer, and the filters.
-    depths = truth.scene.distances - 0.1
-    np.testing.assert_allclose(depths, [0, 209e-6, 518e-6], atol=1e-12)
 
 
 def test_the_same_seed_makes_the_same_files(truth: Truth, tmp_path: Path) -> None:
