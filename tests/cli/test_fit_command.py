@@ -380,6 +380,7 @@ def test_info_shows_a_doubtful_verdict(make_fit: Callable[..., Fit]) -> None:
 # Rerun
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_rerun_takes_moved_images_in_their_order(
     folder: Path, refused: Callable[..., None]
 ) -> None:
@@ -486,6 +487,7 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
 # Comparison of fields
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_fields_are_compared_and_the_likeliest_is_written() -> None:
     options = set_options(samples=2, max_iterations=5, spacing=0.25, smoothness=10)
     quick = ("--noise", 20, *options)

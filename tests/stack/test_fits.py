@@ -76,6 +76,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_a_stored_fit_keeps_its_cautions(images: Any, out: Path) -> None:
     images[1, 10, 12] = 9.0
     recipe = Recipe(setup=SETUPS[0], fit=CHOICES)
@@ -103,6 +104,7 @@ def test_unreliable_error_bars_of_a_stored_fit_are_an_exit_code(code: str, exits
     assert not exits or ended.value.exit_code == 3
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_each_shot_of_an_array_is_fitted_alone(images: Any, out: Path) -> None:
     recipe = Recipe(setup=SETUPS[0], fit=CHOICES)
     store = run_stack(images, out, recipe, scheduler="synchronous", run=RunOptions(dtype="float64"))
@@ -229,6 +231,7 @@ def test_images_of_one_object_are_fitted_together(folder: Path, out: Path) -> No
     np.testing.assert_allclose(store["x"], np.arange(48) * SETUPS[0].object_pixel_size)
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_changed_table_is_refused_and_longer_table_grows(folder: Path, out: Path) -> None:
     recipe = Recipe(fit=CHOICES)
     run_stack("shots.csv", out, recipe, scheduler="synchronous")
