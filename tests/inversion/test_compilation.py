@@ -37,8 +37,8 @@ def test_without_the_compiler_an_inversion_is_slow_and_the_same():
 import sys
 import numpy as np
 from napari_shadowinv import invert
-y, x = np.indices((20, 20)) - 9.5
-print(repr(float(np.hypot(*invert(1 + np.exp(-(y**2 + x**2) / 32)).displacement).max())))
+y, x = np.indices((14, 14)) - 6.5
+print(repr(float(np.hypot(*invert(1 + np.exp(-(y**2 + x**2) / 16)).displacement).max())))
 print({f"scipy.{name}" for name in ("integrate", "interpolate", "stats")} & set(sys.modules))
 """
     printed = [
