@@ -35,7 +35,8 @@ from napari_shadowinv.facts import (
     to_figures,
     with_error,
 )
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.shot import Shot, shots_of
 
@@ -182,7 +183,7 @@ def test_facts_give_the_numbers_of_the_report(inversion):
 
 
 def test_facts_with_a_setup_add_the_field_in_its_unit(inversion):
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     texts = texts_by_key(inversion.in_units(setup).facts)
     strength = setup.field_in_si("path_integrated_b", inversion.displacement)
     assert f"{1e3 * np.hypot(*strength).max():.3g}" in texts["field"]
@@ -249,7 +250,7 @@ def test_a_headline_and_a_report_are_short_and_a_report_repeats_nothing(inversio
             headline = Headline.of(peaks, assessment, doubts)
             assert len(headline.text.split()) <= Headline.MOST_WORDS
             assert headline.text.startswith(f"{'; '.join(peaks)}; {assessment.reason}")
-    for facts in (inversion.facts, inversion.in_units(paper_setup()).facts, fitted.facts):
+    for facts in (inversion.facts, inversion.in_units(ProtonSetup.example()).facts, fitted.facts):
         rows = table_rows(facts)
         assert 4 <= len(rows) <= 6, "and the setup"
         texts = [text for _, text in rows]

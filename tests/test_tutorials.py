@@ -24,6 +24,7 @@ from napari_shadowinv import InversionOptions, invert, read
 from napari_shadowinv.analysis import product_from_text
 from napari_shadowinv.facts import percent
 from napari_shadowinv.inversion.variables import setup_from_dataset
+from napari_shadowinv.physics.setup import ProtonSetup
 
 SETUP = """kind = "proton"
 energy = 14.7
@@ -161,7 +162,7 @@ def test_the_table_of_sources_is_as_the_inversions_say():
     from napari_shadowinv.preprocessing import ESTIMATES
 
     (source, *_), (image, *_) = four_toroids()
-    setup = phantoms.paper_setup()
+    setup = ProtonSetup.example()
     truth = phantoms.four_toroids(image.shape, setup, 0.8).displacement
     assert 1e3 * np.hypot(*setup.path_integrated_b(truth)).max() == pytest.approx(10.8, abs=0.05)
     pattern = r"^\| ([a-z].*?) \| ([\d.]+) \| (\d+) \| ([\d.]+) \|"

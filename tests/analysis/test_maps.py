@@ -28,7 +28,6 @@ from napari_shadowinv.physics.phantoms import (
     gaussian_blob,
     toroid,
     wakefield,
-    wakefield_setup,
 )
 from napari_shadowinv.physics.setup import OpticalSetup
 
@@ -208,7 +207,7 @@ def test_crossed_rays_of_an_inversion_are_the_caustic_regime():
 
 
 def test_large_numbers_have_a_power_of_ten():
-    setup = wakefield_setup()
+    setup = OpticalSetup.example()
     wave = wakefield((80, 120), setup)
     field = RetrievedField(dataset_from_field(wave.displacement, wave.potential, setup))
     (region,) = analyse(field, Region(center=(39.5, 59.5), radius=20), unit="m-2")

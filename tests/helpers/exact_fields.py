@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
-from napari_shadowinv.physics.phantoms import Phantom, paper_setup
+from napari_shadowinv.physics.phantoms import Phantom
+from napari_shadowinv.physics.setup import ProtonSetup
 
-SETUP = paper_setup()
+SETUP = ProtonSetup.example()
 
 
 def field_of(phantom: Phantom) -> RetrievedField:

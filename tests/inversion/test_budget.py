@@ -95,7 +95,7 @@ EVERY_IMAGE = [*PHANTOMS, *STRUCTURES, "coaxial_line"]
 
 @pytest.fixture(scope="module", params=EVERY_IMAGE)
 def every_image(request):
-    name, shape, setup = request.param, (96, 96), phantoms.paper_setup()
+    name, shape, setup = request.param, (96, 96), ProtonSetup.example()
     if name in PHANTOMS:
         phantom = PHANTOMS[name]()
     elif name in STRUCTURES:
@@ -703,7 +703,7 @@ def test_a_reference_of_another_exposure_is_assumed_uneven_and_a_given_uniform_o
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("is_masked", [True, False])
 def test_behind_an_obstacle_is_in_no_total_and_its_edge_in_the_peak(seed, is_masked):
-    setup = phantoms.paper_setup()
+    setup = ProtonSetup.example()
     phantom, behind = phantoms.coaxial_line((200, 200), setup)
     source = np.where(behind, 0.0, 400.0)
     expected = synthetic_image(phantom.displacement, source)

@@ -10,6 +10,7 @@ from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.setup import ProtonSetup
 
 SIDE = 96
 OPTIONS = InversionOptions(n_sites=2500)
@@ -264,7 +265,7 @@ def test_a_wrong_instrument_is_refused_in_a_sentence(values, text):
 @pytest.mark.parametrize(
     ("setup", "power"),
     [
-        (phantoms.paper_setup(), 0.5),
+        (ProtonSetup.example(), 0.5),
         (OpticalSetup(wavelength=8e-7, object_image_distance=0.1, pixel_size=1e-6), 0.0),
     ],
 )

@@ -27,8 +27,9 @@ from napari_shadowinv.inversion.samples import (
     noise_of,
     stratified_numbers,
 )
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.poisson import border_mean
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.transport.linear import SimilarSystems
 from napari_shadowinv.transport.solvers import Target
 
@@ -39,7 +40,7 @@ KINDS = {"closed": {}, "masked": {}, "free": {"boundary": "free"}}
 
 @pytest.fixture(scope="module")
 def image():
-    clean = synthetic_image(toroid(SHAPE, paper_setup(), 97.0, 100e-6).displacement)
+    clean = synthetic_image(toroid(SHAPE, ProtonSetup.example(), 97.0, 100e-6).displacement)
     return clean + NOISE * np.random.default_rng(3).normal(size=SHAPE)
 
 

@@ -29,6 +29,7 @@ from napari_shadowinv.io import read
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.plotting import report_figure
 
 Array = NDArray[np.float64]
@@ -340,7 +341,7 @@ def test_a_real_plume_gets_no_doubts(burner: list[Path], number: int):
 )
 def test_phantoms_get_no_doubts(scene: str):
     shape = (SIDE, SIDE)
-    field = getattr(phantoms, scene)(shape, phantoms.paper_setup()).displacement / 2
+    field = getattr(phantoms, scene)(shape, ProtonSetup.example()).displacement / 2
     image = synthetic_image(field)
     assert signs(image) == []
     assert signs(np.random.default_rng(6).poisson(100 * image).astype(float)) == []

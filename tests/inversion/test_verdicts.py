@@ -11,7 +11,8 @@ from napari_shadowinv import InversionOptions, invert, synthetic_image
 from napari_shadowinv.cautions import CAUTION_CODES, Caution
 from napari_shadowinv.facts import Level, Verdict
 from napari_shadowinv.inversion.error_budget import ErrorEstimate
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.setup import ProtonSetup
 
 FEW = InversionOptions(n_sites=900)
 
@@ -124,7 +125,7 @@ def test_the_error_of_the_energy_counts_for_the_field_alone(image):
     instrument = {"beam_rms": 0.0, "energy": 0.4}
     inversion = invert(image, options=FEW, instrument=instrument)
     assert inversion.in_units(None).assessment.verdict is Verdict.DETERMINED
-    assessment = inversion.in_units(paper_setup()).assessment
+    assessment = inversion.in_units(ProtonSetup.example()).assessment
     assert assessment.verdict is Verdict.UNCERTAIN
     assert "energy" in assessment.reason
     assert "the energy known to" in assessment.advice

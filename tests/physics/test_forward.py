@@ -12,7 +12,8 @@ from shapely import LinearRing, Polygon, box
 from helpers.toroid import toroid_displacement, toroid_image
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
-from napari_shadowinv.physics.phantoms import ellipse_pair, paper_setup, toroid
+from napari_shadowinv.physics.phantoms import ellipse_pair, toroid
+from napari_shadowinv.physics.setup import ProtonSetup
 
 Array = NDArray[np.float64]
 
@@ -226,7 +227,7 @@ def test_intensity_is_one_over_the_jacobian(
     rays_per_pixel: int, largest: float, typical: float
 ) -> None:
     """The paper's toroid at 97 MG µm, intensity between 0.2 and 1.7."""
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     field = toroid((200, 200), setup, 97, 30e-6).displacement
     peak = abs(float(setup.displacement_from_path_integrated_b([97.0, 0.0], "MG um")[1]))
     error = synthetic_image(field, rays_per_pixel=rays_per_pixel) - exact_toroid_image(

@@ -23,25 +23,23 @@ from napari_shadowinv.physics.phantoms import (
     four_toroids,
     gaussian_blob,
     opposite_pair,
-    paper_setup,
     plasma_wavelength,
     toroid,
     wakefield,
-    wakefield_setup,
 )
-from napari_shadowinv.physics.setup import SPECIES
+from napari_shadowinv.physics.setup import SPECIES, OpticalSetup, ProtonSetup
 
 PHANTOMS = {
-    "toroid": toroid((120, 90), paper_setup(), 97, 30e-6, center=(70.3, 41.8)),
+    "toroid": toroid((120, 90), ProtonSetup.example(), 97, 30e-6, center=(70.3, 41.8)),
     "ellipse": gaussian_blob((120, 90), 30.0, (18.0, 11.0), (50.2, 44.7), angle=0.7),
     "pair": ellipse_pair((120, 90)),
     "elliptical toroid": toroid(
-        (120, 90), paper_setup(), -20, (27e-6, 18e-6), center=(60.2, 41.8), angle=0.4
+        (120, 90), ProtonSetup.example(), -20, (27e-6, 18e-6), center=(60.2, 41.8), angle=0.4
     ),
-    "four toroids": four_toroids((300, 280), paper_setup()),
-    "focusing pair": focusing_pair((220, 200), paper_setup()),
-    "opposite pair": opposite_pair((220, 200), paper_setup()),
-    "wakefield": wakefield((240, 400), wakefield_setup()),
+    "four toroids": four_toroids((300, 280), ProtonSetup.example()),
+    "focusing pair": focusing_pair((220, 200), ProtonSetup.example()),
+    "opposite pair": opposite_pair((220, 200), ProtonSetup.example()),
+    "wakefield": wakefield((240, 400), OpticalSetup.example()),
 }
 PAPER_SCENES = [four_toroids, cosine_ellipses, focusing_pair, opposite_pair]
 
@@ -66,7 +64,7 @@ def test_gradient_converges_to_the_displacement() -> None:
 
 def test_toroid_has_its_peak_field_at_sigma() -> None:
     """Pixels of 1.5 µm put r = σ = 30 µm exactly 20 pixels from the centre."""
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     phantom = toroid((101, 121), setup, 97, 30e-6, center=(50, 55))
     field = np.hypot(*setup.path_integrated_b(phantom.displacement, "MG um"))
     assert field[50, 75] == pytest.approx(97, rel=1e-12)
@@ -78,7 +76,7 @@ def test_toroid_has_its_peak_field_at_sigma() -> None:
 
 
 def test_toroid_deflects_protons_outwards_and_electrons_inwards() -> None:
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     electrons = setup.model_copy(update={"species": "electron"})
     for beam, sign in ((setup, 1), (electrons, -1)):
         displacement = toroid((41, 41), beam, 10, 15e-6).displacement
@@ -115,7 +113,7 @@ def test_ellipse_pair_has_no_symmetry_and_no_fold() -> None:
 
 def test_caustics_of_the_toroid_start_near_the_papers_value() -> None:
     """The map folds where 1 + d' = 0: at r = √3 σ, for D_m of about 186 MG µm."""
-    setup = paper_setup()
+    setup = ProtonSetup.example()
 
     def smallest(peak: float) -> float:
         phantom = toroid((201, 201), setup, peak, 30e-6)
@@ -129,7 +127,7 @@ def test_gradient_of_objects_with_a_kink_in_the_field(name: str) -> None:
     """Differences over ever smaller pixels approach a continuous field with its kinks."""
     errors = []
     for scale in (1, 4):
-        setup = paper_setup().model_copy(update={"pixel_size": 1.5e-6 / scale})
+        setup = ProtonSetup.example().model_copy(update={"pixel_size": 1.5e-6 / scale})
         shape = (120 * scale, 120 * scale)
         if name == "cosine ellipses":
             phantom = cosine_ellipses(shape, setup)
@@ -145,7 +143,7 @@ def test_gradient_of_objects_with_a_kink_in_the_field(name: str) -> None:
 @pytest.mark.parametrize("scene", PAPER_SCENES)
 def test_caustics_of_the_papers_structures_have_just_formed(scene: Callable[..., Phantom]) -> None:
     """The map folds at the default strength, not yet at 10 % less."""
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     determinant = jacobian_determinant(scene((200, 200), setup).displacement)
     assert -0.1 < determinant.min() < 0
     assert np.mean(determinant < 0) < 0.05
@@ -154,12 +152,12 @@ def test_caustics_of_the_papers_structures_have_just_formed(scene: Callable[...,
 
 @pytest.mark.parametrize("scene", PAPER_SCENES)
 def test_no_flux_leaves_the_image_of_the_papers_structures(scene: Callable[..., Phantom]) -> None:
-    displacement = scene((200, 200), paper_setup()).displacement
+    displacement = scene((200, 200), ProtonSetup.example()).displacement
     assert synthetic_image(displacement).sum() == pytest.approx(200 * 200, rel=1e-4)
 
 
 def test_elliptical_toroid_reaches_its_peak_on_the_shorter_axis() -> None:
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     phantom = toroid((121, 121), setup, 50, (30e-6, 15e-6))
     field = np.hypot(*setup.path_integrated_b(phantom.displacement, "MG um"))
     assert field[60, 70] == pytest.approx(50, rel=1e-12)  # σ_v is 10 pixels
@@ -169,7 +167,7 @@ def test_elliptical_toroid_reaches_its_peak_on_the_shorter_axis() -> None:
 
 def test_cosine_toroid_ends_smoothly_at_its_rim() -> None:
     """cos² has slope zero at the rim, and its largest slope half-way to it."""
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     phantom = cosine_toroid((121, 121), setup, 50, (60e-6, 30e-6))
     field = np.hypot(*setup.path_integrated_b(phantom.displacement, "MG um"))
     assert field[60, 70] == pytest.approx(50, rel=1e-12)  # the rim is at 20 pixels
@@ -182,7 +180,7 @@ def test_cosine_toroid_ends_smoothly_at_its_rim() -> None:
 
 def test_directions_of_the_papers_structures() -> None:
     """Counter-clockwise drives rays apart, a positive potential; clockwise gathers them."""
-    shape, setup = (200, 200), paper_setup()
+    shape, setup = (200, 200), ProtonSetup.example()
     assert four_toroids(shape, setup).potential.min() >= 0
     assert cosine_ellipses(shape, setup).potential.min() >= 0
     assert focusing_pair(shape, setup).potential.max() <= 0
@@ -195,7 +193,7 @@ def test_directions_of_the_papers_structures() -> None:
 
 def test_coaxial_line_obeys_amperes_law() -> None:
     """2π r B is the current inside r: all of it between the conductors, none outside."""
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     phantom, obstructed = coaxial_line((201, 201), setup, 40, (15e-6, 60e-6, 75e-6))
     field = np.hypot(*setup.path_integrated_b(phantom.displacement, "MG um"))[100, 100:]
     r = np.arange(101.0)
@@ -209,7 +207,7 @@ def test_coaxial_line_obeys_amperes_law() -> None:
 
 def test_plasma_wave_has_its_wavelength_and_lags_on_the_axis() -> None:
     """Its crests lie a plasma wavelength apart on the axis, and further to +x off it."""
-    setup = wakefield_setup()
+    setup = OpticalSetup.example()
     wavelength = plasma_wavelength(1.65e25)
     assert wavelength == pytest.approx(3.339e7 / math.sqrt(1.65e25), rel=1e-3)
     wave = wakefield((241, 401), setup, length=1.0, curvature_radius=40e-6, width=3e-6)
@@ -234,7 +232,7 @@ def _wave_density(y: float, z: NDArray[np.float64], xi: float) -> NDArray[np.flo
 @pytest.mark.parametrize(("row", "column"), [(120, 200), (111, 217), (150, 160), (97, 230)])
 def test_line_integral_of_the_plasma_wave(row: int, column: int) -> None:
     """The closed form equals the sum of the density along the beam."""
-    setup = wakefield_setup()
+    setup = OpticalSetup.example()
     wave = wakefield((241, 401), setup)
     modulation = setup.relative_density_modulation(wave.potential, 1.65e25) * 1e6
     z = np.linspace(-60, 60, 20_001)
@@ -247,7 +245,7 @@ def test_thin_plasma_is_the_first_order_of_the_exact_root() -> None:
     z = np.linspace(-60, 60, 20_001)
     errors = []
     for wavelength in (810e-9, 405e-9):
-        setup = wakefield_setup().model_copy(update={"wavelength": wavelength})
+        setup = OpticalSetup.example().model_copy(update={"wavelength": wavelength})
         share = 1.65e25 / setup.critical_density
         density = 1 + _wave_density(0.0, z, 0.0)
         log_index = 0.5 * np.log1p(-share * density) - 0.5 * math.log1p(-share)
@@ -259,7 +257,7 @@ def test_thin_plasma_is_the_first_order_of_the_exact_root() -> None:
 
 
 def test_paper_structures_refuse_wrong_input() -> None:
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     with pytest.raises(InputError, match="strength nan: it must be finite"):
         four_toroids((20, 20), setup, math.nan)
     with pytest.raises(InputError, match="smaller side of the image is 0"):
@@ -271,15 +269,15 @@ def test_paper_structures_refuse_wrong_input() -> None:
     with pytest.raises(InputError, match="three positive, increasing"):
         coaxial_line((9, 9), setup, radii=(2e-6, 1e-6, 3e-6))
     with pytest.raises(InputError, match="width is -1: it must be positive, in m"):
-        wakefield((9, 9), wakefield_setup(), width=-1)
+        wakefield((9, 9), OpticalSetup.example(), width=-1)
     with pytest.raises(InputError, match="radius of curvature is 0: it must not be 0"):
-        wakefield((9, 9), wakefield_setup(), curvature_radius=0)
+        wakefield((9, 9), OpticalSetup.example(), curvature_radius=0)
     with pytest.raises(InputError, match="density is 0: it must be positive"):
         plasma_wavelength(0)
 
 
 def test_phantoms_refuse_wrong_input() -> None:
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     with pytest.raises(InputError, match="sigma is 0: it must be positive, in m"):
         toroid((9, 9), setup, 10, 0)
     with pytest.raises(InputError, match=r"sigma is -1\.0: it must be positive, in px"):
@@ -300,7 +298,7 @@ def test_phantoms_refuse_wrong_input() -> None:
 @pytest.mark.parametrize("peak", [24, 97, 194])
 def test_toroid_of_an_independent_code(peak: int) -> None:
     """Theirs has the momentum √(2 m W), so its displacement is 0.4 % larger."""
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     energy = setup.energy * 1e6 * SPECIES["proton"].charge
     classical = math.sqrt(2 * SPECIES["proton"].mass * energy)
     ours = toroid((200, 200), setup, peak, 30e-6).displacement

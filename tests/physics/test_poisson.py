@@ -7,12 +7,13 @@ import pytest
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import ellipse_pair, paper_setup, toroid
+from napari_shadowinv.physics.phantoms import ellipse_pair, toroid
 from napari_shadowinv.physics.poisson import (
     border_mean,
     poisson_invert,
     potential_from_displacement,
 )
+from napari_shadowinv.physics.setup import ProtonSetup
 
 
 def test_weak_asymmetric_object_is_recovered_in_place() -> None:
@@ -27,7 +28,7 @@ def test_peak_field_is_underestimated_more_as_it_grows(
     peak: float, lowest: float, highest: float
 ) -> None:
     """As in Fig. 6(b) of the paper; the toroid at 10 MG µm comes out 3.5 % low."""
-    phantom = toroid((200, 200), paper_setup(), peak, 30e-6)
+    phantom = toroid((200, 200), ProtonSetup.example(), peak, 30e-6)
     gradient = np.gradient(poisson_invert(synthetic_image(phantom.displacement)))
     error = np.hypot(*gradient).max() / np.hypot(*phantom.displacement).max() - 1
     assert lowest < error < highest

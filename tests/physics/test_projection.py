@@ -9,7 +9,7 @@ import pytest
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.projection import (
     predict_image,
     transferred_displacement,
@@ -17,7 +17,7 @@ from napari_shadowinv.physics.projection import (
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 
 SHAPE = (48, 56)
-FAST = paper_setup()
+FAST = ProtonSetup.example()
 SLOW = FAST.model_copy(update={"energy": 3.0})
 GREEN = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=12e-6)
 RED = GREEN.model_copy(update={"wavelength": 633e-9})

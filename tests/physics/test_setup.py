@@ -18,7 +18,6 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import (
     displacement_from_potential,
 )
-from napari_shadowinv.physics.phantoms import paper_setup
 from napari_shadowinv.physics.setup import (
     SETUPS,
     SPECIES,
@@ -56,7 +55,7 @@ def optical() -> OpticalSetup:
 
 
 def test_magnification_of_the_paper() -> None:
-    assert paper_setup().magnification == pytest.approx(1 + 20 / 1.3)
+    assert ProtonSetup.example().magnification == pytest.approx(1 + 20 / 1.3)
 
 
 def test_collimated_beam_does_not_magnify(optical: OpticalSetup) -> None:

@@ -10,7 +10,8 @@ import pytest
 from napari_shadowinv import InversionOptions
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import Cache, run
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES, quick_source
 from napari_shadowinv.preprocessing import (
@@ -93,7 +94,7 @@ def test_seconds_of_all_stages_are_told(shot: Array) -> None:
 
 
 def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
-    near = paper_setup().model_copy(update={"pixel_size": 2e-5})
+    near = ProtonSetup.example().model_copy(update={"pixel_size": 2e-5})
 
     def warnings(source: Estimate, image: Shot | Array = shot, **more: Any) -> str:
         recipe = Recipe(source=source, options=FEW, setup=near)
@@ -112,7 +113,7 @@ def test_doubts_of_a_source_are_in_the_report(shot: Array) -> None:
 
 
 def test_the_axis_of_an_isotropic_source_is_in_the_middle_of_the_whole_image(shot: Array) -> None:
-    near = paper_setup().model_copy(update={"pixel_size": 2e-5})
+    near = ProtonSetup.example().model_copy(update={"pixel_size": 2e-5})
     crop = slice(20, 40), slice(5, 35)
     recipe = Recipe(
         steps=(Crop(y=(20, 40), x=(5, 35)),), source=IsotropicEstimate(), options=FEW, setup=near

@@ -34,7 +34,8 @@ from napari_shadowinv.inversion.normalise import number_of_sites
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import Cache, read_recipe, run, write_recipe
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.pipeline.inversion_run import collect_inputs
@@ -142,10 +143,10 @@ def test_source_and_masks_go_through_the_same_steps(image: FloatArray) -> None:
 @pytest.mark.parametrize("steps", MOVES)
 def test_the_matrix_says_where_pixels_came_from(steps: tuple[Step, ...]) -> None:
     """A plane is exact under linear interpolation, so its values show where a pixel was."""
-    recipe = Recipe(steps=steps, setup=paper_setup())
+    recipe = Recipe(steps=steps, setup=ProtonSetup.example())
     matrix = recipe.matrix(SHAPE)
     for axis, plane in enumerate(np.indices(SHAPE, dtype=float)):
-        moved = recipe.move(Shot(plane, setup=paper_setup()))
+        moved = recipe.move(Shot(plane, setup=ProtonSetup.example()))
         assert moved.shape == recipe.shape_after(SHAPE)
         share = abs(np.linalg.det(matrix))  # pixels of the image in one of the result
         y, x = np.indices(moved.shape)
@@ -155,14 +156,14 @@ def test_the_matrix_says_where_pixels_came_from(steps: tuple[Step, ...]) -> None
         np.testing.assert_allclose(moved.image[used] / share, expected[used], atol=1e-9)
         assert moved.setup is not None
         assert moved.setup.object_pixel_size == pytest.approx(
-            share**0.5 * paper_setup().object_pixel_size
+            share**0.5 * ProtonSetup.example().object_pixel_size
         )
 
 
 @pytest.mark.parametrize("steps", [steps for steps in MOVES if Rotate(angle=17) not in steps])
 def test_a_point_source_is_where_it_was_in_the_recorded_image(steps: tuple[Step, ...]) -> None:
     image = np.ones(SHAPE)
-    setup = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
+    setup = ProtonSetup.example().model_copy(update={"pixel_size": 6.5e-6})
     for estimate in (IsotropicEstimate(), IsotropicEstimate(centre_y=4, centre_x=11.5)):
         recipe = Recipe(steps=steps, source=estimate, setup=setup, options=OPTIONS)
         inversion = run(recipe, image)
@@ -205,7 +206,7 @@ def changed(choice: type[Choice]) -> Choice:
 
 
 SETUPS = (
-    paper_setup(),
+    ProtonSetup.example(),
     OpticalSetup(wavelength=5e-7, object_image_distance=0.1, pixel_size=1e-5),
 )
 
@@ -377,14 +378,14 @@ def test_a_shot_keeps_the_doubts_about_its_file(tmp_path: Path, image: FloatArra
 
 
 def test_provenance_says_all_that_is_needed(image: FloatArray) -> None:
-    recipe = Recipe(steps=(Bin(factor=2),), setup=paper_setup(), options=OPTIONS)
+    recipe = Recipe(steps=(Bin(factor=2),), setup=ProtonSetup.example(), options=OPTIONS)
     provenance = run(recipe, image).provenance
     assert provenance is not None
     content = json.loads(provenance.model_dump_json())
     assert content["recipe"]["steps"] == [{"step": "bin", "factor": 2}]
     assert content["recipe"]["source"] == {"method": "uniform"}
     assert provenance.setup is not None
-    assert provenance.setup.object_pixel_size == 2 * paper_setup().object_pixel_size
+    assert provenance.setup.object_pixel_size == 2 * ProtonSetup.example().object_pixel_size
     assert provenance.image.notes == ("binned 2 × 2",)
     assert_same(run(provenance.recipe, image), run(recipe, image))
 
@@ -414,7 +415,7 @@ def test_a_setup_of_the_shot_precedes_the_recipe_and_that_of_its_file_does_not(
     image: FloatArray, tmp_path: Path
 ) -> None:
     ours, file, theirs = (
-        paper_setup().model_copy(update={"energy": energy}) for energy in (3.0, 9.0, 15.0)
+        ProtonSetup.example().model_copy(update={"energy": energy}) for energy in (3.0, 9.0, 15.0)
     )
     with h5py.File(tmp_path / "shot.h5", "w") as written:
         written["image"] = image

@@ -9,7 +9,8 @@ from scipy.ndimage import gaussian_filter
 from helpers.shifted_pair import shifted_pair
 from napari_shadowinv import InputError, Instrument, invert
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import opposite_pair, paper_setup, toroid
+from napari_shadowinv.physics.phantoms import opposite_pair, toroid
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.preprocessing import measure_shift, move, register_source
 
 SIDE = 96
@@ -60,7 +61,7 @@ def test_a_source_of_noise_stays_and_a_mesh_below_the_noise_is_registered():
 
 
 def test_an_object_at_the_borders_does_not_move_a_uniform_source():
-    image = synthetic_image(opposite_pair((200, 200), paper_setup()).displacement)
+    image = synthetic_image(opposite_pair((200, 200), ProtonSetup.example()).displacement)
     for seed in range(15):
         noise = 0.003 * np.random.default_rng(seed).normal(size=(2, 200, 200))
         shift = measure_shift(image + noise[0], 1 + noise[1] / 3)
@@ -69,7 +70,9 @@ def test_an_object_at_the_borders_does_not_move_a_uniform_source():
 
 @pytest.mark.parametrize("peak", [97.0, 194.0])
 def test_a_shift_of_a_faint_smooth_beam_is_seen_above_the_noise(peak):
-    clean = synthetic_image(toroid(SMOOTH.shape, paper_setup(), peak, 30e-6).displacement, SMOOTH)
+    clean = synthetic_image(
+        toroid(SMOOTH.shape, ProtonSetup.example(), peak, 30e-6).displacement, SMOOTH
+    )
     rng = np.random.default_rng(0)
     image, source = (rng.poisson(plane).astype(float) for plane in (clean, SMOOTH))
     measured = measure_shift(image[5:], source[:-5])

@@ -9,7 +9,8 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv import InversionOptions, invert, run, synthetic_image
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import plan_sites
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.preprocessing import (
     Bin,
     Crop,
@@ -43,7 +44,7 @@ def beam() -> np.ndarray:
 
 def counted(peak: float) -> tuple[np.ndarray, np.ndarray]:
     """Image and source in counts, with noise of counting."""
-    truth = toroid(SHAPE, paper_setup(), peak, 30e-6).displacement
+    truth = toroid(SHAPE, ProtonSetup.example(), peak, 30e-6).displacement
     rng = np.random.default_rng(1)
     image = rng.poisson(COUNTS * synthetic_image(truth, beam())).astype(float)
     return image, rng.poisson(COUNTS * beam()).astype(float)
@@ -75,7 +76,7 @@ UNLIT = {
 @pytest.mark.parametrize(("name", "seed"), [*((name, 0) for name in UNLIT), ("rim", 1), ("rim", 2)])
 def test_pixels_without_light_never_make_the_peak(name, seed) -> None:
     dark = UNLIT[name][::2, ::2]
-    truth = toroid(dark.shape, paper_setup(), 40.0, 12e-6).displacement
+    truth = toroid(dark.shape, ProtonSetup.example(), 40.0, 12e-6).displacement
     rng = np.random.default_rng(seed)
     image, source = (
         rng.poisson(60 * plane).astype(float)
@@ -96,7 +97,7 @@ def test_pixels_without_light_never_make_the_peak(name, seed) -> None:
 
 @pytest.mark.parametrize("name", ["rim", "frame"])
 def test_without_a_source_a_dark_rim_is_masked_and_a_hollow_stays(name) -> None:
-    hollow = toroid(SHAPE, paper_setup(), 194.0, 30e-6).displacement
+    hollow = toroid(SHAPE, ProtonSetup.example(), 194.0, 30e-6).displacement
     image = np.random.default_rng(2).poisson(300 * synthetic_image(hollow, np.ones(SHAPE)))
     assert mask_dark(image.astype(float), None, None) == (None, [])
     framed = np.where(UNLIT[name], 2.0, image)
@@ -216,13 +217,13 @@ def test_dark_level_is_the_offset_in_units_of_the_mean(shot, share):
 
 @pytest.mark.parametrize("power", [0.0, 0.5, 1.0])
 def test_dark_level_needs_no_kind_of_noise_to_be_silent(power):
-    image = synthetic_image(toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement)
+    image = synthetic_image(toroid(SHAPE, ProtonSetup.example(), 97.0, 30e-6).displacement)
     rng = np.random.default_rng(2)
     assert offset_share(image + 0.05 * image**power * rng.normal(size=SHAPE)) == 0
 
 
 def test_dark_level_of_image_and_source_needs_no_deep_shadows():
-    truth = toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement
+    truth = toroid(SHAPE, ProtonSetup.example(), 97.0, 30e-6).displacement
     clean = synthetic_image(truth, beam())
     alone = []
     for seed in range(6):
@@ -237,7 +238,7 @@ def test_dark_level_of_image_and_source_needs_no_deep_shadows():
 
 
 def test_most_dark_levels_of_a_tenth_show_in_shallow_shadows():
-    truth = toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement
+    truth = toroid(SHAPE, ProtonSetup.example(), 97.0, 30e-6).displacement
     clean = synthetic_image(truth, beam())
     levels = []
     for seed in range(12):
@@ -252,7 +253,7 @@ def test_most_dark_levels_of_a_tenth_show_in_shallow_shadows():
 
 @pytest.mark.parametrize(("uneven", "speckle"), [(0.03, 0.0), (0.0, 0.1), (0.01, 0.03)])
 def test_noise_in_proportion_to_the_signal_is_no_dark_level(uneven, speckle):
-    truth = toroid(SHAPE, paper_setup(), 97.0, 30e-6).displacement
+    truth = toroid(SHAPE, ProtonSetup.example(), 97.0, 30e-6).displacement
     rng = np.random.default_rng(3)
     pixels = 1 + uneven * rng.normal(size=SHAPE)
 

@@ -11,7 +11,7 @@ import pytest
 
 from napari_shadowinv import preprocessing
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv.physics.setup import ProtonSetup
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_filters_do_not_see_masked_pixels(recipe: Any, junk: float) -> None:
     np.testing.assert_array_equal(recipe().filter_image(spoilt, usable)[usable], expected[usable])
 
 
-NEAR = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
+NEAR = ProtonSetup.example().model_copy(update={"pixel_size": 6.5e-6})
 
 
 def test_an_isotropic_estimate_is_the_function_in_its_experiment() -> None:

@@ -7,7 +7,8 @@ from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob, paper_setup
+from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.preprocessing import (
     gaussian_source,
     interpolated_source,
@@ -24,7 +25,7 @@ from napari_shadowinv.preprocessing.estimates import point_distance
 
 SHAPE = (48, 60)
 # 200 px from the source to the detector.
-NEAR = paper_setup().model_copy(update={"pixel_size": 6.5e-6})
+NEAR = ProtonSetup.example().model_copy(update={"pixel_size": 6.5e-6})
 SOURCES = {
     "uniform": uniform_source,
     "gaussian": gaussian_source,
