@@ -127,7 +127,7 @@ def repeated(image, noise):
 
 @pytest.mark.parametrize(
     ("every_image", "noise"),
-    [("focusing", gaussian), *((name, counting) for name in EVERY_IMAGE)],
+    [("focusing", gaussian), *((name, counting) for name in EVERY_IMAGE if "_pair" not in name)],
     indirect=["every_image"],
 )
 def test_noise_is_the_scatter_of_repeats(repeats, every_image, noise):
