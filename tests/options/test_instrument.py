@@ -2,11 +2,10 @@
 
 import pytest
 
-from napari_shadowinv import InputError, Instrument, Recipe
+from napari_shadowinv import InputError, Instrument
 from napari_shadowinv.cli._flags import instrument_keys
 from napari_shadowinv.cli._settings import INVERSION_SECTIONS, settings_of
 from napari_shadowinv.options import BEAM_SOURCES, DETECTORS, BeamPrior
-from napari_shadowinv.pipeline import read_recipe, write_recipe
 
 
 def test_a_detector_fills_in_what_is_not_stated():
@@ -34,15 +33,6 @@ def test_an_unknown_detector_is_refused_with_those_known():
         Instrument.of("paper")
     with pytest.raises(InputError, match=r"'sun'.*'TNSA', 'implosion', 'X-ray tube' or 'laser'"):
         Instrument.of(source="sun")
-
-
-def test_a_stated_zero_survives_a_recipe_file(tmp_path):
-    recipe = Recipe(instrument=Instrument.of("film", source="TNSA", background=0))
-    path = tmp_path / "recipe.toml"
-    write_recipe(path, recipe)
-    assert read_recipe(path) == recipe
-    assert "gamma" not in path.read_text()  # the default of film
-    assert Instrument.model_validate_json(recipe.instrument.model_dump_json()) == recipe.instrument
 
 
 def test_flags_replace_the_detector_of_a_recipe():

@@ -230,7 +230,7 @@ def test_a_recipe_survives_its_file(
         source=chosen if source is MeasuredSource else changed(source),
         mask=tmp_path / "below" / "mask.png",
         setup=setup,
-        instrument=Instrument(beam_rms=0.02, gamma=0.1),
+        instrument=Instrument.of("film", source="TNSA", beam_rms=0.02, background=0),
         options=InversionOptions(n_sites=7, boundary="free", flux="known"),
         fit=fit,
     )
@@ -238,6 +238,7 @@ def test_a_recipe_survives_its_file(
     write_recipe(path, recipe)
     assert read_recipe(path) == recipe
     assert str(tmp_path) not in path.read_text()  # paths are relative to the recipe
+    assert "gamma" not in path.read_text()  # the default of film
     assert Recipe.model_validate_json(recipe.model_dump_json()) == recipe
 
 
