@@ -14,7 +14,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, fit
-from napari_shadowinv.options import FitOptions
+from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.shot import Shot, shots_of
 
 SIZE = (48, 56)
@@ -232,13 +232,20 @@ def test_fiducials_hold_the_field_where_noise_does_not() -> None:
     assert distance(fields[1], truth) < 0.5 * distance(fields[0], truth)
 
 
-def test_neither_threads_nor_a_second_time_change_a_bit(shots: list[FloatArray]) -> None:
+@pytest.mark.parametrize(
+    "instrument", [None, Instrument(beam_rms=0.0, beam_between=0.05)], ids=["exact", "own beams"]
+)
+def test_neither_threads_nor_a_second_time_change_a_bit(
+    shots: list[FloatArray], instrument: Instrument | None
+) -> None:
     images = noisy(shots, NOISE)
     runs = []
     for threads in (1, 3):
         options = FitOptions(samples=2, max_iterations=5, spacing=0.25, threads=threads, seed=3)
-        runs.append(fit(shots_of(images, strength=STRENGTHS, noise=NOISE), options=options))
+        listed = shots_of(images, strength=STRENGTHS, noise=NOISE)
+        runs.append(fit(listed, instrument=instrument, options=options))
     first, second = runs
+    assert first.report.sampling == ("linear" if instrument is None else "resolve")
     np.testing.assert_array_equal(first.fields[0].displacement, second.fields[0].displacement)
     assert first.fields[0].errors.per_pixel is not None
     np.testing.assert_array_equal(
