@@ -21,9 +21,10 @@ from qtpy.QtTest import QTest
 from qtpy.QtWidgets import QApplication, QFileDialog, QLineEdit, QMenu, QWidget
 
 import napari
+from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import role_of, unit_of
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 
 SETUP = """kind = "proton"
 energy = 14.7
@@ -37,7 +38,7 @@ PATIENCE_S = 90.0
 def write_files(folder: Path) -> tuple[Path, Path, Path]:
     """Write a shot, its reference and the setup."""
     rng = np.random.default_rng(1)
-    image = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement)
+    image = synthetic_image(toroid((200, 200), ProtonSetup.example(), 97, 30e-6).displacement)
     files = folder / "shot_0012.tif", folder / "reference.tif", folder / "setup.toml"
     for path, flux in zip(files, (image, np.ones_like(image)), strict=False):
         tifffile.imwrite(path, rng.poisson(2000 * flux).astype(np.uint16))

@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv import FitOptions, InversionOptions, fit, invert
-from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv import FitOptions, InversionOptions, ProtonSetup, fit, invert
 from napari_shadowinv.shot import shots_of
 from reference import errors, toroid_case
 
@@ -55,7 +54,7 @@ def blobs(parts: list[tuple[float, float, float, float, float, float]]) -> Field
 
 def outward(peak: float) -> float:
     """Displacement in px by a field in MG µm in the paper's experiment."""
-    field = paper_setup().displacement_from_path_integrated_b([-peak, 0.0], "MG um")
+    field = ProtonSetup.example().displacement_from_path_integrated_b([-peak, 0.0], "MG um")
     return float(field[1])
 
 
@@ -165,7 +164,7 @@ class Case:
     keywords: dict[str, Any] = field(default_factory=dict)
 
     def strengths(self) -> FloatArray:
-        setups = [paper_setup().model_copy(update={"energy": e}) for e in self.energies]
+        setups = [ProtonSetup.example().model_copy(update={"energy": e}) for e in self.energies]
         first = setups[0]
         magnetic = [first.momentum / s.momentum for s in setups]
         rigid = [first.momentum * first.velocity / s.momentum / s.velocity for s in setups]

@@ -16,9 +16,8 @@ from collections.abc import Callable
 import numpy as np
 
 from fit import blobs, counted, unit_of_time
-from napari_shadowinv import fit
+from napari_shadowinv import ProtonSetup, fit
 from napari_shadowinv.fitting.rays import RayModel, TracedBeam
-from napari_shadowinv.physics.phantoms import paper_setup
 from napari_shadowinv.shot import shots_of
 from reference import errors
 
@@ -40,7 +39,9 @@ def fastest(work: Callable[[], object], times: int = 15) -> float:
 
 def main() -> None:
     field = blobs([tuple(map(float, one)) for one in BLOBS])
-    momenta = [paper_setup().model_copy(update={"energy": e}).momentum for e in (14.7, 30.0, 60.0)]
+    momenta = [
+        ProtonSetup.example().model_copy(update={"energy": e}).momentum for e in (14.7, 30.0, 60.0)
+    ]
     strengths = momenta[0] / np.array(momenta)
     clean = [counted([field], np.array([one]), None, SIZE, RAYS) for one in strengths]
     images = clean + NOISE * np.random.default_rng(0).normal(size=(3, *SIZE))

@@ -36,8 +36,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from fit import Beam, Field, blobs, counted
-from napari_shadowinv import Fit, FitOptions, fit
-from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv import Fit, FitOptions, ProtonSetup, fit
 from napari_shadowinv.shot import shots_of
 
 # A scientific camera: 1,000 photoelectrons a pixel, and 5 more of r.m.s. noise by reading.
@@ -71,7 +70,9 @@ class Shots:
 
     def strengths(self) -> FloatArray:
         """Return the displacement of each image by each field, relative to the first image."""
-        setups = [paper_setup().model_copy(update={"energy": energy}) for energy in self.energies]
+        setups = [
+            ProtonSetup.example().model_copy(update={"energy": energy}) for energy in self.energies
+        ]
         magnetic = [setups[0].momentum / setup.momentum for setup in setups]
         rigid = [setup.momentum * setup.velocity for setup in setups]
         electric = [rigid[0] / value for value in rigid]
@@ -416,7 +417,9 @@ def main() -> None:
 def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str, str, Fit]:
     """Fit one case; return its row of the table, its mark, and the result."""
     begun = time.perf_counter()
-    setups = [paper_setup().model_copy(update={"energy": energy}) for energy in shots.energies]
+    setups = [
+        ProtonSetup.example().model_copy(update={"energy": energy}) for energy in shots.energies
+    ]
     images = shots.images(seed)
     if shots.mask is not None:
         images = np.ma.array(images, mask=np.broadcast_to(~shots.mask, np.shape(images)))

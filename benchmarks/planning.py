@@ -18,9 +18,8 @@ import time
 import numpy as np
 
 from instrument import COUNTS, IMPERFECTIONS, Shot, objects, truth
-from napari_shadowinv import Instrument, invert
+from napari_shadowinv import Instrument, ProtonSetup, invert
 from napari_shadowinv.physics.phantom_models import BlobRecipe, ToroidRecipe
-from napari_shadowinv.physics.phantoms import paper_setup
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
 from napari_shadowinv.pipeline.experiment_object import object_of_displacement
 
@@ -32,7 +31,7 @@ INSTRUMENTS = {
 
 
 def setups() -> list:
-    first = paper_setup()
+    first = ProtonSetup.example()
     return [first, first.model_copy(update={"energy": 30.0})]
 
 

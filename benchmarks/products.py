@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import constants
 
-from napari_shadowinv import Inversion, invert, synthetic_image
+from napari_shadowinv import Inversion, ProtonSetup, invert, synthetic_image
 from napari_shadowinv.analysis import (
     Contrast,
     CurrentDensity,
@@ -38,10 +38,9 @@ from napari_shadowinv.analysis import (
 )
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
-from napari_shadowinv.physics.phantoms import paper_setup
 
 FloatArray = NDArray[np.float64]
-SETUP = paper_setup()
+SETUP = ProtonSetup.example()
 SHARE = 0.68
 BORDER_PX = 8  # of a map, where it depends on what is outside
 

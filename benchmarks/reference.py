@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv import synthetic_image
-from napari_shadowinv.physics.phantoms import ellipse_pair, paper_setup, toroid
+from napari_shadowinv import ProtonSetup, synthetic_image
+from napari_shadowinv.physics.phantoms import ellipse_pair, toroid
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -30,7 +30,7 @@ def toroid_case(peak: int, noise: bool = False) -> Case:
     file = folder / f"dm{peak:03d}{'_noise' if noise else ''}.npy"
     if file.exists():
         return Case(name, np.load(file), np.load(folder / f"dm{peak:03d}_displacement.npy"))
-    truth = toroid((200, 200), paper_setup(), float(peak), 30e-6).displacement
+    truth = toroid((200, 200), ProtonSetup.example(), float(peak), 30e-6).displacement
     image = synthetic_image(truth)
     if noise:
         image += 0.1 * np.random.default_rng(peak).normal(size=image.shape)

@@ -9,14 +9,14 @@ import time
 
 import numpy as np
 
-from napari_shadowinv import InversionOptions, invert, synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv import InversionOptions, ProtonSetup, invert, synthetic_image
+from napari_shadowinv.physics.phantoms import toroid
 from reference import Case, errors
 
 
 def case(side: int, peak: float) -> Case:
     """The paper's toroid over the same 300 µm, on side² pixels."""
-    setup = paper_setup().model_copy(update={"pixel_size": 300e-6 / side})
+    setup = ProtonSetup.example().model_copy(update={"pixel_size": 300e-6 / side})
     truth = toroid((side, side), setup, peak, 30e-6).displacement
     return Case(f"toroid {peak:g}, {side}²", synthetic_image(truth, rays_per_pixel=64), truth)
 

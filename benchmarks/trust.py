@@ -56,7 +56,17 @@ from exact_shots import (
     truth_of,
     with_slope,
 )
-from napari_shadowinv import Fit, Instrument, Inversion, ProtonSetup, analyse, fit, invert, read
+from napari_shadowinv import (
+    Fit,
+    Instrument,
+    Inversion,
+    OpticalSetup,
+    ProtonSetup,
+    analyse,
+    fit,
+    invert,
+    read,
+)
 from napari_shadowinv.analysis import EnclosedCurrent, LineProfile
 from napari_shadowinv.shot import shots_of
 
@@ -867,7 +877,7 @@ def samples(seed: int, count: int) -> Iterator[Answer]:
     from napari_shadowinv._napari import samples as sample_data
     from napari_shadowinv.physics import phantoms
 
-    setup = phantoms.paper_setup()
+    setup = ProtonSetup.example()
     toroid = phantoms.toroid((200, 200), setup, 97.0, 30e-6).displacement
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "napari_shadowinv", "demo", "--out", folder]
@@ -905,7 +915,7 @@ def sampled_run(sample_data: Any, phantoms: Any) -> Iterator[Answer]:
         height, width = stack.shape[1:]
         wave = phantoms.wakefield(
             (height, width),
-            phantoms.wakefield_setup(),
+            OpticalSetup.example(),
             0.8 * np.sin(np.pi * (0.15 + 0.75 * phase)) ** 2,
             center=((height - 1) / 2, width * (0.2 + 0.6 * phase)),
         )

@@ -19,10 +19,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv import InversionOptions, invert, synthetic_image
+from napari_shadowinv import InversionOptions, ProtonSetup, invert, synthetic_image
 from napari_shadowinv.inversion import ErrorSamples, plan_sites
 from napari_shadowinv.inversion.result import Inversion
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 from reference import toroid_case
 
 SIGMA = 0.1
@@ -94,7 +94,7 @@ def agreement_row(peak: int, n_sites: int, n: int) -> str:
 
 def calibration_row(peak: int, kind: str, n: int, shots: int) -> str:
     options = InversionOptions(n_sites=40_000, negative="clip")
-    truth = toroid(SOURCE.shape, paper_setup(), float(peak), 30e-6).displacement
+    truth = toroid(SOURCE.shape, ProtonSetup.example(), float(peak), 30e-6).displacement
     clean = synthetic_image(truth)
     rng = np.random.default_rng(peak)
     if kind == "Gaussian":

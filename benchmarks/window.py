@@ -22,15 +22,15 @@ from qtpy.QtCore import QSettings
 from qtpy.QtWidgets import QApplication
 
 import napari
-from napari_shadowinv import InversionOptions, Recipe, run
+from napari_shadowinv import InversionOptions, ProtonSetup, Recipe, run
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.pipeline import Cache
 
 
 def noisy_toroid(side: int) -> np.ndarray[Any, Any]:
     """The paper's toroid below caustics, with 5 % of noise."""
-    setup = paper_setup().model_copy(update={"pixel_size": 1.5e-6 * 200 / side})
+    setup = ProtonSetup.example().model_copy(update={"pixel_size": 1.5e-6 * 200 / side})
     image = synthetic_image(toroid((side, side), setup, 97, 30e-6).displacement)
     return np.maximum(image + np.random.default_rng(0).normal(0, 0.05, image.shape), 0)
 

@@ -23,7 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv import Instrument, InversionOptions, read, synthetic_image
+from napari_shadowinv import (
+    Instrument,
+    InversionOptions,
+    OpticalSetup,
+    ProtonSetup,
+    read,
+    synthetic_image,
+)
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.normalise import mask_unlit, prepare
@@ -159,7 +166,7 @@ def noticed_shots(seeds: int) -> dict[str, list[bool]]:
     """Return for each mistake whether it was named, over strengths, beams, counts and seeds."""
     named: dict[str, list[bool]] = {}
     for peak in (97.0, 194.0):
-        truth = phantoms.toroid(SHAPE, phantoms.paper_setup(), peak, 30e-6).displacement
+        truth = phantoms.toroid(SHAPE, ProtonSetup.example(), peak, 30e-6).displacement
         for kind in ("smooth", "structured"):
             clean = beam(kind)
             folded = synthetic_image(truth, clean)
@@ -177,7 +184,7 @@ def noticed_shots(seeds: int) -> dict[str, list[bool]]:
 
 def right_shots(seeds: int) -> Iterator[tuple[str, Shot]]:
     """Yield right shots: all phantoms with all noises and beams, and the reference images."""
-    setup = phantoms.paper_setup()
+    setup = ProtonSetup.example()
     scenes: dict[str, Callable[[], phantoms.Phantom]] = {
         "toroid 24": lambda: phantoms.toroid(SHAPE, setup, 24.0, 30e-6),
         "toroid 97": lambda: phantoms.toroid(SHAPE, setup, 97.0, 30e-6),
@@ -189,7 +196,7 @@ def right_shots(seeds: int) -> Iterator[tuple[str, Shot]]:
         "coaxial line": lambda: phantoms.coaxial_line(SHAPE, setup)[0],
         "ellipse pair": lambda: phantoms.ellipse_pair(SHAPE),
         "blob": lambda: phantoms.gaussian_blob(SHAPE, 100.0, 20.0),
-        "plasma wave": lambda: phantoms.wakefield(SHAPE, phantoms.wakefield_setup()),
+        "plasma wave": lambda: phantoms.wakefield(SHAPE, OpticalSetup.example()),
     }
     for name, make in scenes.items():
         displacement = make().displacement

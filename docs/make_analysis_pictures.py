@@ -31,7 +31,7 @@ from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.plotting import make_logarithmic
 
 BINNED = 8
@@ -210,7 +210,7 @@ def filaments(side: int = 160, radius: float = 5.0, spacing: float = 29.0) -> No
 
 def integrals(side: int = 160, sigma: float = 24e-6) -> None:
     """Draw a flux, a current and a region of a toroid, its azimuthal field, and the contrast."""
-    setup, middle = paper_setup(), (side - 1) / 2
+    setup, middle = ProtonSetup.example(), (side - 1) / 2
     figure = Figure(figsize=(11, 3.5), layout="constrained")
     left, centre, right = figure.subplots(1, 3)
     for peak, colour in ((60, BLUE), (6, ORANGE)):

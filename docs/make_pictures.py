@@ -19,13 +19,14 @@ from PIL import Image
 from napari_shadowinv import (
     FitOptions,
     InversionOptions,
+    ProtonSetup,
     fit,
     invert,
     poisson_invert,
     read,
     synthetic_image,
 )
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.plotting import (
     comparison_figure,
     fit_figure,
@@ -49,7 +50,7 @@ def save_small(figure: Figure, path: Path, width: int) -> None:
 
 def toroid_picture() -> None:
     """The paper's toroid with noise: truth, retrieval and linear inversion."""
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     truth = toroid((200, 200), setup, 97.0, 30e-6).displacement
     image = synthetic_image(truth)
     image += 0.1 * np.random.default_rng(0).normal(size=image.shape)
@@ -73,7 +74,7 @@ def burner_picture(folder: Path) -> None:
 
 def fit_picture() -> None:
     """Two folded radiographs, and the field and the beam that explain both."""
-    low = paper_setup()
+    low = ProtonSetup.example()
     high = low.model_copy(update={"energy": 30.0})
     truth = toroid((200, 200), low, 290.0, 30e-6).displacement
     y, x = np.indices((200, 200))

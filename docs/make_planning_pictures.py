@@ -7,9 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from napari_shadowinv import Instrument
+from napari_shadowinv import Instrument, ProtonSetup
 from napari_shadowinv.physics.phantom_models import ToroidRecipe
-from napari_shadowinv.physics.phantoms import paper_setup
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
 from napari_shadowinv.plotting import plan_figure, save_figure
 
@@ -23,7 +22,7 @@ def main() -> None:
     """Plan one shot of the paper's protons."""
     options = ExperimentOptions()
     plan = plan_experiment(
-        OBJECT, paper_setup(), shape=SHAPE, instrument=INSTRUMENT, options=options
+        OBJECT, ProtonSetup.example(), shape=SHAPE, instrument=INSTRUMENT, options=options
     )
     print(plan.headline.text)
     print("\n".join(f"{fact.title}: {fact.text}" for fact in plan.facts))

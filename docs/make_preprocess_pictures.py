@@ -22,9 +22,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from napari_shadowinv import invert, read, synthetic_image
+from napari_shadowinv import ProtonSetup, invert, read, synthetic_image
 from napari_shadowinv.options import BeamPrior
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import (
     butterworth,
     gaussian_source,
@@ -177,7 +177,7 @@ def source_pictures() -> None:
     y, x = grid()
     flat = scene(np.ones(SHAPE), big_object())
     source_picture("uniform", "uniform_source", flat, uniform_source(flat.shot))
-    setup = paper_setup().model_copy(update={"pixel_size": 4e-6})
+    setup = ProtonSetup.example().model_copy(update={"pixel_size": 4e-6})
     point = scene(isotropic_source(np.ones(SHAPE), setup), 0.5 * big_object())
     source_picture(
         "isotropic",

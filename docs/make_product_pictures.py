@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from napari_shadowinv import analyse, invert, synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv import ProtonSetup, analyse, invert, synthetic_image
+from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.plotting import products_figure, save_figure
 
 PICTURE = Path(__file__).parent / "pictures" / "products.png"
@@ -21,7 +21,7 @@ MIDDLE = (SIDE - 1) / 2
 
 
 def main() -> None:
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     phantom = toroid((SIDE, SIDE), setup, peak=60, sigma=24e-6)
     image = np.random.default_rng(0).poisson(COUNTS * synthetic_image(phantom.displacement))
     inversion = invert(image, source=np.full(image.shape, COUNTS))

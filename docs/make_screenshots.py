@@ -31,10 +31,10 @@ from qtpy.QtGui import QImage
 from qtpy.QtWidgets import QApplication
 
 import napari
-from napari_shadowinv import run_stack, synthetic_image
+from napari_shadowinv import ProtonSetup, run_stack, synthetic_image
 from napari_shadowinv._napari.layer_metadata import metadata_for
 from napari_shadowinv.io import read_shot
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.preprocessing import Recipe
 
@@ -246,7 +246,7 @@ def night_window() -> None:
 def series_window() -> None:
     """Eight shots of a growing toroid: the circle, its numbers over time and their growth."""
     viewer = new_window("growing field", height=900)
-    setup, rng = paper_setup(), np.random.default_rng(0)
+    setup, rng = ProtonSetup.example(), np.random.default_rng(0)
     phantoms = [toroid((96, 96), setup, 15 * np.exp(0.2 * time), 14e-6) for time in range(8)]
     shots = [rng.poisson(400 * synthetic_image(each.displacement)) for each in phantoms]
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
@@ -273,7 +273,7 @@ def series_window() -> None:
 def fit_window() -> None:
     """Two films of one toroid: the widget, its verdict and the field."""
     viewer = new_window("two energies", height=860)
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     truth = toroid((96, 96), setup, 90.0, 16e-6).displacement
     for seed, energy in enumerate((14.7, 30.0)):
         film = setup.model_copy(update={"energy": energy})

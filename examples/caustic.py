@@ -16,8 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.ndimage import binary_closing, binary_dilation, gaussian_filter
 
-from napari_shadowinv import invert, synthetic_image
-from napari_shadowinv.physics import jacobian_determinant, paper_setup, toroid
+from napari_shadowinv import ProtonSetup, invert, synthetic_image
+from napari_shadowinv.physics import jacobian_determinant, toroid
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("--peak", type=float, default=290.0, help="peak of ∫B dl in MG µm")
@@ -28,7 +28,7 @@ options.out.mkdir(parents=True, exist_ok=True)
 
 # %% The true field and its image
 side = 100 if options.small else 200
-setup = paper_setup().model_copy(update={"pixel_size": 300e-6 / side})
+setup = ProtonSetup.example().model_copy(update={"pixel_size": 300e-6 / side})
 truth = toroid((side, side), setup, peak=options.peak, sigma=30e-6).displacement
 image = synthetic_image(truth)
 

@@ -13,12 +13,12 @@ import numpy as np
 from napari.components import ViewerModel
 from npe2 import PluginManager
 
-from napari_shadowinv import InversionOptions, add_to_viewer, invert
+from napari_shadowinv import InversionOptions, ProtonSetup, add_to_viewer, invert
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 
-setup = paper_setup()
+setup = ProtonSetup.example()
 if len(sys.argv) > 1:
     shot = read_shot(sys.argv[1]).image
 else:

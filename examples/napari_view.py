@@ -7,8 +7,7 @@ python napari_view.py result.shadowinv   a result that was saved
 import sys
 
 import napari
-from napari_shadowinv import InversionOptions, add_to_viewer, invert
-from napari_shadowinv.physics.phantoms import paper_setup
+from napari_shadowinv import InversionOptions, ProtonSetup, add_to_viewer, invert
 
 viewer = napari.Viewer()
 if len(sys.argv) > 1:
@@ -16,7 +15,7 @@ if len(sys.argv) > 1:
 else:
     *_, shot = viewer.open_sample("napari-shadowinv", "toroid_with_caustics")
     inversion = invert(shot.data, options=InversionOptions(n_sites=10_000))
-    add_to_viewer(viewer, inversion, paper_setup(), name="toroid")
+    add_to_viewer(viewer, inversion, ProtonSetup.example(), name="toroid")
 
 if __name__ == "__main__":
     napari.run()

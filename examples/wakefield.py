@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from napari_shadowinv import invert, synthetic_image
-from napari_shadowinv.physics.phantoms import plasma_wavelength, wakefield, wakefield_setup
+from napari_shadowinv import OpticalSetup, invert, synthetic_image
+from napari_shadowinv.physics.phantoms import plasma_wavelength, wakefield
 from napari_shadowinv.preprocessing import filters
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -28,7 +28,7 @@ options.out.mkdir(parents=True, exist_ok=True)
 # %% The wave and its image, with the noise of 2000 counts per pixel
 density = 1.65e25  # electrons per m³
 factor = 2 if options.small else 1
-setup = wakefield_setup()
+setup = OpticalSetup.example()
 setup = setup.model_copy(update={"pixel_size": setup.object_pixel_size * factor})
 shape = (200 // factor, 360 // factor)
 wave = wakefield(shape, setup, density=density)

@@ -46,7 +46,7 @@ def of_phantom(structure: Structure) -> Field:
     """Field of a phantom on a square of the paper's size."""
 
     def field(n: int) -> Array:
-        return structure((n, n), with_pixels(phantoms.paper_setup(), n)).displacement / n
+        return structure((n, n), with_pixels(ProtonSetup.example(), n)).displacement / n
 
     return field
 
@@ -71,7 +71,7 @@ def paper_fields() -> dict[str, Field]:
 
 def coaxial_source(n: int) -> Array:
     """Beam that the conductors of the coaxial line stop."""
-    _, obstructed = phantoms.coaxial_line((n, n), with_pixels(phantoms.paper_setup(), n))
+    _, obstructed = phantoms.coaxial_line((n, n), with_pixels(ProtonSetup.example(), n))
     return np.where(obstructed, 0.0, 1.0)
 
 

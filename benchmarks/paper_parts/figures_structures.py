@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from napari_shadowinv.physics import phantoms
+from napari_shadowinv import OpticalSetup
 from paper_parts.drawing import (
     BLUE,
     FIELD_LABEL,
@@ -83,7 +83,7 @@ def draw_cut(
 def figure_wave(wave: Wave, path: Path) -> None:
     figure = new_figure(12.6, 10)
     panels = figure.subplots(3, 2, height_ratios=(1.25, 1.25, 1))
-    pixel = phantoms.wakefield_setup().object_pixel_size * 1e6
+    pixel = OpticalSetup.example().object_pixel_size * 1e6
     high = float(np.abs(wave.true).max())
     label = "∫Δn/n₀ dz (µm)"
     shadow = (float(wave.image.min()), float(np.percentile(wave.image, 99.9)))

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq
 
-from napari_shadowinv import Inversion, poisson_invert, synthetic_image
+from napari_shadowinv import Inversion, OpticalSetup, poisson_invert, synthetic_image
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import jacobian_determinant
 from paper_parts.shots import (
@@ -205,7 +205,7 @@ class Wave:
 
 
 def plasma_wave() -> Wave:
-    setup = phantoms.wakefield_setup()
+    setup = OpticalSetup.example()
     density = 1.65e25
     phantom = phantoms.wakefield(PLASMA_SHAPE, setup, density=density)
     image = synthetic_image(phantom.displacement)

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from napari_shadowinv import Inversion, InversionOptions, invert
+from napari_shadowinv import Inversion, InversionOptions, ProtonSetup, invert
 from napari_shadowinv.physics import phantoms
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 SHAPE = (200, 200)
-SETUP = phantoms.paper_setup()
+SETUP = ProtonSetup.example()
 PIXEL = SETUP.object_pixel_size * 1e6  # µm
 SIGMA = 30e-6
 NOISE = 0.1

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from napari_shadowinv import Instrument, OpticalSetup, invert, read, trace, write
+from napari_shadowinv import Instrument, OpticalSetup, ProtonSetup, invert, read, trace, write
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.physics import FieldGrid
 from napari_shadowinv.physics.phantom_models import BlobRecipe, FourToroidsRecipe, ToroidRecipe
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
+from napari_shadowinv.physics.phantoms import gaussian_blob, toroid
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
 from napari_shadowinv.pipeline.experiment_object import (
     Grid,
@@ -29,7 +29,7 @@ from napari_shadowinv.pipeline.experiment_result import (
 )
 from napari_shadowinv.pipeline.experiment_shots import ExperimentInputs, ShotSimulator
 
-SETUP = paper_setup()
+SETUP = ProtonSetup.example()
 SLOWER = SETUP.model_copy(update={"energy": 6.0})
 EXACT = Instrument(beam_rms=0.0)
 

@@ -15,7 +15,7 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.io.public_images import fetch_burner
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.setup import setup_from_dict
+from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, setup_from_dict
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.shot import Shot
 
@@ -41,7 +41,7 @@ def toroid_with_caustics() -> LayerData:
 
 def four_toroids() -> LayerData:
     """Four toroids under an uneven beam, which differs by 0.5 % (r.m.s.) from its reference."""
-    phantom = phantoms.four_toroids(_SHAPE, phantoms.paper_setup(), 0.8)
+    phantom = phantoms.four_toroids(_SHAPE, ProtonSetup.example(), 0.8)
     y, x = _coordinates()
     beam = 1 + 0.3 * np.sin(2.3 * x + 0.4) * np.cos(1.7 * y - 0.3) + 0.15 * x
     change = 1 + 0.01 * np.sin(5.1 * x + 1.0) * np.cos(4.3 * y + 0.6)
@@ -50,7 +50,7 @@ def four_toroids() -> LayerData:
 
 def coaxial_line() -> LayerData:
     """Field between two conductors that stop the beam; the source holds their shadow."""
-    phantom, obstructed = phantoms.coaxial_line(_SHAPE, phantoms.paper_setup())
+    phantom, obstructed = phantoms.coaxial_line(_SHAPE, ProtonSetup.example())
     return _proton_shot("coaxial line", phantom, np.where(obstructed, 0.0, 1.0))
 
 
@@ -78,7 +78,7 @@ def wakefield_run() -> LayerData:
     """Twenty optical shots of a plasma wave that moves, grows and fades, computed when shown."""
     stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
     limits = intensity_limits(_wakefield_shot(_RUN_LENGTH // 2))
-    shots = Shot(stack, setup=phantoms.wakefield_setup(), source=_wakefield_beam())
+    shots = Shot(stack, setup=OpticalSetup.example(), source=_wakefield_beam())
     return layers_of_shot(shots, "wakefield run", limits)
 
 
@@ -91,7 +91,7 @@ def burner() -> LayerData:
 
 
 def _toroid_of(peak: float) -> phantoms.Phantom:
-    return phantoms.toroid(_SHAPE, phantoms.paper_setup(), peak, 30e-6)
+    return phantoms.toroid(_SHAPE, ProtonSetup.example(), peak, 30e-6)
 
 
 def _proton_shot(
@@ -106,7 +106,7 @@ def _proton_shot(
     # Pixels that no ray can reach, behind an obstacle, are dark in both.
     lit = (light > 0) | (synthetic_image(phantom.displacement, light) > 0)
     mask = None if lit.all() else lit
-    shot = Shot(image, setup=phantoms.paper_setup(), source=source, mask=mask)
+    shot = Shot(image, setup=ProtonSetup.example(), source=source, mask=mask)
     return layers_of_shot(shot, name)
 
 
@@ -128,7 +128,7 @@ def _wakefield_shot(shot: int) -> FloatArray:
     height, width = _RUN_SHAPE
     wave = phantoms.wakefield(
         _RUN_SHAPE,
-        phantoms.wakefield_setup(),
+        OpticalSetup.example(),
         0.8 * np.sin(np.pi * (0.15 + 0.75 * phase)) ** 2,
         center=((height - 1) / 2, width * (0.2 + 0.6 * phase)),
     )

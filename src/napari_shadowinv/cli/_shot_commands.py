@@ -193,12 +193,13 @@ def demo(
     make_folder(out)
     from napari_shadowinv.io import write
     from napari_shadowinv.physics.forward import synthetic_image
-    from napari_shadowinv.physics.phantoms import paper_setup, toroid
+    from napari_shadowinv.physics.phantoms import toroid
     from napari_shadowinv.physics.poisson import poisson_invert
+    from napari_shadowinv.physics.setup import ProtonSetup
     from napari_shadowinv.pipeline import run
     from napari_shadowinv.plotting import comparison_figure, report_figure
 
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     truth = toroid((200, 200), setup, peak=_DEMO_PEAK, sigma=30e-6).displacement
     image = synthetic_image(truth)
     grain = np.random.default_rng(0).normal(size=image.shape)

@@ -1,7 +1,7 @@
 from .field_grid import FieldGrid, field_grid
 from .forward import jacobian_determinant, synthetic_image
 from .particle_flight import TracedParticles, trace_particles
-from .phantoms import Phantom, ellipse_pair, gaussian_blob, paper_setup, toroid
+from .phantoms import Phantom, ellipse_pair, gaussian_blob, toroid
 from .poisson import poisson_invert
 from .projection import predict_image, transferred_displacement
 from .setup import OpticalSetup, ProtonSetup, Setup, setup_from_dict
@@ -21,7 +21,6 @@ __all__ = [
     "field_grid",
     "gaussian_blob",
     "jacobian_determinant",
-    "paper_setup",
     "poisson_invert",
     "predict_image",
     "setup_from_dict",

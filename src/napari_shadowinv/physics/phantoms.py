@@ -1,9 +1,9 @@
 """Objects whose potential and displacement are known exactly.
 
-- the paper's experiment and its toroidal magnetic field: `paper_setup`, `toroid`
+- the paper's toroidal magnetic field: `toroid`
 - the structures of its Fig. 6: `four_toroids`, `cosine_ellipses`, `focusing_pair`,
   `opposite_pair`, `coaxial_line`
-- a plasma wave, probed by light: `wakefield`, `wakefield_setup`, `plasma_wavelength`
+- a plasma wave, probed by light: `wakefield`, `plasma_wavelength`
 - building blocks, round or elliptical: `gaussian_blob`, `cosine_toroid`; phantoms are
   added with ``+``
 - an object that every flip, shift or swap of axes changes: `ellipse_pair`
@@ -41,11 +41,9 @@ __all__ = [
     "four_toroids",
     "gaussian_blob",
     "opposite_pair",
-    "paper_setup",
     "plasma_wavelength",
     "toroid",
     "wakefield",
-    "wakefield_setup",
 ]
 
 Radii = float | tuple[float, float]
@@ -124,9 +122,9 @@ def toroid(
 
     Examples
     --------
-    >>> from napari_shadowinv.physics.phantoms import paper_setup
-    >>> phantom = toroid((200, 200), paper_setup(), peak=97, sigma=30e-6)
-    >>> field = paper_setup().path_integrated_b(phantom.displacement, "MG um")
+    >>> from napari_shadowinv import ProtonSetup
+    >>> phantom = toroid((200, 200), ProtonSetup.example(), peak=97, sigma=30e-6)
+    >>> field = ProtonSetup.example().path_integrated_b(phantom.displacement, "MG um")
     >>> float(np.hypot(*field).max())
     96.99
     """
@@ -234,15 +232,6 @@ def _along_axes(
 # Peak in MG µm, radii in shares of the image's smaller side, centre in shares of height
 # and width, angle in rad.
 Part = tuple[float, Radii, tuple[float, float], float]
-
-
-def paper_setup() -> ProtonSetup:
-    """Experiment of the paper's benchmark (Section IV A).
-
-    Protons of 14.7 MeV, 1.3 mm from source to object, 2 cm on to the detector, pixels
-    of 1.5 µm in the object plane: 200 pixels are ten times the toroid's σ of 30 µm.
-    """
-    return ProtonSetup.example()
 
 
 def four_toroids(shape: tuple[int, int], setup: ProtonSetup, strength: float = 1.0) -> Phantom:
@@ -372,15 +361,6 @@ def _scene(
         center = share[0] * shape[0] - 0.5, share[1] * shape[1] - 0.5
         phantoms.append(make(shape, setup, strength * peak, lengths, center, angle))
     return sum(phantoms[1:], start=phantoms[0])
-
-
-def wakefield_setup() -> OpticalSetup:
-    """Optical probe of the paper's plasma wave: collimated light of 810 nm (Section V).
-
-    The image is of a plane 20 µm behind the wave, at 0.25 µm per pixel. The paper gives neither
-    distance nor pixel; farther behind, diffraction at a wave of 8 µm would no longer be small.
-    """
-    return OpticalSetup.example()
 
 
 def plasma_wavelength(density: float) -> float:

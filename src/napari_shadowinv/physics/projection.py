@@ -133,8 +133,8 @@ def transferred_displacement(
     --------
     Slower protons are deflected more, by the ratio of the momenta in a magnetic field:
 
-    >>> from napari_shadowinv.physics.phantoms import paper_setup
-    >>> setup = paper_setup()
+    >>> from napari_shadowinv import ProtonSetup
+    >>> setup = ProtonSetup.example()
     >>> slow = setup.model_copy(update={"energy": 3.0})
     >>> float(transferred_displacement(np.ones((2, 4, 4)), setup, slow)[0, 0, 0])
     2.22

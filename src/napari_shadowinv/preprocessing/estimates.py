@@ -570,8 +570,8 @@ def isotropic_source(
 
     Examples
     --------
-    >>> from napari_shadowinv.physics.phantoms import paper_setup
-    >>> beam = isotropic_source(np.ones((201, 201)), paper_setup())
+    >>> from napari_shadowinv import ProtonSetup
+    >>> beam = isotropic_source(np.ones((201, 201)), ProtonSetup.example())
     >>> float(round(beam[0, 0] / beam[100, 100], 3))  # the corner, 9.3 degrees from the axis
     0.961
     """

@@ -16,14 +16,13 @@ from pydantic import BaseModel
 from qtpy.QtWidgets import QFileDialog
 
 from helpers.forms import enter
-from napari_shadowinv import InputError, Instrument, InversionOptions, ProtonSetup
+from napari_shadowinv import InputError, Instrument, InversionOptions, OpticalSetup, ProtonSetup
 from napari_shadowinv._napari.form import ModelForm, ModelPicker, kinds_of
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._qt import save_state, saved_state
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.phantom_models import PHANTOMS
-from napari_shadowinv.physics.phantoms import paper_setup, wakefield_setup
 from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.files import setup_from
@@ -42,8 +41,8 @@ CHANGED = {
 OTHERS = (InversionOptions, FitOptions, Instrument, ExperimentOptions, GridView)
 MODELS = [*OTHERS, *PHANTOMS.values(), *STEPS.values(), *ESTIMATES.values()]
 STATED = [
-    paper_setup(),
-    wakefield_setup(),
+    ProtonSetup.example(),
+    OpticalSetup.example(),
     InversionOptions(**CHANGED),
     FitOptions(smoothness=1.5, evidence=True, align="shift"),
     Instrument.of("film", source="laser", gamma=0, noise_correlation=0),

@@ -32,7 +32,7 @@ from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup, toroid
+from napari_shadowinv.physics.phantoms import gaussian_blob, toroid
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import STEPS
 
@@ -76,7 +76,7 @@ def settled(tool: Any) -> bool:
 def test_the_window_thread_computes_nothing_during_a_run(
     window: Any, tool: Any, qtbot: Any
 ) -> None:
-    shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement)
+    shot = synthetic_image(toroid((200, 200), ProtonSetup.example(), 97, 30e-6).displacement)
     window.layers["shot"].data = shot
     tool.options.restore({"n_sites": 40_000})
     qtbot.wait(300)
@@ -354,7 +354,7 @@ def test_whole_numbers_and_the_finest_of_many_scales_are_inverted(
     np.testing.assert_allclose(computed(tool).image, counts)
     pyramid = window.add_image([counts, counts[::2, ::2]], name="pyramid", multiscale=True)
     tool.image.layer = pyramid
-    tool.setup.show_setup(paper_setup().model_dump())
+    tool.setup.show_setup(ProtonSetup.example().model_dump())
     run(tool)
     field = layer_of(window, "field")
     assert field.data.shape == shot.shape
@@ -396,7 +396,9 @@ def test_the_preview_follows_in_its_own_layers(
     window: Any, tool: Any, qtbot: Any, messages: list[str]
 ) -> None:
     noise = np.random.default_rng(0).normal(0, 0.05, (200, 200))
-    shot = synthetic_image(toroid((200, 200), paper_setup(), 97, 30e-6).displacement) + noise
+    shot = (
+        synthetic_image(toroid((200, 200), ProtonSetup.example(), 97, 30e-6).displacement) + noise
+    )
     window.layers["shot"].data = np.maximum(shot, 0)
     # Without a graphics card, drawing a large window takes longer than the inversion.
     window.window._qt_window.resize(900, 600)
@@ -452,7 +454,7 @@ def test_the_preview_follows_in_its_own_layers(
 def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fits: Any) -> None:
     tool.options.restore({"seed": 5})
     tool.source.set_kind("interpolated")
-    tool.setup.show_setup(paper_setup().model_dump())
+    tool.setup.show_setup(ProtonSetup.example().model_dump())
     for name in STEPS:
         tool.steps.add(name)
     tool.steps.folded.expand()
@@ -462,7 +464,7 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     again = Invert(window)
     qtbot.addWidget(again)
     assert again.options.model() == InversionOptions(seed=5)
-    assert again.setup.setup() == paper_setup()
+    assert again.setup.setup() == ProtonSetup.example()
     assert again.source.model() == tool.source.model()
     assert again.store.run.model() == RunOptions(workers=3)
     assert again.steps.steps() == tuple(step() for step in STEPS.values())

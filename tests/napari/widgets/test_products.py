@@ -12,27 +12,28 @@ from qtpy.QtWidgets import QFileDialog
 
 from helpers.forms import enter
 from helpers.reports import texts_of
+from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets._products import shape_fields
 from napari_shadowinv.analysis import PRODUCTS, EnclosedCurrent, analyse, products_in
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.io import read_dataset
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 
 PATIENCE = 60_000  # ms
 
 
 @pytest.fixture(scope="module")
 def inversion() -> Inversion:
-    phantom = toroid((48, 48), paper_setup(), 30.0, 9e-6)
+    phantom = toroid((48, 48), ProtonSetup.example(), 30.0, 9e-6)
     image = np.random.default_rng(0).poisson(400 * synthetic_image(phantom.displacement))
     return invert(image, source=np.full(image.shape, 400.0))
 
 
 @pytest.fixture
 def form(window: Any, open_widget: Any, inversion: Inversion) -> Any:
-    add_to_viewer(window, inversion, paper_setup(), name="ring")
+    add_to_viewer(window, inversion, ProtonSetup.example(), name="ring")
     form = open_widget("Analyse").products
     enter(form.bands.entries["samples"], 20)
     return form
@@ -72,7 +73,7 @@ def test_drawn_circle_measures_the_same_current_as_python(
     measured = measure(form, qtbot)
     circle = EnclosedCurrent(center=(23.5, 23.5), radius=8.0)
     assert measured.product.center == pytest.approx(circle.center)
-    (expected,) = analyse(inversion, measured.product, setup=paper_setup(), samples=20)
+    (expected,) = analyse(inversion, measured.product, setup=ProtonSetup.example(), samples=20)
     assert measured["current"].value == expected["current"].value
     np.testing.assert_array_equal(measured["current"].samples, expected["current"].samples)
     assert expected.facts[0].text in texts_of(form.report).values()

@@ -12,14 +12,13 @@ import tifffile
 
 from napari_shadowinv import ProtonSetup, read
 from napari_shadowinv._napari.layer_metadata import metadata_for, result_of, role_of
-from napari_shadowinv.physics.phantoms import paper_setup
 
 PATIENCE = 60_000  # ms
 
 
 @pytest.fixture
 def tool(window: Any, open_widget: Callable[[str], Any], shot: Any) -> Any:
-    window.add_image(shot, name="shot", metadata=metadata_for("shot", "", paper_setup()))
+    window.add_image(shot, name="shot", metadata=metadata_for("shot", "", ProtonSetup.example()))
     widget = open_widget("Invert")
     widget.options.restore({"n_sites": 300})
     return widget
@@ -47,7 +46,7 @@ def test_saved_result_comes_back_and_is_inverted_again(
     assert {role_of(layer) for layer in window.layers if layer.visible} == {"field", "arrows"}
     # The image has its setup and source, and is a shot again.
     assert role_of(tool.image.layer) == "image"
-    assert tool.setup.setup() == paper_setup()
+    assert tool.setup.setup() == ProtonSetup.example()
     run(tool)
     assert window.layers.selection.active.data.max() == pytest.approx(peak, rel=1e-6)
 

@@ -13,14 +13,14 @@ from qtpy.QtWidgets import QFileDialog
 
 from helpers.forms import enter
 from helpers.reports import texts_of
-from napari_shadowinv import run_stack
+from napari_shadowinv import ProtonSetup, run_stack
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets import _products
 from napari_shadowinv.analysis import Region, analyse_shots
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import paper_setup, toroid
+from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.preprocessing import Recipe
 
 PATIENCE = 60_000  # ms
@@ -30,7 +30,7 @@ SHOTS = 4
 
 def image_at(time: float) -> Any:
     """A toroid that grows, as the camera would see it after a time in ns."""
-    phantom = toroid((32, 32), paper_setup(), 20 * np.exp(RATE * time), 6e-6)
+    phantom = toroid((32, 32), ProtonSetup.example(), 20 * np.exp(RATE * time), 6e-6)
     return 300 * synthetic_image(phantom.displacement)
 
 
@@ -38,7 +38,7 @@ def image_at(time: float) -> Any:
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("series") / "night.shadowinv.zarr"
     images = np.stack([image_at(time) for time in range(SHOTS)])
-    run_stack(images, out, Recipe(setup=paper_setup()))
+    run_stack(images, out, Recipe(setup=ProtonSetup.example()))
     return out
 
 
@@ -89,7 +89,7 @@ def test_numbers_and_centroid_are_drawn_over_time(form: Any, qtbot: Any) -> None
     assert {"peak", "rms", "centroid_y", "centroid_x"} <= lines.keys()
     np.testing.assert_allclose(lines["rms"].get_xdata(), [0, 1, 2, 4])
     np.testing.assert_allclose(lines["rms"].get_ydata(), form.measured[0]["rms"].value)
-    middle = 1e6 * 15.5 * paper_setup().object_pixel_size
+    middle = 1e6 * 15.5 * ProtonSetup.example().object_pixel_size
     np.testing.assert_allclose(lines["centroid_y"].get_ydata(), middle, rtol=0.02)
 
 
@@ -169,7 +169,7 @@ def test_single_result_has_no_times(form: Any, window: Any, qtbot: Any) -> None:
     enter(form.shots.entries["times"], "1 ns")
     press(form, qtbot)
     inversion = invert(image_at(0.0), source=np.full((32, 32), 300.0))
-    added = add_to_viewer(window, inversion, paper_setup(), name="single")
+    added = add_to_viewer(window, inversion, ProtonSetup.example(), name="single")
     form.result.layer = next(layer for layer in added if layer in form.result.offered)
     assert not form.shots.isVisibleTo(form)
     enter(form.bands.entries["samples"], 20)

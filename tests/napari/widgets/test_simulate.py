@@ -13,7 +13,7 @@ from napari.components import ViewerModel
 from helpers.forms import enter
 from helpers.jobs import run_job
 from helpers.reports import texts_of
-from napari_shadowinv import InputError, Instrument, ProtonSetup
+from napari_shadowinv import InputError, Instrument, OpticalSetup, ProtonSetup
 from napari_shadowinv._napari.layer_metadata import role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.simulate import ForwardJob, GridFile, InputField, Simulate
@@ -22,13 +22,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read_field_grid
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantom_models import BlobRecipe
-from napari_shadowinv.physics.phantoms import (
-    coaxial_line,
-    four_toroids,
-    paper_setup,
-    wakefield,
-    wakefield_setup,
-)
+from napari_shadowinv.physics.phantoms import coaxial_line, four_toroids, wakefield
 from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
@@ -60,7 +54,7 @@ def test_an_object_makes_its_image_and_caustics_are_warned_of(
     tool.side.setText("60 x 80")
     strength = tool.object.form.entries["strength"]
     enter(strength, 0.2)
-    expected = four_toroids((60, 80), paper_setup(), 0.2)
+    expected = four_toroids((60, 80), ProtonSetup.example(), 0.2)
     layer = made()
     np.testing.assert_allclose(layer.data, synthetic_image(expected.displacement))
     assert tuple(layer.scale) == pytest.approx((1.5, 1.5))
@@ -151,7 +145,7 @@ def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
     tool.panel.button.click()
     qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
     (layer,) = viewer.layers
-    phantom, obstructed = coaxial_line((200, 200), paper_setup())
+    phantom, obstructed = coaxial_line((200, 200), ProtonSetup.example())
     dark = np.where(obstructed, 0.0, 1.0)
     np.testing.assert_allclose(layer.data, synthetic_image(phantom.displacement, dark))
     np.testing.assert_array_equal(source_of(layer), dark)
@@ -165,19 +159,19 @@ def test_an_object_brings_the_beam_that_it_needs(
 ) -> None:
     tool = opened(Simulate)
     tool.object.set_kind("wakefield")
-    assert tool.setup.setup() == wakefield_setup()
+    assert tool.setup.setup() == OpticalSetup.example()
     tool.panel.button.click()
     qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
-    wave = wakefield((200, 200), wakefield_setup())
+    wave = wakefield((200, 200), OpticalSetup.example())
     np.testing.assert_allclose(viewer.layers[0].data, synthetic_image(wave.displacement))
     enter(tool.object.form.entries["density"], "2e19 cm⁻³")
     assert tool.object.model().density == pytest.approx(2e25)
 
     # What somebody has typed is not replaced.
-    entered = wakefield_setup().model_copy(update={"wavelength": 532e-9})
+    entered = OpticalSetup.example().model_copy(update={"wavelength": 532e-9})
     tool.setup.show_setup(entered.model_dump())
     tool.object.set_kind("toroid")
-    assert tool.setup.setup() == paper_setup()
+    assert tool.setup.setup() == ProtonSetup.example()
     tool.object.set_kind("wakefield")
     assert tool.setup.setup() == entered
     tool.setup.picker.set_kind("none")
@@ -205,7 +199,7 @@ def test_a_3d_field_of_a_file_is_traced(tmp_path: Path) -> None:
     )
     path = tmp_path / "field.nc"
     dataset.to_netcdf(path, engine="h5netcdf")
-    setup = paper_setup()
+    setup = ProtonSetup.example()
     with pytest.raises(InputError, match="there is no setup"):
         run_job(ForwardJob(GridFile(file=path), shape=(20, 30)))
     job = ForwardJob(GridFile(file=path, right="-x"), shape=(20, 30), setup=setup)
@@ -237,7 +231,7 @@ def finished(tool: Any, qtbot: Any) -> None:
 def test_a_plan_shows_its_verdict_and_the_first_image(
     tool: Any, viewer: ViewerModel, qtbot: Any
 ) -> None:
-    assert tool.setup.setup() == paper_setup()
+    assert tool.setup.setup() == ProtonSetup.example()
     finished(tool, qtbot)
     assert "would be determined: 3 of 3" in tool.verdict.text()
     assert "Error made" in texts_of(tool.report)
@@ -292,8 +286,8 @@ def test_a_3d_field_is_planned_as_in_python(
     qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
     grid = read_field_grid(cube).turned("x", "y").centred()
     expected = plan_experiment(
-        object_of_field(grid, paper_setup()),
-        paper_setup(),
+        object_of_field(grid, ProtonSetup.example()),
+        ProtonSetup.example(),
         instrument=Instrument(beam_rms=0.0),
         options=ExperimentOptions(draws=3, counts=3000.0),
     )

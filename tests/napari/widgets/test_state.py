@@ -29,7 +29,7 @@ from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import gaussian_blob, paper_setup
+from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import PolynomialEstimate
 
 Array = np.ndarray[Any, Any]
@@ -477,7 +477,7 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     viewer: ViewerModel, opened: Any, solved: Inversion, proton_setup: ProtonSetup, qtbot: Any
 ) -> None:
     tool = opened(Simulate)
-    assert tool.setup.setup() == paper_setup()
+    assert tool.setup.setup() == ProtonSetup.example()
     assert tool.setup.note.text() == "Example from the paper."
     typed(tool, 7.0)
     entered = tool.setup.setup()
