@@ -118,7 +118,7 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
         default=6,
         ge=0,
         le=1000,
-        description="Number of random fields for the error bars, at least 24 where the beams of "
+        description="Number of random fields for the error bars, at least 16 where the beams of "
         "energies differ; 0 for no error bars.",
     )
     sampling: Literal["linear", "resolve"] = Field(
@@ -126,7 +126,7 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
         description="'linear': random fields respond to noise and instrument to first order. "
         "'resolve': each is fitted to images with other noise and another instrument, which takes "
         "2 to 5 times as long as a linear one; for strong folds and instruments that are known "
-        "poorly.",
+        "poorly. It is always so where the beams of energies differ.",
     )
     evidence: bool = Field(
         default=False,
