@@ -170,8 +170,20 @@ def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluate
     polygon.data = [polygon.data[0][:3]]
     tool.panel.button.click()
     assert "with 3 corners: expected one polygon with the four" in tool.panel.status.text()
+    polygon.data = []
+    tool.panel.button.click()
+    assert "has 0 shapes: expected one polygon" in tool.panel.status.text()
     assert len(viewer.layers) == before
     assert not tool.panel.running
+
+
+def test_an_opened_result_does_not_keep_the_file_of_another_one(
+    viewer: ViewerModel, tool: Any, pack_doses: Any, tmp_path: Path
+) -> None:
+    tool.path.edit.setText(str(tmp_path / "another.toml"))
+    viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
+    assert tool.path.path == ""
+    assert tool.request().pack == pack_doses.pack
 
 
 def test_painted_pixels_are_not_used(
@@ -183,7 +195,9 @@ def test_painted_pixels_are_not_used(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     tool = evaluated
+    tool.show_corners.click()
     tool.paint.click()
+    assert not tool.corners.scan.visible  # it would cover what is painted
     marks = layer_of(viewer, "unusable")
     assert marks.visible
     assert marks.mode == "paint"

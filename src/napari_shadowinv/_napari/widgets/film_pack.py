@@ -63,6 +63,7 @@ class CornerEditor(QObject):
             self.close()
         self._films, self._doses = films, doses
         self._show(plane_in_view(self._viewer, films))
+        self.set_visible(True)
 
     def close(self) -> None:
         """Remove the layers and discard the changes."""
@@ -93,10 +94,11 @@ class CornerEditor(QObject):
             return
         shapes = [np.asarray(vertices, np.float64)[:, -2:] for vertices in self.polygon.data]
         if len(shapes) != 1 or len(shapes[0]) != 4:
+            counts = ", ".join(str(len(vertices)) for vertices in shapes)
+            corners = f" with {counts} corners" if shapes else ""
             raise InputError(
-                f"'{self.polygon.name}' has {len(shapes)} shapes with "
-                f"{', '.join(str(len(vertices)) for vertices in shapes)} corners: expected one "
-                "polygon with the four corners of the film"
+                f"'{self.polygon.name}' has {len(shapes)} shapes{corners}: expected one polygon "
+                "with the four corners of the film; press Show corners to reset it"
             )
         old_corners = self._moved.get(self._plane, self._doses.corners[self._plane])
         if np.abs(shapes[0] - old_corners).max() > _MIN_MOVE_PX:
@@ -132,6 +134,11 @@ class CornerEditor(QObject):
         self.polygon.mode = "direct"
         if is_new:
             self._viewer.reset_view()
+
+    def set_visible(self, visible: bool) -> None:
+        """Show or hide the layers, if they are there."""
+        if self.shown:
+            self.scan.visible = self.polygon.visible = visible
 
     def _scan_of(self, plane: int) -> AnyArray:
         """Return the pixels of a film's scan with eight bits."""
@@ -320,6 +327,8 @@ class FilmPack(panels.ToolPanel):
         has_result = self.packs.layer is not None
         self.actions.setVisible(has_result)
         if has_result:
+            # The file of an opened result is unknown: Run then uses the pack in the result.
+            self.path.restore(about.metadata_of(self.packs.layer).get("path", ""))
             facts = self._selected()[1].facts
             self.report.show_rows([*panels.fact_rows(facts), *panels.warning_rows(facts)])
         self.update_plot()
@@ -363,6 +372,7 @@ class FilmPack(panels.ToolPanel):
                 f"the unusable pixels of '{layer.name}' were deleted: press Run, or open the file "
                 "again"
             )
+        self.corners.set_visible(False)  # the scan would cover the labels
         labels.visible = True
         labels.selected_label = packs.BY_HAND
         labels.brush_size = _BRUSH_PX
