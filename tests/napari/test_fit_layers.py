@@ -19,6 +19,7 @@ from napari_shadowinv._napari.layer_metadata import (
     metadata_of,
     result_of,
     role_of,
+    setup_of,
     unit_of,
 )
 from napari_shadowinv._napari.layers import add_layers, fit_layers
@@ -107,15 +108,17 @@ def test_a_file_of_the_command_shows_all_of_a_fit(
     in_each += ["significance", "structures"]
     of_fields = ["field arrows", *(f"{role}{part}" for role in in_each for part in ("", " E"))]
     of_answers = [f"{role} {name} 1" for role in ("field", "arrows") for name in "BE"]
-    of_images = ["image", "reprojection", "residual"]
-    assert set(layers) == {*of_fields, *of_answers, *of_images}
+    of_images = ["reprojection", "residual"]
+    assert set(layers) == {*of_fields, *of_answers, *of_images, "image 1", "image 2"}
     assert {slot for slot, layer in layers.items() if layer.visible} == {"field", "arrows"}
     for slot in of_images:
         assert layers[slot].data.shape == (2, *SHAPE)
         assert tuple(map(str, layers[slot].units)) == ("pixel", "micrometer", "micrometer")
         assert tuple(layers[slot].scale) == pytest.approx((1, 1.5, 1.5))
     np.testing.assert_array_equal(layers["reprojection"].data, two_fields.reprojection)
-    np.testing.assert_array_equal(layers["image"].data, two_fields.images)
+    for number, (pixels, setup) in enumerate(zip(two_fields.images, SETUPS, strict=True), 1):
+        np.testing.assert_array_equal(layers[f"image {number}"].data, pixels)
+        assert setup_of(layers[f"image {number}"]) == setup
     for slot, fitted_field in zip(("field", "field E"), two_fields.fields, strict=True):
         np.testing.assert_array_equal(displacement_of(layers[slot]), fitted_field.displacement)
     assert unit_of(layers["field"]).endswith("T·m")

@@ -256,17 +256,11 @@ def _image_layers(
         beams = fit.source / fit.source.mean(axis=(1, 2), keepdims=True)
         is_common = np.abs(beams - beams[0]).max() < _MAX_BEAM_DIFFERENCE
         content = {"source": (fit.source[:1] if is_common else fit.source, grey), **content}
-    if with_images:
-        content = {"image": (fit.images, grey), **content}
-    layers: LayerData = []
+    layers: LayerData = _fitted_images(fit, frame, name, facts, grey) if with_images else []
     for role, (planes, limits) in content.items():
         kind = _KINDS[role]
         data = planes[0] if len(planes) == 1 else planes
         more = facts | {"main": role != "reprojection"}
-        if role == "image" and len(planes) == 1:
-            # With beam and mask, the image can be inverted again.
-            usable = None if fit.mask.all() else fit.mask[0]
-            more |= {"source": fit.source[0], "usable": usable}
         look = {
             "visible": False,
             "colormap": colour_map(kind.colormap),
@@ -274,6 +268,30 @@ def _image_layers(
         }
         more |= {"level": fit.headline.level, "stack_axis": "image" if data.ndim == 3 else ""}
         layers.append(kind.layer(data, name, frame, fit.setup, look, **more))
+    return layers
+
+
+def _fitted_images(
+    fit: Fit, frame: Frame, name: str, facts: dict[str, Any], limits: Limits
+) -> LayerData:
+    """Describe a hidden layer of each image, which can be fitted again, a single one inverted."""
+    kind, is_single = _KINDS["image"], len(fit.images) == 1
+    look = {
+        "visible": False,
+        "colormap": colour_map(kind.colormap),
+        "contrast_limits": limits,
+    }
+    layers: LayerData = []
+    for k, (image, used) in enumerate(zip(fit.images, fit.mask, strict=True)):
+        setup = fit.setups[k] if fit.setups else None
+        more = facts | {"main": True, "level": fit.headline.level}
+        more["usable"] = None if used.all() else used
+        if is_single:
+            more["source"] = fit.source[k]
+        else:
+            more |= {"part": str(k + 1), "strength": float(fit.strengths[k, 0])}
+        title = name if is_single else f"{name} {k + 1}"
+        layers.append(kind.layer(image, title, frame, setup, look, **more))
     return layers
 
 

@@ -105,8 +105,12 @@ def missing_layers(viewer: Any, layer: Any) -> LayerData:
             f"'{layer.name}' shows no result: select a layer of a result, or press Run first"
         )
     present = about.layers_of(viewer, layer)
-    keys = {about.layer_key(layer) for layer in present} | _shown_inputs(viewer, result)
-    missing = [entry for entry in layer_data if about.layer_key(entry[1]) not in keys]
+    keys, inputs = {about.layer_key(layer) for layer in present}, _shown_inputs(viewer, result)
+    missing = [
+        entry
+        for entry in layer_data
+        if about.layer_key(entry[1]) not in keys and about.role_of(entry[1]) not in inputs
+    ]
     for _, keywords, _ in missing:
         keywords["visible"] = False
     return missing

@@ -209,6 +209,16 @@ def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qt
     assert report["Setup"].startswith("particles")
 
 
+def test_the_images_of_an_opened_fit_can_be_fitted_again(
+    window: Any, tool: Any, fitted: Fit, tmp_path: Path
+) -> None:
+    window.layers.clear()
+    window.open(write(tmp_path / "pair.shadowinv", fitted), plugin="napari-shadowinv")
+    assert [shot.setup for shot in tool.request().shots] == list(fitted.setups)
+    assert tool.request().name == "pair fit"
+    assert tool.source.kind == "uniform"  # a beam that was found is not measured
+
+
 def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
     window: Any, tool: Any, show: Any, fitted: Fit, messages: list[str]
 ) -> None:
@@ -269,7 +279,7 @@ def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
         (
             lambda: type_in(tool, 1, BEAM, "fast"),
             lambda: type_in(tool, 1, BEAM, "6"),
-            "'6.0 MeV': received 'fast', expected a number in MeV",
+            "Energy of '6.0 MeV': received 'fast', expected a number in MeV",
         ),
         (
             lambda: type_in(tool, 1, BEAM, "-2"),

@@ -179,7 +179,7 @@ class ImageTable(QTableWidget):
             cell = self.item(self.images.index(image), number)
             value = cell.data(Qt.ItemDataRole.UserRole)
             if problem := spec.problem(value):
-                raise InputError(f"'{image.name}': {problem}")
+                raise InputError(f"{spec.title} of '{image.name}': {problem}")
             values[spec.name] = spec.default if value is None else float(value)
         return values
 

@@ -12,7 +12,7 @@ import numpy as np
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.costs import fit_cost
-from napari_shadowinv._napari.jobs import Finished, FitJob
+from napari_shadowinv._napari.jobs import Finished, FitJob, name_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import layers_of_shot, shot_of_layer
@@ -217,9 +217,8 @@ class FitImages(inputs.ImagePanel):
         steps = "; ".join(step.summary for step in recipe.steps)
         described = self.describe(first, recipe, (*images, self.masks.layer), steps=steps)
         described["origins"] |= _cautions_of(images)
-        return FitJob(
-            shots=shots, name=f"{first.name} fit", frame=result_frame(first, recipe), **described
-        )
+        name = f"{name_of_result(first).removesuffix(' fit')} fit"
+        return FitJob(shots=shots, name=name, frame=result_frame(first, recipe), **described)
 
     def _shots(self, images: Sequence[Any], setup: Setup | None) -> tuple[Shot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
@@ -261,7 +260,8 @@ class FitImages(inputs.ImagePanel):
         if len(images) < 2:
             raise InputError(
                 f"{len(images) or 'no'} image{'s are' if not images else ' is'} checked, expected "
-                "two or more of one object: open them, or use 'Refine' in Invert for one image"
+                "two or more of one object: open them, split a stack (right click on the layer → "
+                "Split Stack), or use 'Refine' in Invert for one image"
             )
         shape = tuple(images[0].data.shape)
         for image in images[1:]:
@@ -300,8 +300,10 @@ class FitImages(inputs.ImagePanel):
     def _on_reference(self) -> None:
         """Show the setup of a new reference; without a setup it gets the last one."""
         image, old_setup = self.images.reference, self.setup.complete_setup()
-        # Other images show the same object: none of them is the beam of another.
+        # Other images show the same object: none of them is the beam of another, and the beam that
+        # a fit has found was not measured.
         has_beam = image is not None and about.result_of(image) is not None
+        has_beam = has_beam and about.source_of(image) is not None
         self.source.follow(image if has_beam else None)
         self.setup.follow(image)
         if image is not None:
