@@ -95,5 +95,7 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str], pack: Pat
     tool.shots.table.edit.setText("")
     expect("o table is selected")
     tool.shots.table.edit.setText("/no/pack.csv")
-    expect("/no/pack.csv")
+    expect("/no/pack.csv does not exist: expected a .csv file")
+    tool.shots.table.edit.setText(str(pack.with_name("film0.npy")))
+    expect("film0.npy is no table: expected a .csv file")
     assert not tool.store.path.exists()

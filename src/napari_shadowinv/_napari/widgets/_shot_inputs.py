@@ -20,6 +20,7 @@ from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
+from napari_shadowinv.pipeline.shot_table import is_table
 
 LAYER, FILES, TABLE, FOLDER = "layer", "files", "table", "folder"
 _PLACES = {FILES: "Files…", TABLE: "Table (.csv)…", FOLDER: "Watched folder…"}
@@ -196,7 +197,14 @@ class ShotsPicker(QWidget):
         if self.kind in _MISSING:
             if not self.name:
                 raise InputError(_MISSING[self.kind])
-            return Path(self.name).expanduser()
+            path = Path(self.name).expanduser()
+            if self.kind == TABLE and not (path.is_file() and is_table(path)):
+                found = "is no table" if path.is_file() else "does not exist"
+                raise InputError(
+                    f"{path} {found}: expected a .csv file that begins with names of "
+                    "columns, such as file and energy"
+                )
+            return path
         parts = [part.strip() for part in self.files.path.split(_SEPARATOR.strip())]
         paths = [os.path.expanduser(part) for part in parts if part]
         if not paths:
