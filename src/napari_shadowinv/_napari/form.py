@@ -406,7 +406,8 @@ class ModelForm(QWidget):
 
     def model(self) -> BaseModel:
         """Return the validated model, or raise an `InputError`."""
-        name = getattr(self._model_class, "title", "options")
+        title = getattr(self._model_class, "title", None)  # of some an attribute of each model
+        name = title if isinstance(title, str) else "options"
         return validate(self._model_class, self.state(), name, labels_of(self._model_class))
 
     def _on_edit(self, name: str) -> None:

@@ -309,7 +309,10 @@ def test_file_and_view_are_remembered(traced: Any, cube: Path) -> None:
 def test_wrong_file_is_a_sentence(
     traced: Any, qtbot: Any, messages: list[str], tmp_path: Path
 ) -> None:
-    for text, message in (("", "'File' is missing"), (str(tmp_path / "none.h5"), "none.h5")):
+    for text, message in (
+        ("", "ptions: 'File' is missing"),
+        (str(tmp_path / "none.h5"), "none.h5"),
+    ):
         enter(traced.object.form.entries["file"], text)
         finished(traced, qtbot)
         assert message in traced.panel.status.text()
