@@ -174,7 +174,7 @@ class StackView(QWidget):
             self._refresh_timer.start()
 
     def _begin(self, job: StackJob) -> None:
-        is_resumed = self.job is not None and self.job.out == job.out
+        is_resumed = self.job is not None and self.job.out == job.out and bool(self.results.layers)
         if not is_resumed:
             self.results, self._applied, self._newest = ResultLayers(self._viewer, self), {}, 0
             self.results.complete.connect(self._on_layers)
