@@ -38,7 +38,7 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
-_LEGEND_CHARACTERS, _HANDLE_CHARACTERS = 60, 5  # of a row above a plot
+_LEGEND_CHARACTERS, _HANDLE_CHARACTERS = 56, 5  # of a row above a plot
 _CONSTANT_STAGES = ("samples",)  # do not change the objective
 # napari's docks, which users expect to see next to a plugin's.
 _NAPARI_DOCKS = {"layer list", "layer controls", "console"}
