@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.night import OPTIONS, grouped, make_shots
+from helpers.store_content import content
 from napari_shadowinv import invert, run_stack
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.stack import _arrivals
@@ -67,6 +68,14 @@ def make_night(tmp_path, compiled):
 def any_night(tmp_path_factory, compiled) -> Night:
     """One that no test may change."""
     return written_night(6, tmp_path_factory.mktemp("any") / "shots")
+
+
+@pytest.fixture(scope="session")
+def expected(any_night, tmp_path_factory) -> dict[str, bytes]:
+    """The content of the store of its shots, made at once and without any fault."""
+    store = tmp_path_factory.mktemp("expected") / "expected.shadowinv.zarr"
+    any_night.run(store, scheduler="synchronous")
+    return content(store)
 
 
 @pytest.fixture

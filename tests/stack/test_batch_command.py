@@ -328,22 +328,6 @@ def test_a_film_that_ends_early_leaves_nothing(tmp_path, name, error):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_shots_that_find_no_room_are_not_exported_by_half(store, small_disk):
-    from napari_shadowinv.io import read_dataset
-
-    (store.parent / "setup.toml").write_text(PROTON)
-    assert batch("--setup", "setup.toml", "--overwrite").exit_code == 0
-    disk, resize = small_disk
-    assert resize("40k")
-    result = shadowinv("export", store, "--format", "pradformat", "--out", disk / "shots")
-    assert result.exit_code == 2, result.output
-    assert "cannot be written (No space left on device)" in flat(result.output)
-    written = sorted((disk / "shots").iterdir())
-    assert 0 < len(written) < 6
-    for path in written:
-        assert "potential" in read_dataset(path)
-
-
 def test_the_colour_scale_of_a_film_is_fixed(store):
     from napari_shadowinv.plotting import stack_frames
 

@@ -51,14 +51,6 @@ def cluster(compiled):
         yield made
 
 
-@pytest.fixture
-def expected(night, tmp_path) -> dict[str, bytes]:
-    """The content of a store without any fault."""
-    store = tmp_path / "expected.shadowinv.zarr"
-    night.run(store)
-    return content(store)
-
-
 class InThread(threading.Thread):
     """A run that the test watches from outside."""
 

@@ -32,14 +32,7 @@ def hidden(night):
     return hide
 
 
-@pytest.fixture
-def whole(night, tmp_path) -> dict[str, bytes]:
-    """The content of a single run over all shots."""
-    night.run(tmp_path / "whole.shadowinv.zarr")
-    return content(tmp_path / "whole.shadowinv.zarr")
-
-
-def test_appended_shots_give_the_bytes_of_a_single_run(night, out, whole, hidden):
+def test_appended_shots_give_the_bytes_of_a_single_run(night, out, expected, hidden):
     hidden(4, 5)
     night.run(out)
     before = content(out)
@@ -53,7 +46,7 @@ def test_appended_shots_give_the_bytes_of_a_single_run(night, out, whole, hidden
     assert list(grown.name.values) == [f"shot_{i}.npy" for i in range(6)]
     assert list(grown.shot) == list(range(6))
     assert (grown.iterations > 0).all()
-    assert content(out) == whole
+    assert content(out) == expected
     assert {name: (out / name).stat().st_mtime_ns for name in before} == stamps
     # A reader that opened it earlier sees the earlier content.
     np.testing.assert_array_equal(earlier.potential, grown.potential[:4])
@@ -120,7 +113,7 @@ def test_sources_arrive_with_their_shots(night, out, hidden):
         night.run(out, source=sources)
 
 
-def test_arrays_and_films_grow_too(night, out, tmp_path, whole):
+def test_arrays_and_films_grow_too(night, out, tmp_path, expected):
     film = tmp_path / "film.tif"
     for count in (4, 6):
         tifffile.imwrite(film, night.images[:count], photometric="minisblack")
@@ -128,8 +121,8 @@ def test_arrays_and_films_grow_too(night, out, tmp_path, whole):
             list(night.run(tmp_path / "film.shadowinv.zarr", shots=film).status) == [DONE] * count
         )
         assert list(night.run(out, shots=night.images[:count]).status) == [DONE] * count
-    assert content(out) == whole
-    assert content(tmp_path / "film.shadowinv.zarr") == whole
+    assert content(out) == expected
+    assert content(tmp_path / "film.shadowinv.zarr") == expected
     with pytest.raises(InputError, match="shot 1 has changed"):
         night.run(out, shots=night.images[[0, 2, 1, 3, 4, 5]])
 
@@ -138,7 +131,7 @@ class Killed(BaseException):
     """As a signal that nothing can catch."""
 
 
-def test_killed_at_any_moment_of_growing_it_is_as_before(night, out, whole, hidden, monkeypatch):
+def test_killed_at_any_moment_of_growing_it_is_as_before(night, out, expected, hidden, monkeypatch):
     hidden(1, 5)
     night.run(out)
     before = read(out).load()
@@ -178,7 +171,7 @@ def test_killed_at_any_moment_of_growing_it_is_as_before(night, out, whole, hidd
         assert list(after.status) == [DONE] * 6
         moments += 1
     assert moments > 8  # each array along shots, and the folder's own metadata
-    first = {name: text for name, text in whole.items() if "/c/0" in name}
+    first = {name: text for name, text in expected.items() if "/c/0" in name}
     assert first.items() <= content(out).items()
 
 
@@ -192,7 +185,7 @@ def test_a_second_run_cannot_grow_it_meanwhile(night, out, hidden):
     assert len(StackStore(out).names) == 5
 
 
-def test_workers_of_the_shorter_store_write_new_shots(night, out, whole, hidden):
+def test_workers_of_the_shorter_store_write_new_shots(night, out, expected, hidden):
     from distributed import Client, LocalCluster
 
     with (
@@ -205,7 +198,7 @@ def test_workers_of_the_shorter_store_write_new_shots(night, out, whole, hidden)
         night.run(out, scheduler=client)
         hidden()
         night.run(out, scheduler=client)
-    assert content(out) == whole
+    assert content(out) == expected
 
 
 def test_a_store_that_looks_shorter_here_is_not_written(night, out):

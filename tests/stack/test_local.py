@@ -20,13 +20,6 @@ from napari_shadowinv.io.store import DONE, FAILED
 from napari_shadowinv.stack._worker import threads_here
 
 
-@pytest.fixture
-def expected(night, tmp_path) -> dict[str, bytes]:
-    store = tmp_path / "expected.shadowinv.zarr"
-    night.run(store, scheduler="synchronous")
-    return content(store)
-
-
 def test_the_bytes_do_not_depend_on_the_scheduler(night, out, expected):
     with ThreadPoolExecutor(2) as pool:
         for scheduler in ("threads", "processes", pool, dask.get):

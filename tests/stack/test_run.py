@@ -99,18 +99,6 @@ def test_stored_variables_can_be_chosen(night, out):
         np.testing.assert_array_equal(written[name], lazy[name])
 
 
-def test_the_bytes_do_not_depend_on_threads_or_order(night, out, tmp_path):
-    other_store = tmp_path / "other.shadowinv.zarr"
-    night.run(out, shots=night.images, scheduler="synchronous")
-    run_stack(
-        Shot(night.images, source=night.source),
-        other_store,
-        Recipe(options=OPTIONS),
-        run=RunOptions(workers=3),
-    )
-    assert content(out) == content(other_store)
-
-
 def test_a_run_goes_on_where_it_stopped(night, out):
     note, enough = stop_after(2)
     arguments = {"reader": log_and_read}
@@ -138,13 +126,6 @@ def test_a_run_goes_on_where_it_stopped(night, out):
     assert first.items() <= content(out).items()
     lazy = invert_stack(Shot(night.images, source=night.source), Recipe(options=OPTIONS))
     np.testing.assert_allclose(after.potential, lazy.potential, rtol=1e-6, atol=1e-6)
-
-
-def test_a_finished_run_has_nothing_to_do(night, out):
-    night.run(out, shots=night.images)
-    progress = []
-    night.run(out, shots=night.images, on_progress=progress.append)
-    assert [(p.scheduler, p.done, p.outcome) for p in progress] == [("nothing to do", 6, None)]
 
 
 def spoil(night) -> dict[int, str]:
