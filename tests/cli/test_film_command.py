@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from helpers.command_line import content, flat, shadowinv
-from napari_shadowinv import read
+from napari_shadowinv import read, write
 from napari_shadowinv.cli import _terminal
 from napari_shadowinv.film import read_corners
 from simulated_pack import Truth, simulate
@@ -56,6 +56,9 @@ def test_a_pack_is_described_and_repeated(
     assert "film pack of shadowinv" in output
     assert "films 3, " in output
     assert "pixels 90 × 120, " in output
+    dark = '[{"code": "film-range", "text": "film 2 is dark"}]'
+    write("dark.shadowinv", read("pack.shadowinv").assign_attrs(cautions=dark))
+    assert "film 2 is dark" in flat(shadowinv("info", "dark.shadowinv").output)
     # A result may come from anybody: scans that lie elsewhere are asked for.
     refused("rerun", "pack.shadowinv", names="film_01.tif, which is in another folder")
     again = shadowinv("rerun", "pack.shadowinv", "--other-folders")

@@ -16,7 +16,6 @@ import xarray as xr
 
 from helpers.command_line import content, flat, interrupted, shadowinv
 from helpers.fit_images import of_each
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit, point_spread
 from napari_shadowinv.inversion.variables import setup_from_dataset
@@ -256,15 +255,6 @@ TABLES = {
     "file,noise\na.tif,loud\n": ("line 2", "'noise' is 'loud': expected 'poisson'"),
     "file,strength\na.tif,1\nb.tif,\n": ("b.tif has no strength, other images have",),
     "file,source\na.tif,unknown\nb.tif,\n": ("b.tif has no unknown source",),
-    "file,strength,noise\na.tif,1,poisson\nb.tif,2,3\n": (
-        "'poisson' in some images and a number in others",
-    ),
-    "file,strength,noise\na.tif,1,poisson\nb.tif,2,proportional\n": (
-        "and 'proportional' in others",
-    ),
-    "file,strength\na.tif,1 2\nb.tif,2\n": (
-        "strengths are (1.0, 2.0), (2.0,) for 1 field: expected one number for each",
-    ),
 }
 
 
@@ -527,20 +517,7 @@ def test_a_doubtful_setup_is_printed_once_by_a_fit() -> None:
     text = Path("setup.toml").read_text()
     near = text.replace("object_image_distance = 0.3", "object_image_distance = 1e-4")
     Path("setup.toml").write_text(near)
-    result = shadowinv("fit", "a.tif", "--setup", "setup.toml", "--energies", "14.7")
+    result = shadowinv("fit", "a.tif", "--setup", "setup.toml", "--energies", "14.7", *QUICK)
     assert flat(result.stderr).count("setup: the magnification is") == 1
     assert "setup: the magnification is" not in flat(result.stdout)
     assert "setup: the magnification is" in flat(shadowinv("info", "a_fit.shadowinv").stdout)
-
-
-def test_setup_warnings_come_before_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fit(*_: Any, **__: Any) -> Fit:
-        raise InputError("the work began")
-
-    monkeypatch.setattr("napari_shadowinv.pipeline.fit_run.fit", fit)
-    text = Path("setup.toml").read_text()
-    near = text.replace("object_image_distance = 0.3", "object_image_distance = 1e-4")
-    Path("setup.toml").write_text(near)
-    lines = shadowinv(*PAIR, "--quiet").stderr.splitlines()
-    assert lines[0].startswith("setup: the magnification is")
-    assert lines[-1] == "the work began"

@@ -136,19 +136,6 @@ def _missing(name: str) -> None:
     raise ImportError(name)
 
 
-def test_frames_in_other_files_are_refused(tmp_path, nexus):
-    path = tmp_path / "master.h5"
-    layout = h5py.VirtualLayout((6, 5, 7), "u2")
-    layout[:] = h5py.VirtualSource(nexus, "flat", (6, 5, 7))
-    with h5py.File(path, "w") as file:
-        file.create_virtual_dataset("all", layout)
-        file["linked"] = h5py.ExternalLink(nexus.name, "entry/data/data")
-    with pytest.raises(FileFormatError, match="as a virtual array from"):
-        read(f"{path}::all")
-    with pytest.raises(FileFormatError, match="does not hold 'linked' itself but links to"):
-        read(f"{path}::linked")
-
-
 def test_tiff_folder_and_pattern_give_lazy_frames(tmp_path):
     planes = CUBE.reshape(6, 5, 7)
     folder = tmp_path / "shots"

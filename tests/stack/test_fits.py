@@ -28,7 +28,6 @@ from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import RunOptions, run_fit, write_recipe
-from napari_shadowinv.preprocessing import Bin
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import invert_stack
 
@@ -123,17 +122,6 @@ def test_each_shot_of_an_array_is_fitted_alone(images: Any, out: Path) -> None:
     assert "path_integrated_e" not in store
     assert "caustic" not in store
     assert "flux_residual" not in store
-
-
-def test_the_store_does_not_depend_on_workers(images: Any, tmp_path: Path) -> None:
-    recipe = Recipe(steps=(Bin(factor=1),), fit=CHOICES)
-    contents = []
-    for name, engine in (("one", "synchronous"), ("two", "threads")):
-        path = tmp_path / f"{name}.shadowinv.zarr"
-        run_stack(images, path, recipe, scheduler=engine, run=RunOptions(workers=2))
-        contents.append({key: data for key, data in content(path).items() if "potential" in key})
-    assert contents[0]
-    assert contents[0] == contents[1]
 
 
 def test_a_shot_fails_alone_and_the_rest_is_resumed(images: Any, out: Path) -> None:

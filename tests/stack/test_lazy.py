@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import threading
 
 import dask
@@ -288,12 +286,3 @@ def test_all_shots_at_once_never_have_more_threads_than_cores(monkeypatch, worke
         ask.start()
         ask.join()
     assert counts == [threads]
-
-
-def test_importing_the_package_imports_no_dask():
-    code = (
-        "import sys, napari_shadowinv, napari_shadowinv.cli\n"
-        "print({'dask', 'zarr', 'distributed', 'xarray'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "set()"

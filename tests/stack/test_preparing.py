@@ -12,7 +12,6 @@ from helpers.night import OPTIONS, grouped
 from napari_shadowinv import (
     InputError,
     InversionOptions,
-    ProtonSetup,
     Recipe,
     Shot,
     invert,
@@ -21,10 +20,8 @@ from napari_shadowinv import (
     run_stack,
 )
 from napari_shadowinv.cli import app
-from napari_shadowinv.io.store import DONE, StackStore, read_stack
-from napari_shadowinv.pipeline import RunOptions
+from napari_shadowinv.io.store import DONE
 from napari_shadowinv.preprocessing import (
-    GaussianEstimate,
     HighPassFilter,
     HotPixelFilter,
     InterpolatedEstimate,
@@ -34,7 +31,6 @@ from napari_shadowinv.preprocessing import (
     PolynomialEstimate,
     UniformEstimate,
     high_pass,
-    isotropic_source,
     low_pass,
     polynomial_source,
 )
@@ -187,11 +183,6 @@ def test_arrays_of_matlab_files_and_a_free_boundary(night, tmp_path, monkeypatch
     np.testing.assert_allclose(
         read("n.shadowinv.zarr").potential[1], expected.potential, rtol=1e-6, atol=1e-6
     )
-    refused = CliRunner().invoke(
-        app, [*batch[:5], "--set=options.margin=5", "--out", "m.shadowinv.zarr"]
-    )
-    assert refused.exit_code == 2
-    assert "options.margin: it needs --boundary free" in " ".join(refused.output.split())
 
 
 def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
@@ -217,37 +208,3 @@ def test_a_batch_prepares_its_shots_as_an_inversion_of_one(
     output = " ".join(CliRunner().invoke(app, ["info", "n.shadowinv.zarr"]).output.split())
     assert "source fitted polynomial, degree 1" in output
     assert "low-pass (smooth), width 0.8" in output
-    refused = CliRunner().invoke(
-        app, ["batch", night.glob, "--source", shot, "--source-from", "gaussian", *out]
-    )
-    assert refused.exit_code == 2
-    assert "choose one of them" in " ".join(refused.output.split())
-
-
-def test_doubts_of_a_source_are_in_the_report_of_each_shot(night, out):
-    near = ProtonSetup(
-        energy=14.7, source_object_distance=1e-3, object_image_distance=0.28, pixel_size=1e-5
-    )
-    y, x = np.mgrid[:24, :28]
-    spot = 1e4 * np.exp(-((y - 12) ** 2 + (x - 14) ** 2) / 2 / 5**2) + 100
-    shots = np.random.default_rng(0).poisson([spot, spot])
-    hidden = np.hypot(y - 12, x - 14) > 7
-    for source, source_mask, words in (
-        (None, None, "choose the source 'isotropic'"),
-        (UniformEstimate(), None, "choose the source 'isotropic'"),
-        (GaussianEstimate(), hidden, "the Gaussian beam rises to"),
-        (IsotropicEstimate(), None, ""),
-    ):
-        run_stack(
-            Shot(shots, source_mask=source_mask),
-            out,
-            Recipe(setup=near, source=source, options=OPTIONS),
-            scheduler="synchronous",
-            run=RunOptions(variables=("potential", "source"), overwrite=True),
-        )
-        for index in (0, 1):
-            warnings = str(StackStore(out).report(index)["warnings"])
-            assert words in warnings
-            assert ("'isotropic'" in warnings) == ("'isotropic'" in words)
-    written = read_stack(out)["source"][1]
-    np.testing.assert_allclose(written, isotropic_source(shots[1], near), rtol=1e-6)

@@ -103,7 +103,7 @@ def test_damage_at_random_ends_in_one_of_two_errors(store, tmp_path):
     spec.loader.exec_module(fuzz)
     reader = fuzz.Reader()
     (tmp_path / "bad").mkdir()
-    tally = fuzz.fuzz("run.shadowinv.zarr", 60, 1, tmp_path / "bad", reader, store)
+    tally = fuzz.fuzz("run.shadowinv.zarr", 30, 1, tmp_path / "bad", reader, store)
     reader.close()
     assert tally.failures == []
     assert tally.refused >= 3

@@ -29,7 +29,7 @@ from napari_shadowinv import (
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.cli import _batch
 from napari_shadowinv.inversion import plan_sites
-from napari_shadowinv.io.store import DONE, FAILED, StackStore
+from napari_shadowinv.io.store import DONE, FAILED
 from napari_shadowinv.stack import RunStatus, watch_stack
 
 pytestmark = pytest.mark.usefixtures("impatient")
@@ -132,28 +132,6 @@ def test_a_store_inside_the_folder_does_not_set_it_off(folder):
         time.sleep(3 * SETTLE)
         assert len(watch.shots) == 2
     assert list(watch.result.status.values) == [DONE, DONE]
-
-
-def test_bad_files_fail_alone(folder, out):
-    (folder / "shot_0.npy").write_bytes(b"")
-    np.save(folder / "shot_1.npy", IMAGES[0][:10])
-    (folder / "shot_2.npy").write_text("no image")
-    put(folder, 3)
-    with Watched(folder, out) as watch:
-        watch.ended(4)
-        (folder / "shot_4.npy").write_bytes(b"")
-        watch.ended(5)
-        put(folder, 5)
-        watch.ended(6)
-        np.save(folder / "shot_6.npy", IMAGES[1])
-        watch.ended(7)
-    result = watch.result
-    assert list(result.status.values) == [FAILED] * 3 + [DONE, FAILED, DONE, DONE]
-    reasons = {event.outcome.index: event.outcome.reason for event in watch.shots}
-    assert "is empty" in reasons[0]
-    assert "image has shape (10, 28), expected (24, 28)" in reasons[1]
-    assert reasons[4] == StackStore(out).report(4)["reason"]
-    assert np.isnan(result.displacement[4]).all()
 
 
 def test_store_waits_for_the_first_shot_that_can_be_read(folder, out):
