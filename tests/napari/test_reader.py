@@ -250,17 +250,6 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_files_raise_one_sentence_in_a_script(
-    viewer: ViewerModel, tmp_path: Path, name: str
-) -> None:
-    content, words = BAD[name]
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(FileFormatError, match=words):
-        viewer.open(tmp_path / name, plugin=PLUGIN)
-    assert not viewer.layers
-
-
-@pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_one_notification_in_a_window(
     viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, messages: list[str]
 ) -> None:

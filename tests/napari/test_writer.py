@@ -135,22 +135,6 @@ def test_painted_caustics_are_kept(viewer: ViewerModel, solved: Inversion, tmp_p
     np.testing.assert_array_equal(caustic[5:], solved.caustic[5:])
 
 
-def test_pradformat_has_the_potential(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
-) -> None:
-    add_to_viewer(viewer, solved, proton_setup)
-    assert viewer.layers.save(str(tmp_path / "a.h5"), plugin=PLUGIN) == [str(tmp_path / "a.h5")]
-    potential = read(tmp_path / "a.h5")["potential"]
-    np.testing.assert_allclose(potential, solved.potential, rtol=1e-9, atol=1e-12)
-
-
-def test_pradformat_needs_protons(viewer: ViewerModel, solved: Inversion, tmp_path: Path) -> None:
-    add_to_viewer(viewer, solved)
-    with pytest.raises(FileFormatError, match="needs a setup of kind 'proton', received none"):
-        viewer.layers.save(str(tmp_path / "a.h5"), plugin=PLUGIN)
-    assert not list(tmp_path.iterdir())
-
-
 def test_sites_are_written_with_all_that_is_known(
     viewer: ViewerModel, solved: Inversion, tmp_path: Path
 ) -> None:
@@ -218,25 +202,6 @@ def test_an_ending_is_added_but_never_onto_an_existing_file(
     # The dialog asked about "shot.07", not about this.
     with pytest.raises(FileFormatError, match=r"shot.07.shadowinv exists: choose another name"):
         write_result(str(target), described_layers(viewer))
-
-
-def test_a_failed_write_leaves_the_old_file_whole(
-    viewer: ViewerModel, solved: Inversion, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    add_to_viewer(viewer, solved)
-    target = tmp_path / "a.shadowinv"
-    viewer.layers.save(str(target), plugin=PLUGIN)
-    before = target.read_bytes()
-
-    def break_off(path: Path, dataset: Any) -> None:
-        path.write_bytes(b"half")
-        raise OSError("no space left")
-
-    monkeypatch.setattr("napari_shadowinv.io.read_write.write_result", break_off)
-    with pytest.raises(OSError, match="no space left"):
-        viewer.layers.save(str(target), plugin=PLUGIN)
-    assert target.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_a_duplicated_layer_still_belongs_to_the_result(

@@ -289,3 +289,14 @@ def test_a_shot_of_a_stack_has_its_own_mask_and_that_of_all_again(tmp_path: Path
     again = rerun(shot, tmp_path / "shot_1.txt")
     usable = (tifffile.imread(tmp_path / "mask.tif") > 0) & (hidden[1] == 0)
     np.testing.assert_array_equal(again.content.mask, usable)
+
+
+def test_what_was_no_file_is_asked_for(tmp_path: Path) -> None:
+    path = record(tmp_path)[0]
+    first = run(Recipe(options=InversionOptions(n_sites=150)), np.load(path))
+    written = write(tmp_path / "a.shadowinv", first)
+    with pytest.raises(FileFormatError, match="was not made from a file: name the file"):
+        rerun(written)
+    again = rerun(written, path)
+    assert again.is_identical
+    assert "was not a file before" in again.changes[0]

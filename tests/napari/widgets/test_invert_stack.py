@@ -263,19 +263,11 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.source.set_kind("uniform")
     assert written(out) == before
 
-    tool.store.folder.edit.setText(str(tmp_path / "results"))
-    expect(".shadowinv.zarr")
     tool.store.folder.edit.setText("")
     expect("o store is selected")
     tool.store.folder.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
     tool.shots.set_kind("files")
     expect("o files are selected")
-    tool.shots.files.edit.setText(str(tmp_path / "*.tif"))
-    expect("o file matches")
-    tool.image.layer = window.add_image(np.ones((*SHAPE, 3)), rgb=True)
-    expect("colour image")
-    window.layers.clear()
-    expect("no image to use")
     assert sorted(path.name for path in tmp_path.glob("*.zarr")) == [out.name]
 
 

@@ -17,7 +17,6 @@ from helpers.jobs import run_job
 from napari_shadowinv import InputError, Instrument, InversionOptions, ProtonSetup, read
 from napari_shadowinv._napari.form import StepsSection
 from napari_shadowinv._napari.layer_metadata import (
-    Frame,
     frame_of,
     metadata_for,
     role_of,
@@ -183,23 +182,6 @@ def test_a_result_of_larger_pixels_is_in_the_units_of_these(
     )
     assert mine.name.replace(" – shot", "") == expected.name
     np.testing.assert_allclose(mine.data, expected.data)
-
-
-def test_a_turned_result_comes_back_where_it_was(
-    viewer: ViewerModel, opened: Any, run: Any, image: Any, tmp_path: Path
-) -> None:
-    tool = opened()
-    tool.steps.show_steps((Rotate(angle=10), Crop(y=(5, 40), x=(8, 50))))
-    run(tool)
-    before = next(
-        result_layer for result_layer in viewer.layers if role_of(result_layer) == "field"
-    )
-    viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
-    later = ViewerModel()
-    later.open(str(tmp_path / "a.shadowinv"), plugin="napari-shadowinv")
-    for layer in later.layers:
-        assert frame_of(layer).rotate != Frame().rotate
-        np.testing.assert_allclose(layer.data_to_world((3, 4)), before.data_to_world((3, 4)))
 
 
 # One file for window and command
