@@ -26,21 +26,22 @@ from napari_shadowinv import ProtonSetup, invert, read, synthetic_image
 from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import (
-    butterworth,
-    gaussian_source,
-    high_pass,
-    interpolated_source,
-    isotropic_source,
-    low_pass,
-    low_pass_source,
-    polynomial_source,
-    remove_background,
+    BackgroundFilter,
+    ButterworthFilter,
+    GaussianEstimate,
+    HighPassFilter,
+    InterpolatedEstimate,
+    IsotropicEstimate,
+    KrigedEstimate,
+    LowPassEstimate,
+    LowPassFilter,
+    PolynomialEstimate,
+    TotalVariationEstimate,
+    UniformEstimate,
     remove_hot_pixels,
-    total_variation_source,
-    uniform_source,
 )
 from napari_shadowinv.preprocessing.estimates import point_distance
-from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source
+from napari_shadowinv.preprocessing.kriging import kriged_prior
 
 SHOT = "Image_20241017221829851.bmp"
 SHAPE = (160, 200)
@@ -100,7 +101,8 @@ def tilted_beam() -> FloatArray:
 
 
 def patchy_beam(width: float, seed: int = 2) -> FloatArray:
-    patches = low_pass(np.random.default_rng(seed).normal(size=SHAPE), width)
+    noise = np.random.default_rng(seed).normal(size=SHAPE)
+    patches = LowPassFilter(width=width).filter_image(noise)
     return np.exp(0.28 * (patches - patches.mean()) / patches.std())
 
 
@@ -166,7 +168,7 @@ def source_picture(
     tidy(axes[3], f"Cut at y = {shot.row} px", "x (px)", "Intensity / mean")
     beams = {"this source": source, "the true beam": shot.beam}
     if name != "uniform":
-        beams["a uniform source"] = uniform_source(shot.shot)
+        beams["a uniform source"] = UniformEstimate().source(shot.shot)
     footer = "Error of the retrieved displacement:  " + "  ·  ".join(
         f"{displacement_error(shot, beam):.0%} with {text}" for text, beam in beams.items()
     )
@@ -176,50 +178,52 @@ def source_picture(
 def source_pictures() -> None:
     y, x = grid()
     flat = scene(np.ones(SHAPE), big_object())
-    source_picture("uniform", "uniform_source", flat, uniform_source(flat.shot))
+    source_picture("uniform", "uniform", flat, UniformEstimate().source(flat.shot))
     setup = ProtonSetup.example().model_copy(update={"pixel_size": 4e-6})
-    point = scene(isotropic_source(np.ones(SHAPE), setup), 0.5 * big_object())
+    isotropic = IsotropicEstimate().adapt_to(setup, SHAPE)
+    point = scene(isotropic.source(np.ones(SHAPE)), 0.5 * big_object())
     source_picture(
         "isotropic",
-        f"isotropic_source, {point_distance(setup):.0f} px from the detector",
+        f"isotropic, {point_distance(setup):.0f} px from the detector",
         point,
-        isotropic_source(point.shot, setup),
+        isotropic.source(point.shot),
     )
     spot = scene(gaussian_beam(), big_object())
-    source_picture("gaussian", "gaussian_source", spot, gaussian_source(spot.shot))
+    source_picture("gaussian", "gaussian", spot, GaussianEstimate().source(spot.shot))
     tilted = scene(tilted_beam(), big_object())
     source_picture(
         "polynomial",
-        "polynomial_source, degree 2",
+        "polynomial, degree 2",
         tilted,
-        polynomial_source(tilted.shot),
+        PolynomialEstimate().source(tilted.shot),
     )
     patchy = scene(patchy_beam(24), small_objects(), row=67)
     source_picture(
         "low-pass",
-        "low_pass_source, width 10 px",
+        "low-pass, width 10 px",
         patchy,
-        low_pass_source(patchy.shot, 10),
+        LowPassEstimate(width=10).source(patchy.shot),
     )
     clipped = scene(clipped_beam(), small_objects(), row=67)
     source_picture(
         "total-variation",
-        "total_variation_source, weight 1 px",
+        "total-variation, weight 1 px",
         clipped,
-        total_variation_source(clipped.shot, weight=1.0),
+        TotalVariationEstimate(weight=1.0).source(clipped.shot),
     )
     covered = scene(patchy_beam(45, seed=6), big_object())
     mask = np.hypot((y - 78) / 38, (x - 102) / 50) > 1
     source_picture(
         "interpolated",
-        "interpolated_source",
+        "interpolated",
         covered,
-        interpolated_source(covered.shot, mask, width=8.0),
+        InterpolatedEstimate(width=8.0).source(covered.shot, mask),
         mask,
     )
     uneven = scene(patchy_beam(22, seed=9), big_object())
-    source, error = kriged_source(uneven.shot, mask), on_pixels(kriged_prior(uneven.shot, mask))
-    source_picture("kriged", "kriged_source", uneven, source, mask, error)
+    source = KrigedEstimate().source(uneven.shot, mask)
+    error = on_pixels(kriged_prior(uneven.shot, mask))
+    source_picture("kriged", "kriged", uneven, source, mask, error)
 
 
 def on_pixels(prior: BeamPrior) -> FloatArray:
@@ -238,10 +242,10 @@ def burner_sources_picture(folder: Path) -> None:
     y, x = np.mgrid[: shot.shape[0], : shot.shape[1]]
     mask = ~((x > 115) & (x < 530) & (y < 200)) & ~((x > 190) & (x < 440))
     estimates = {
-        "Uniform": uniform_source(shot),
-        "Gaussian": gaussian_source(shot, mask=mask),
-        "Polynomial, degree 4": polynomial_source(shot, degree=4, mask=mask),
-        "Low pass, 60 px": low_pass_source(shot, 60),
+        "Uniform": UniformEstimate().source(shot),
+        "Gaussian": GaussianEstimate().source(shot, mask),
+        "Polynomial, degree 4": PolynomialEstimate(degree=4).source(shot, mask),
+        "Low pass, 60 px": LowPassEstimate(width=60).source(shot),
     }
     figure, axes = page("A real beam: plume of an alcohol burner", [1, 1, 1], rows=2)
     show(axes[0], shot, "Shot", "Intensity / mean", (0.75, 1.4))
@@ -250,7 +254,7 @@ def burner_sources_picture(folder: Path) -> None:
     for panel, (name, beam) in zip(axes[2:], estimates.items(), strict=True):
         miss = beam / beam.mean() / reference - 1
         title = f"{name}: {100 * miss.std():.1f} % rms"
-        miss = low_pass(100 * miss, 2.0)
+        miss = LowPassFilter(width=2.0).filter_image(100 * miss)
         show(panel, miss, title, "Estimate - beam (% of beam)", (-15, 15), "RdBu_r")
     footer = (
         "Orange: the Gaussian and the polynomial were fitted outside of it. The low pass saw all."
@@ -282,14 +286,15 @@ def gain_panel(axes: Axes, curves: dict[str, Callable[[FloatArray], FloatArray]]
 def pass_pictures() -> None:
     shot = scene(gaussian_beam(), big_object()).shot
     noisy = np.random.default_rng(3).poisson(shot / 60).astype(float)
-    noisy, smooth = noisy / noisy.mean(), low_pass(noisy, 1.5) / noisy.mean()
-    figure, axes = page("low_pass, width 1.5 px", [1, 1, 1.15])
+    smooth = LowPassFilter(width=1.5).filter_image(noisy) / noisy.mean()
+    noisy = noisy / noisy.mean()
+    figure, axes = page("low-pass, width 1.5 px", [1, 1, 1.15])
     show(axes[0], noisy, "Shot of 33 counts per pixel", "Intensity / mean", range_of(smooth, 0.1))
     show(axes[1], smooth, "Filtered", "Intensity / mean", range_of(smooth, 0.1))
     gain_panel(
         axes[2],
         {
-            f"width {width:g} px": lambda image, width=width: low_pass(image, width)
+            f"width {width:g} px": LowPassFilter(width=width).filter_image
             for width in (1.5, 5.0, 15.0)
         },
     )
@@ -300,19 +305,19 @@ def pass_pictures() -> None:
     for name, title, filtered, curves in (
         (
             "high-pass",
-            "high_pass, width 10 px",
-            high_pass(patchy, 10.0),
+            "high-pass, width 10 px",
+            HighPassFilter(width=10.0).filter_image(patchy),
             {
-                f"width {width:g} px": lambda image, width=width: high_pass(image, width)
+                f"width {width:g} px": HighPassFilter(width=width).filter_image
                 for width in (5.0, 10.0, 30.0)
             },
         ),
         (
             "butterworth",
             "butterworth, cutoff 40 px, order 2",
-            butterworth(patchy, 40.0, 2),
+            ButterworthFilter(cutoff=40.0, order=2).filter_image(patchy),
             {
-                f"order {order}": lambda image, order=order: butterworth(image, 40.0, order)
+                f"order {order}": ButterworthFilter(cutoff=40.0, order=order).filter_image
                 for order in (1, 2, 4, 8)
             },
         ),
@@ -327,8 +332,8 @@ def pass_pictures() -> None:
 def background_picture() -> None:
     tilted = scene(tilted_beam(), big_object())
     shot = tilted.shot / tilted.shot.mean()
-    flat = remove_background(shot, 2)
-    figure, axes = page("remove_background, degree 2", [1, 1, 1.15])
+    flat = BackgroundFilter(degree=2).filter_image(shot)
+    figure, axes = page("background, degree 2", [1, 1, 1.15])
     show(axes[0], shot, "Shot", "Intensity / mean", range_of(shot))
     show(axes[1], flat, "Flattened", "Intensity / mean", range_of(shot))
     for panel in axes[:2]:
@@ -372,14 +377,14 @@ def burner_filters_picture(folder: Path) -> None:
     """The paper's filtering of a shadowgram, of its potential, and of both."""
     shot = read(folder / SHOT).bin_pixels(4).image
     reference = read(folder / "Image_00000.bmp").bin_pixels(4).image
-    flat = remove_background(shot, 4)
+    flat = BackgroundFilter(degree=4).filter_image(shot)
     raw = invert(shot).potential
     potentials = {
         "Recorded beam, unfiltered": invert(shot, source=reference).potential,
         "Uniform source, unfiltered": raw,
-        "Potential high-passed": high_pass(raw, 25.0),
+        "Potential high-passed": HighPassFilter(width=25.0).filter_image(raw),
         "Image flattened": invert(flat).potential,
-        "Both": high_pass(invert(flat).potential, 25.0),
+        "Both": HighPassFilter(width=25.0).filter_image(invert(flat).potential),
     }
     figure, axes = page("Filtering a real shot without its beam", [1, 1, 1], rows=2)
     show(axes[0], shot / shot.mean(), "Shot", "Intensity / mean", (0.75, 1.4))

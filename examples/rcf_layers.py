@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 
 from napari_shadowinv import InversionOptions, Shot, invert
 from napari_shadowinv.film import Calibration, dose
-from napari_shadowinv.preprocessing import low_pass_source
+from napari_shadowinv.preprocessing import LowPassEstimate
 
 parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
 parser.add_argument("folder", type=Path, help="folder with the scans and the calibration")
@@ -66,7 +66,7 @@ for layer, (energy, top, left) in LAYERS.items():
 
 # %% A guess of the beam, and the deflection that explains the rest
 blur = 30 / factor  # 30 px of the film, 2.5 mm
-sources = {layer: low_pass_source(image, blur) for layer, image in doses.items()}
+sources = {layer: LowPassEstimate(width=blur).source(image) for layer, image in doses.items()}
 inversions = {
     layer: invert(
         image,

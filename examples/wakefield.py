@@ -41,7 +41,7 @@ retrieved = setup.relative_density_modulation(inversion.potential, density)
 true = setup.relative_density_modulation(wave.potential, density)
 # An inversion amplifies the slowest part of the noise; the wave is 33 pixels long, so what is much
 # longer can be taken away from the potential.
-found = filters.high_pass(retrieved, 40 / factor, keep_mean=False)
+found = retrieved - filters.LowPassFilter(width=40 / factor).filter_image(retrieved)
 raw_error, error = (
     float(np.linalg.norm(plane - plane.mean() - true) / np.linalg.norm(true))
     for plane in (retrieved, found)

@@ -451,7 +451,7 @@ def test_an_estimated_source_is_described(shot: Path) -> None:
     assert result.exit_code in (0, 3), result.output
     saved = dataset("shot.shadowinv")
     np.testing.assert_array_equal(
-        saved["source"], sources.polynomial_source(np.load(shot), degree=3)
+        saved["source"], sources.PolynomialEstimate(degree=3).source(np.load(shot))
     )
     text = flat(shadowinv("info", "shot.shadowinv").stdout)
     assert f"source {sources.PolynomialEstimate(degree=3).summary}" in text
@@ -467,7 +467,9 @@ def test_filters_match_the_library() -> None:
     clean, hot, dead = filters.remove_hot_pixels(image, threshold=6.0)
     assert (hot.sum(), dead.sum()) == (1, 0)
     blocks = clean.reshape(24, 2, 32, 2).sum(axis=(1, 3))
-    expected = filters.low_pass(filters.remove_background(blocks, 1), 1.5)
+    expected = filters.LowPassFilter(width=1.5).filter_image(
+        filters.BackgroundFilter(degree=1).filter_image(blocks)
+    )
     flags = ["--step=low-pass 1.5", "--step=background degree=1", "--step=hot-pixels 6", "--bin", 2]
     result = shadowinv("invert", "shot.npy", *flags)
     assert result.exit_code == 0, result.output

@@ -34,8 +34,8 @@ from napari_shadowinv.pipeline import run
 from napari_shadowinv.preprocessing import (
     ESTIMATES,
     LowPassFilter,
+    PolynomialEstimate,
     Recipe,
-    polynomial_source,
 )
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import invert_stack, run_stack
@@ -628,7 +628,7 @@ def test_each_estimate_of_a_source_is_a_beam_that_nobody_measured(method, tmp_pa
 
 
 def test_an_estimate_passed_as_an_array_is_declared(image):
-    estimated = polynomial_source(image)
+    estimated = PolynomialEstimate().source(image)
     options = InversionOptions(n_sites=900)
     errors = invert(image, source=estimated, options=options, measured=False).errors
     assert errors.beam_basis == "assumed"

@@ -26,7 +26,6 @@ from napari_shadowinv.preprocessing import (
     Recipe,
     TotalVariationEstimate,
     UniformEstimate,
-    isotropic_source,
 )
 from napari_shadowinv.shot import Shot
 
@@ -118,7 +117,8 @@ def test_the_axis_of_an_isotropic_source_is_in_the_middle_of_the_whole_image(sho
     recipe = Recipe(
         steps=(Crop(y=(20, 40), x=(5, 35)),), source=IsotropicEstimate(), options=FEW, setup=near
     )
-    expected = isotropic_source(np.ones(shot.shape), near)[crop]
+    recorded = IsotropicEstimate().adapt_to(near, shot.shape)
+    expected = recorded.source(np.ones(shot.shape))[crop]
     for preview in (False, True):
         source = run(recipe, shot, preview=preview).source
         np.testing.assert_allclose(source / source.mean(), expected / expected.mean())

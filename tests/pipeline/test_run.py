@@ -55,9 +55,6 @@ from napari_shadowinv.preprocessing import (
     Recipe,
     Rotate,
     Step,
-    low_pass,
-    polynomial_source,
-    remove_background,
 )
 from napari_shadowinv.shot import Shot
 
@@ -105,9 +102,9 @@ def test_steps_are_done_in_their_order(image: FloatArray) -> None:
         expected = image
         for step in steps:
             if step is background:
-                expected = remove_background(expected, 1)
+                expected = BackgroundFilter(degree=1).filter_image(expected)
             elif step is smooth:
-                expected = low_pass(expected, 2.0)
+                expected = LowPassFilter(width=2.0).filter_image(expected)
             else:
                 expected = expected.reshape(20, 2, 26, 2).sum(axis=(1, 3))
         assert_same(
@@ -127,7 +124,7 @@ def test_source_and_masks_go_through_the_same_steps(image: FloatArray) -> None:
     usable = by_hand(mask)
     small = LowPassFilter(width=1).filter_image(by_hand(image), usable)
     recipe = Recipe(steps=steps, source=PolynomialEstimate(degree=1), options=OPTIONS)
-    source = polynomial_source(small, degree=1, mask=usable & by_hand(bare))
+    source = PolynomialEstimate(degree=1).source(small, usable & by_hand(bare))
     inversion = run(recipe, Shot(image, mask=mask, source_mask=bare))
     # Sums of a turned array are rounded in another order.
     expected = invert(small, source=source, mask=usable, options=OPTIONS)

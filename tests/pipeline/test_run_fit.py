@@ -23,7 +23,6 @@ from napari_shadowinv.preprocessing import (
     Crop,
     LowPassEstimate,
     Recipe,
-    low_pass_source,
 )
 from napari_shadowinv.shot import Shot, shots_of
 
@@ -122,7 +121,7 @@ def test_provenance_is_complete_and_survives_its_file(
 def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[FloatArray]) -> None:
     recipe = Recipe(steps=STEPS, source=LowPassEstimate(width=20))
     inputs = collect_fit_inputs(recipe, [Shot(image, strength=(1.0,)) for image in images])
-    expected = [low_pass_source(binned(image), width=20) for image in images]
+    expected = [LowPassEstimate(width=20).source(binned(image)) for image in images]
     np.testing.assert_allclose(of_each(inputs.shots, "source"), expected)
     assert inputs.provenance.recipe.source == LowPassEstimate(width=20)
 

@@ -5,22 +5,22 @@ import pytest
 
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import (
-    butterworth,
+    BackgroundFilter,
+    ButterworthFilter,
+    HighPassFilter,
+    HotPixelFilter,
+    LowPassFilter,
     fit_polynomial,
-    high_pass,
-    low_pass,
-    remove_background,
     remove_hot_pixels,
 )
-from napari_shadowinv.preprocessing.filters import LowPassFilter
 
 SHAPE = (48, 60)
 FILTERS = {
-    "low pass": lambda image: low_pass(image, 3.0),
-    "high pass": lambda image: high_pass(image, 3.0),
-    "butterworth": lambda image: butterworth(image, 12.0),
-    "background": lambda image: remove_background(image, 1),
-    "hot pixels": lambda image: remove_hot_pixels(image)[0],
+    "low pass": LowPassFilter(width=3).filter_image,
+    "high pass": HighPassFilter(width=3).filter_image,
+    "butterworth": ButterworthFilter(cutoff=12).filter_image,
+    "background": BackgroundFilter(degree=1).filter_image,
+    "hot pixels": HotPixelFilter().filter_image,
 }
 
 
@@ -41,38 +41,47 @@ def wave(n_y, n_x, shape=SHAPE):
 @pytest.mark.parametrize("width", [0.7, 4.0, 30.0, 1000.0])
 def test_high_pass_and_low_pass_add_up_to_the_image(width):
     image = random_image()
-    low = low_pass(image, width)
-    np.testing.assert_allclose(high_pass(image, width, keep_mean=False) + low, image, rtol=1e-14)
-    np.testing.assert_allclose(high_pass(image, width) + low - image.mean(), image, rtol=1e-13)
+    low = LowPassFilter(width=width).filter_image(image)
+    high = HighPassFilter(width=width).filter_image(image)
+    np.testing.assert_allclose(high + low - image.mean(), image, rtol=1e-13)
 
 
 @pytest.mark.parametrize("numbers", [(0, 4), (5, 0), (3, 7), (20, 31)])
 def test_gaussian_filters_attenuate_a_wave_by_the_textbook_factor(numbers):
     image, k = wave(*numbers)
     gain = np.exp(-((2.0 * k) ** 2) / 2)
-    np.testing.assert_allclose(low_pass(image, 2.0), gain * image, atol=1e-14)
-    np.testing.assert_allclose(high_pass(image, 2.0), (1 - gain) * image, atol=1e-14)
+    np.testing.assert_allclose(
+        LowPassFilter(width=2.0).filter_image(image), gain * image, atol=1e-14
+    )
+    np.testing.assert_allclose(
+        HighPassFilter(width=2.0).filter_image(image), (1 - gain) * image, atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("order", [1, 2, 5, 20])
 @pytest.mark.parametrize("kind", ["high", "low"])
 def test_butterworth_keeps_one_over_root_two_at_the_cutoff(order, kind):
     image, k = wave(6, 9)
-    filtered = butterworth(image, 2 * np.pi / k, order, kind=kind)
+    filtered = ButterworthFilter(cutoff=2 * np.pi / k, order=order, kind=kind).filter_image(image)
     np.testing.assert_allclose(filtered, image / np.sqrt(2), atol=1e-12)
 
 
 def test_butterworth_falls_by_its_order_per_octave():
     slow, k = wave(2, 0)
     for order in (1, 2, 3):
-        gain = butterworth(slow, 2 * np.pi / (8 * k), order)[0, 0] / slow[0, 0]
+        gain = (
+            ButterworthFilter(cutoff=2 * np.pi / (8 * k), order=order).filter_image(slow)[0, 0]
+            / slow[0, 0]
+        )
         assert gain == pytest.approx((1 + 8.0 ** (2 * order)) ** -0.5, rel=1e-9)
 
 
 def test_powers_of_the_two_butterworth_filters_add_up():
     image, _ = wave(3, 4)
-    high = butterworth(image, 30.0, 3)[0, 0] / image[0, 0]
-    low = butterworth(image, 30.0, 3, kind="low")[0, 0] / image[0, 0]
+    high = ButterworthFilter(cutoff=30.0, order=3).filter_image(image)[0, 0] / image[0, 0]
+    low = (
+        ButterworthFilter(cutoff=30.0, order=3, kind="low").filter_image(image)[0, 0] / image[0, 0]
+    )
     assert high**2 + low**2 == pytest.approx(1, rel=1e-12)
 
 
@@ -82,18 +91,12 @@ def test_flux_is_kept(name):
     assert FILTERS[name](image).sum() == pytest.approx(image.sum(), rel=1e-13)
 
 
-def test_high_passes_without_the_mean_have_none():
-    image = random_image(2)
-    assert high_pass(image, 3.0, keep_mean=False).mean() == pytest.approx(0, abs=1e-14)
-    assert butterworth(image, 9.0, keep_mean=False).mean() == pytest.approx(0, abs=1e-14)
-
-
 def test_the_kept_mean_does_not_keep_a_dark_spot_of_a_peaked_beam_positive():
     y, x = np.mgrid[:64, :64] - 31.5
     image = 10 * np.exp(-(y**2 + x**2) / 200) + 0.01
     image[30:33, 30:33] = 0.01
-    assert high_pass(image, 3.0).min() < 0
-    assert remove_background(image, 0).min() > 0
+    assert HighPassFilter(width=3.0).filter_image(image).min() < 0
+    assert BackgroundFilter(degree=0).filter_image(image).min() > 0
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -141,17 +144,17 @@ def test_dividing_by_the_background_returns_the_modulation():
     modulation = 1 + 0.05 * wave(12, 14)[0]
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 60
     beam = 300 * (2 + x - y**2)
-    flat = remove_background(beam * modulation, 2)
+    flat = BackgroundFilter(degree=2).filter_image(beam * modulation)
     np.testing.assert_allclose(flat / flat.mean(), modulation, atol=2e-3)
 
 
 def test_subtracting_serves_a_potential_that_changes_sign():
     potential, _ = wave(10, 12)
     tilt = np.linspace(-3, 3, SHAPE[1])
-    flat = remove_background(potential + tilt, 1, kind="subtract")
+    flat = BackgroundFilter(degree=1, kind="subtract").filter_image(potential + tilt)
     np.testing.assert_allclose(flat, potential, atol=0.02)
     with pytest.raises(InputError, match="the kind 'subtract'"):
-        remove_background(potential + tilt, 1)
+        BackgroundFilter(degree=1).filter_image(potential + tilt)
 
 
 def test_the_background_ignores_masked_pixels():
@@ -258,20 +261,29 @@ def test_arrays_that_are_no_images_are_refused(name, image, words):
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda image: low_pass(image, 0), "width is 0"),
-        (lambda image: high_pass(image, np.nan), "width is nan"),
-        (lambda image: butterworth(image, -3), "cutoff is -3"),
-        (lambda image: butterworth(image, 2), "cutoff is 2"),
-        (lambda image: butterworth(image, 3, 0), "order is 0"),
-        (lambda image: butterworth(image, 3, 21), "order is 21"),
-        (lambda image: butterworth(image, 3, kind="band"), "kind is 'band'"),
-        (lambda image: remove_background(image, 2.5), "degree is 2.5"),
-        (lambda image: remove_background(image, 11), "from 0 to 10"),
-        (lambda image: remove_background(image, kind="add"), "kind is 'add'"),
-        (lambda image: remove_background(image, mask=np.ones(SHAPE)), "float64, expected bool"),
-        (lambda image: remove_background(image, mask=np.ones((3, 3), bool)), r"shape \(3, 3\)"),
+        (lambda image: LowPassFilter(width=0).filter_image(image), "'width' is 0"),
+        (lambda image: HighPassFilter(width=np.nan).filter_image(image), "'width' is nan"),
+        (lambda image: ButterworthFilter(cutoff=-3).filter_image(image), "'cutoff' is -3"),
+        (lambda image: ButterworthFilter(cutoff=2).filter_image(image), "'cutoff' is 2"),
+        (lambda image: ButterworthFilter(cutoff=3, order=0).filter_image(image), "'order' is 0"),
+        (lambda image: ButterworthFilter(cutoff=3, order=21).filter_image(image), "'order' is 21"),
         (
-            lambda image: remove_background(image, mask=np.zeros(SHAPE, bool)),
+            lambda image: ButterworthFilter(cutoff=3, kind="band").filter_image(image),
+            "'kind' is 'band'",
+        ),
+        (lambda image: BackgroundFilter(degree=2.5).filter_image(image), "'degree' is 2.5"),
+        (lambda image: BackgroundFilter(degree=11).filter_image(image), "at most 10"),
+        (lambda image: BackgroundFilter(kind="add").filter_image(image), "'kind' is 'add'"),
+        (
+            lambda image: BackgroundFilter().filter_image(image, np.ones(SHAPE)),
+            "float64, expected bool",
+        ),
+        (
+            lambda image: BackgroundFilter().filter_image(image, np.ones((3, 3), bool)),
+            r"shape \(3, 3\)",
+        ),
+        (
+            lambda image: BackgroundFilter().filter_image(image, np.zeros(SHAPE, bool)),
             "mask leaves 0 of .* pixels usable",
         ),
         (lambda image: fit_polynomial(image[:2, :2], 2), "6 coefficients"),
@@ -283,15 +295,3 @@ def test_arrays_that_are_no_images_are_refused(name, image, words):
 def test_options_that_make_no_sense_are_refused(call, words):
     with pytest.raises(InputError, match=words):
         call(random_image())
-
-
-def test_a_function_with_further_keywords_receives_the_mask():
-    """One that does not name it takes it, too, as ``**options``."""
-    mask, received = np.ones((4, 4), bool), {}
-
-    def record(image, **options):
-        received.update(options)
-        return image
-
-    LowPassFilter(width=2.0).call(record, np.ones((4, 4)), mask=mask, should_stop=None)
-    assert received == {"width": 2.0, "mask": mask, "should_stop": None}

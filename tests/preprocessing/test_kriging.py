@@ -11,7 +11,7 @@ from napari_shadowinv import InputError, Instrument, InversionOptions, Recipe, i
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.pipeline import run
-from napari_shadowinv.preprocessing import kriged_source, polynomial_source, uniform_source
+from napari_shadowinv.preprocessing import KrigedEstimate, PolynomialEstimate, UniformEstimate
 from napari_shadowinv.preprocessing.kriging import kriged_prior
 from napari_shadowinv.shot import Shot
 
@@ -29,7 +29,8 @@ def beam(length, rng, rms=0.05):
 
 def predict(image, bare):
     """Return the beam behind an object, and the prior of its error."""
-    return kriged_source(image, bare, on_caution=lambda _: None), kriged_prior(image, bare)
+    source = KrigedEstimate().source(image, bare, on_caution=lambda _: None)
+    return source, kriged_prior(image, bare)
 
 
 def hidden(image):
@@ -58,8 +59,8 @@ def test_the_beam_behind_an_object_is_within_the_conditional_variance(length):
 
 def test_pixels_under_the_mask_do_not_count():
     image = np.random.default_rng(0).poisson(300 * beam(0.25, np.random.default_rng(1)))
-    first = kriged_source(np.where(BARE, image, 0), BARE)
-    second = kriged_source(hidden(image), BARE)
+    first = KrigedEstimate().source(np.where(BARE, image, 0), BARE)
+    second = KrigedEstimate().source(hidden(image), BARE)
     np.testing.assert_array_equal(first, second)
     assert first[BARE].mean() == pytest.approx(image[BARE].mean())
 
@@ -81,13 +82,13 @@ def test_the_variance_is_largest_behind_the_object():
 
 def test_an_image_without_bare_pixels_is_refused():
     mask = np.zeros((SIDE, SIDE), bool)
-    with pytest.raises(InputError, match=r"^no pixel is free of the object, so the beam behind"):
-        kriged_source(np.ones((SIDE, SIDE)), mask)
+    with pytest.raises(InputError, match=r"^mask leaves 0 of .* pixels usable"):
+        KrigedEstimate().source(np.ones((SIDE, SIDE)), mask)
     with pytest.raises(InputError, match=r"^the mask hides no pixel, so the object would be"):
-        kriged_source(np.ones((SIDE, SIDE)), ~mask)
+        KrigedEstimate().source(np.ones((SIDE, SIDE)), ~mask)
     mask[:8] = True
     with pytest.raises(InputError, match=r"% of the image is free of the object, too little"):
-        kriged_source(np.ones((SIDE, SIDE)), mask)
+        KrigedEstimate().source(np.ones((SIDE, SIDE)), mask)
 
 
 def random_waves(rng, length, rms):
@@ -126,8 +127,8 @@ def test_random_waves_behind_a_traced_object_are_predicted_within_their_error():
         image, true = traced_shot(seed)
         source, prior = predict(image, bare)
         sources = {
-            "uniform": uniform_source(image),
-            "polynomial": polynomial_source(image, mask=bare),
+            "uniform": UniformEstimate().source(image),
+            "polynomial": PolynomialEstimate().source(image, bare),
             "kriged": source,
         }
         for name, estimate in sources.items():
@@ -164,7 +165,7 @@ def test_a_smooth_profile_is_continued_under_the_mask(profile, noise):
     true = PROFILES[profile]
     image = true * (1 + noise * np.random.default_rng(0).normal(size=true.shape))
     cautions = []
-    source = kriged_source(hidden(image), BARE, on_caution=cautions.append)
+    source = KrigedEstimate().source(hidden(image), BARE, on_caution=cautions.append)
     error = np.log(source / true)
     error -= error[BARE].mean()
     assert np.abs(error[~BARE]).max() < 3e-3
@@ -216,7 +217,7 @@ def test_a_mask_that_leaves_a_halo_is_named(width):
     for seed in range(4):
         image, _ = traced_shot(seed, width)
         cautions = []
-        kriged_source(image, bare, on_caution=cautions.append)
+        KrigedEstimate().source(image, bare, on_caution=cautions.append)
         warned.append([caution.code for caution in cautions])
         assert all("may not cover the object with its halo" in each.text for each in cautions)
     assert warned == 4 * ([["source"]] if width == 0.09 else [[]])
@@ -228,9 +229,9 @@ def test_an_image_of_the_beam_alone_leaves_its_prediction_as_it_is():
         rng = np.random.default_rng(seed)
         true = random_waves(rng, (0.15, 0.25, 0.5, 1.0)[seed % 4], 0.03)(*np.indices((SIDE, SIDE)))
         cautions = []
-        kriged_source(rng.poisson(1000 * true), BARE, on_caution=cautions.append)
+        KrigedEstimate().source(rng.poisson(1000 * true), BARE, on_caution=cautions.append)
         assert not cautions
-    kriged_source(np.ones((SIDE, SIDE)), BARE, on_caution=cautions.append)
+    KrigedEstimate().source(np.ones((SIDE, SIDE)), BARE, on_caution=cautions.append)
     assert not cautions
 
 

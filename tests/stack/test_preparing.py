@@ -30,9 +30,6 @@ from napari_shadowinv.preprocessing import (
     LowPassFilter,
     PolynomialEstimate,
     UniformEstimate,
-    high_pass,
-    low_pass,
-    polynomial_source,
 )
 from napari_shadowinv.provenance import Provenance
 
@@ -59,7 +56,7 @@ def alone(image, usable, bare):
     clean = LowPassFilter(width=0.8).filter_image(
         HotPixelFilter().filter_image(image, usable), usable
     )
-    source = polynomial_source(clean, degree=1, mask=usable & bare)
+    source = PolynomialEstimate(degree=1).source(clean, usable & bare)
     return invert(clean, source=source, mask=usable, options=OPTIONS)
 
 
@@ -97,7 +94,9 @@ def test_sources_are_guessed_from_filtered_shots(night, out, bare, usable):
 def test_a_measured_source_is_blurred_as_its_shots(night, out):
     blur = (LowPassFilter(width=1.0),)
     expected = invert(
-        low_pass(night.images[1], 1.0), source=low_pass(night.source, 1.0), options=OPTIONS
+        LowPassFilter(width=1.0).filter_image(night.images[1]),
+        source=LowPassFilter(width=1.0).filter_image(night.source),
+        options=OPTIONS,
     )
     sources = np.stack([night.source] * 6)
     for source in (night.source, sources):
@@ -111,7 +110,7 @@ def test_a_uniform_beam_is_shared_and_may_be_flattened(night):
     stack = invert_stack(
         night.images, Recipe(steps=flatten, source=UniformEstimate(), options=OPTIONS)
     )
-    expected = invert(high_pass(night.images[2], 9.0), options=OPTIONS)
+    expected = invert(HighPassFilter(width=9.0).filter_image(night.images[2]), options=OPTIONS)
     np.testing.assert_allclose(stack.potential[2].compute(), expected.potential, rtol=0, atol=1e-9)
 
 

@@ -29,7 +29,7 @@ from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
-from napari_shadowinv.preprocessing.estimates import uniform_source
+from napari_shadowinv.preprocessing.estimates import UniformEstimate
 from napari_shadowinv.shot import Shot
 
 OPTIONS = InversionOptions(n_sites=300)
@@ -139,7 +139,7 @@ def test_plan_without_the_mask_is_refused(burnt: np.ma.MaskedArray[Any, Any]) ->
 
 
 def test_estimate_ignores_masked_pixels(burnt: np.ma.MaskedArray[Any, Any]) -> None:
-    assert uniform_source(burnt).mean() == pytest.approx(SHOT[~burnt.mask].mean())
+    assert UniformEstimate().source(burnt).mean() == pytest.approx(SHOT[~burnt.mask].mean())
 
 
 def test_stack_with_different_masks_is_refused(burnt: np.ma.MaskedArray[Any, Any]) -> None:

@@ -117,14 +117,15 @@ def remove_hot_pixels(selection: _Selection, should_stop: ShouldStop) -> results
 def high_pass(selection: _Selection, _: ShouldStop) -> results.LayerData:
     """Remove structures larger than about 0.15 of the image's shorter side; keep the mean."""
     width = 0.15 * min(selection.image.shape)
-    image = preprocessing.high_pass(selection.image, width)
+    image = preprocessing.HighPassFilter(width=width).filter_image(selection.image)
     return [_filtered_layer(selection, image, f"high-pass σ={width:.3g} px")]
 
 
 @_in_thread("Estimating the source of")
 def estimate_source(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
     """Estimate the undisturbed beam as the image of least total variation near the selected one."""
-    source = preprocessing.total_variation_source(selection.image, should_stop=should_stop)
+    estimate = preprocessing.TotalVariationEstimate()
+    source = estimate.source(selection.image, should_stop=should_stop)
     made_from = {"image": selection.name, "estimate": "total variation"}
     selection = replace(selection, role=about.SOURCE)
     return [_filtered_layer(selection, source, "source by total variation", made_from=made_from)]

@@ -255,14 +255,19 @@ def _order_axes(array: Any, name: str, dims: Sequence[str], unit: str) -> Any:
     return array.transpose(*leading, *plane).data
 
 
-def block_sums(planes: FloatArray | BoolArray, side: int) -> FloatArray:
+def block_sums(planes: FloatArray | BoolArray, side: int, few: int = 8) -> FloatArray:
     """Return sums over square blocks of a plane, or of each of several, without incomplete ones.
 
-    Of small blocks, sums of slices take a tenth of the time of scikit-image's `block_reduce`.
+    Blocks with `few` pixels a side are summed as NumPy does, which is slow where they have fewer:
+    it adds such pixels in turn, as slices do in a quarter of the time.
     """
     height, width = (length // side * side for length in planes.shape[-2:])
-    rows = sum(planes[..., k:height:side, :width] for k in range(side))
-    sums = sum(np.asarray(rows)[..., k::side] for k in range(side))
+    if side < few:
+        lines = (planes[..., first:height:side, :width] for first in range(side))
+        sums = sum(sum(line[..., first::side] for first in range(side)) for line in lines)
+    else:
+        blocks = *planes.shape[:-2], height // side, side, width // side, side
+        sums = planes[..., :height, :width].reshape(blocks).sum(axis=(-3, -1))
     return np.asarray(sums, dtype=None if planes.dtype.kind == "f" else np.float64)
 
 

@@ -3,11 +3,9 @@
 - the shot: `Shot`; the recipe: `Recipe`
 - whether image and source look right: `image_cautions`, `ReferencePair`; a source in register with
   its image: `register_source`
-- steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; as functions `low_pass`,
-  `high_pass`, `butterworth`, `remove_background`, `remove_hot_pixels`
-- estimates of the source by name in `ESTIMATES`; as functions `uniform_source`,
-  `isotropic_source`, `gaussian_source`, `polynomial_source`, `low_pass_source`,
-  `total_variation_source`, `interpolated_source`, `kriged_source`
+- steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; the broken pixels that
+  one of them replaces: `remove_hot_pixels`
+- estimates of the source by name in `ESTIMATES`
 """
 
 import lazy_loader

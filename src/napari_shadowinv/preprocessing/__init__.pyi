@@ -9,13 +9,7 @@ from .estimates import (
     PolynomialEstimate,
     TotalVariationEstimate,
     UniformEstimate,
-    gaussian_source,
-    isotropic_source,
-    low_pass_source,
-    polynomial_source,
-    total_variation_source,
     uniform_cautions,
-    uniform_source,
 )
 from .filters import (
     BackgroundFilter,
@@ -24,15 +18,10 @@ from .filters import (
     HighPassFilter,
     HotPixelFilter,
     LowPassFilter,
-    butterworth,
-    high_pass,
-    low_pass,
-    remove_background,
     remove_hot_pixels,
 )
 from .image_checks import ReferencePair, image_cautions
-from .kriging import kriged_source
-from .pixels import fit_polynomial, interpolated_source
+from .pixels import fit_polynomial
 from .recipe import (
     ESTIMATES,
     FILTERS,
@@ -76,26 +65,14 @@ __all__ = [
     "Step",
     "TotalVariationEstimate",
     "UniformEstimate",
-    "butterworth",
     "check_masks",
     "estimate_source",
     "fit_polynomial",
-    "gaussian_source",
-    "high_pass",
     "image_cautions",
-    "interpolated_source",
-    "isotropic_source",
-    "kriged_source",
-    "low_pass",
-    "low_pass_source",
     "measure_shift",
     "move",
-    "polynomial_source",
     "register_source",
-    "remove_background",
     "remove_hot_pixels",
-    "total_variation_source",
     "uniform_cautions",
-    "uniform_source",
     "with_prior_of",
 ]

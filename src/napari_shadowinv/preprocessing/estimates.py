@@ -3,24 +3,16 @@
 An inversion needs the source: the image that the beam would make without the object. Where
 none was recorded, or the beam changes from shot to shot, it must be estimated from the shot.
 
-- the beam is flat, or nothing is known: `uniform_source`; whether it can be: `uniform_cautions`
-- a point shines evenly in all directions: `isotropic_source`; how far away: `point_distance`
-- the beam is a Gaussian spot: `gaussian_source`
-- the beam varies slowly, in no known way: `polynomial_source`, `low_pass_source`
-- the beam has edges that matter: `total_variation_source`
-- the object covers a known part of the image: `interpolated_source`
-- the beam is smooth and random, and visible around the object: `kriged_source`
-- in a recipe: `Estimate` and the classes derived from it
+- the beam is flat, or nothing is known: `UniformEstimate`; whether it can be: `uniform_cautions`
+- a point shines evenly in all directions: `IsotropicEstimate`; how far away: `point_distance`
+- the beam is a Gaussian spot: `GaussianEstimate`
+- the beam varies slowly, in no known way: `PolynomialEstimate`, `LowPassEstimate`
+- the beam has edges that matter: `TotalVariationEstimate`
+- the object covers a known part of the image: `InterpolatedEstimate`
+- the beam is smooth and random, and visible around the object: `KrigedEstimate`
+- their base class: `Estimate`
 
-Each takes an image ``[y, x]``, counts or any linear measure of fluence, and returns float64
-of the same shape and unit that is positive everywhere and has the same flux over the usable
-pixels. A `mask` is True where a pixel is usable; the others (dead areas, handwriting, a shadow)
-may hold anything, NaN too, and are filled in. Default: all are usable.
-
-An `InputError` refuses an image and a mask that cannot be used, an image without flux, a parameter
-out of range, and an estimate that rises, where it sees nothing, to ten times the brightest pixel
-it saw. Estimates that take long ask `should_stop` at each of their steps, that of total variation
-before its first, and raise `InversionCancelled` when it returns true.
+Each is a source of a recipe, and makes that of one image by `Estimate.source`.
 
 Structure that an estimate attributes to the beam is lost from the object, and vice versa. The
 choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179, section V.
@@ -46,18 +38,17 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.setup import Setup, bin_setup
-from napari_shadowinv.preprocessing import pixels
-from napari_shadowinv.preprocessing.filters import low_pass
+from napari_shadowinv.preprocessing import filters, pixels
 from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
+
+_NOTABLE_RISE = 1.5  # of a Gaussian under the mask, over the brightest pixel that was fitted
 
 
 class Estimate(Choice):
     """A way to estimate the undisturbed beam from the shot."""
 
     key = "method"
-    # Takes the image and the parameters, and may take `mask`, `should_stop` and `on_caution`.
-    function: ClassVar[Callable[..., FloatArray]]
     needs_mask: ClassVar[bool] = False  # does it nothing without a mask
     uses_mask: ClassVar[bool] = True  # does it anything with one
 
@@ -74,22 +65,52 @@ class Estimate(Choice):
 
     def source(
         self,
-        image: FloatArray,
-        mask: BoolArray | None,
+        image: ArrayLike,
+        mask: ArrayLike | None = None,
         should_stop: ShouldStop | None = None,
         on_caution: OnCaution | None = None,
     ) -> FloatArray:
-        """Estimate the source; `on_caution` receives a `Caution` if it is doubtful.
+        """Estimate the source of an image.
 
-        An `InputError` if the image cannot be used, or there is no mask where one is needed.
+        Parameters
+        ----------
+        image : array_like, shape (H, W)
+            Counts, or any linear measure of fluence.
+        mask : array_like of bool, shape (H, W), optional
+            True where a pixel is usable; the others (dead areas, handwriting, a shadow) may hold
+            anything, NaN too, and are filled in. Default: all are usable.
+        should_stop : callable, optional
+            Asked at each step of estimates that take long, of total variation before the first.
+        on_caution : callable, optional
+            Receives a `Caution` if the source is doubtful. Default: `warnings.warn` with its text.
+
+        Returns
+        -------
+        ndarray of float64, shape (H, W)
+            In the unit of the image, positive everywhere, with the same flux over the usable
+            pixels.
+
+        Raises
+        ------
+        InputError
+            If image or mask cannot be used, the image has no flux, there is no mask where one is
+            needed, or the estimate rises, where it sees nothing, to ten times the brightest pixel
+            it saw.
+        InversionCancelled
+            If `should_stop` returned true.
         """
         if self.needs_mask and mask is None:
             raise InputError(
                 f"got the estimate '{self.title}' without a mask: it fills in the masked pixels; "
                 "choose a mask that covers the object"
             )
-        options = {"mask": mask, "should_stop": should_stop, "on_caution": on_caution}
-        return self.call(self.function, image, **options)
+        values, usable = pixels.beam_pixels(image, mask)
+        return self._estimate(values, usable, Reporter(None, should_stop), on_caution or warn_of)
+
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        raise NotImplementedError
 
     def beam_prior(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
@@ -107,107 +128,54 @@ class Estimate(Choice):
         return self.model_copy(update=lengths)
 
 
-def uniform_source(image: ArrayLike, *, mask: ArrayLike | None = None) -> FloatArray:
-    """Flat beam with the mean of the image.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    mask : array_like of bool, shape (H, W), optional
+class UniformEstimate(Estimate):
+    """The mean of the image, everywhere.
 
     Examples
     --------
-    >>> uniform_source([[1, 2], [3, 6]])
+    >>> UniformEstimate().source([[1, 2], [3, 6]])
     array([[3., 3.], [3., 3.]])
     """
-    values, usable = pixels.beam_pixels(image, mask)
-    return np.full(values.shape, values[usable].mean())
-
-
-class UniformEstimate(Estimate):
-    """The same everywhere."""
 
     title = "uniform"
-    function = staticmethod(uniform_source)
     uses_mask = False
     place = 10
     method: Literal["uniform"] = "uniform"
 
-
-def polynomial_source(
-    image: ArrayLike,
-    *,
-    degree: int = 2,
-    mask: ArrayLike | None = None,
-    should_stop: ShouldStop | None = None,
-) -> FloatArray:
-    """Polynomial in y and x, fitted to the image as by `fit_polynomial`.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    degree : int, default 2
-        Total degree of the polynomial in y and x, from 0 to 10.
-    mask, should_stop : optional
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        Where the polynomial falls below 0.001 of the image's mean, it is that.
-    """
-    values, usable = pixels.beam_pixels(image, mask)
-    fit = pixels.fit_polynomial(values, degree, mask=usable, should_stop=should_stop)
-    return pixels.with_flux_of(fit, values, usable)
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        return np.full(values.shape, values[usable].mean())
 
 
 class PolynomialEstimate(Estimate):
-    """A fitted polynomial."""
+    """A polynomial in y and x, fitted as by `fit_polynomial`.
+
+    Where it falls below 0.001 of the image's mean, it is that.
+    """
 
     title = "fitted polynomial"
-    function = staticmethod(polynomial_source)
     place = 40
     method: Literal["polynomial"] = "polynomial"
     degree: int = degree_field(": 0 is flat, 2 is bowl-shaped, 10 follows fine detail.")
 
-
-def low_pass_source(
-    image: ArrayLike,
-    width: float,
-    *,
-    mask: ArrayLike | None = None,
-    should_stop: ShouldStop | None = None,
-) -> FloatArray:
-    """The image, blurred until the object is gone.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    width : float
-        Standard deviation of the Gaussian blur in px; a few times the size of the object.
-    mask, should_stop : optional
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        At each pixel the mean of the usable pixels around it, weighted by the Gaussian; its border
-        is mirrored. Where none is within reach, the width is doubled until there is one.
-    """
-    values, usable = pixels.beam_pixels(image, mask)
-    width = pixels.checked_number("width", width, above=0, unit="px")
-    report = Reporter(None, should_stop)
-    beam, support = _blur_masked(values, usable, width, report)
-    while not support.all():
-        width *= 2
-        wider, reached = _blur_masked(values, usable, width, report)
-        beam, support = np.where(support, beam, wider), support | reached
-    return pixels.with_flux_of(beam, values, usable)
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        fit = pixels.fit_polynomial(
+            values, self.degree, mask=usable, should_stop=report.should_stop
+        )
+        return pixels.with_flux_of(fit, values, usable)
 
 
 class LowPassEstimate(Estimate):
-    """The blurred shot."""
+    """The shot, blurred until the object is gone.
+
+    At each pixel it is the mean of the usable pixels around it, weighted by the Gaussian; its
+    border is mirrored. Where none is within reach, the width is doubled until there is one.
+    """
 
     title = "blurred shot"
-    function = staticmethod(low_pass_source)
     place = 50
     method: Literal["low-pass"] = "low-pass"
     width: float = width_field(
@@ -217,12 +185,23 @@ class LowPassEstimate(Estimate):
         200.0,
     )
 
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        width = self.width
+        beam, support = _blur_masked(values, usable, width, report)
+        while not support.all():
+            width *= 2
+            wider, reached = _blur_masked(values, usable, width, report)
+            beam, support = np.where(support, beam, wider), support | reached
+        return pixels.with_flux_of(beam, values, usable)
+
 
 def _blur_masked(
     values: FloatArray, usable: BoolArray, width: float, report: Reporter, least: float = 1e-6
 ) -> tuple[FloatArray, BoolArray]:
     """Blur the usable pixels; return also where at least a share of them is within reach."""
-    blur: Callable[[FloatArray], FloatArray] = partial(low_pass, width=width)
+    blur: Callable[[FloatArray], FloatArray] = partial(filters.blur, width=width)
     if width < 2:  # px, with waves too short for the pixels; its time depends on the width
         blur = partial(scipy.ndimage.gaussian_filter, sigma=width, mode="reflect")
     report("source", 0, 2)
@@ -232,61 +211,25 @@ def _blur_masked(
     return blurred / np.maximum(support, least), support >= least
 
 
-def total_variation_source(
-    image: ArrayLike,
-    *,
-    weight: float = 2.0,
-    iterations: int = 1000,
-    mask: ArrayLike | None = None,
-    should_stop: ShouldStop | None = None,
-) -> FloatArray:
-    """The image without small structures, but with its edges.
+class TotalVariationEstimate(Estimate):
+    """The shot without small structures, but with its edges.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    weight : float, default 2
-        Strength of the smoothing, in px: a disc of radius r px is lowered by 2·weight/r of the
-        image's mean. So it takes c·r/2 to remove a disc of contrast c.
-    iterations : int, default 1000
-        Maximum iterations; an object of radius r px needs about r².
-    mask : array_like of bool, shape (H, W), optional
-        Unusable pixels are first filled as by `interpolated_source`.
-    should_stop : callable, optional
-        Asked before the iterations, which take 10 s a megapixel and cannot be stopped.
+    A disc of radius r px is lowered by 2·weight/r of the image's mean. Unusable pixels are first
+    filled as by `InterpolatedEstimate`. The iterations take 10 s a megapixel and cannot be stopped.
 
     References
     ----------
     A. Chambolle, "An algorithm for total variation minimization and applications", Journal
     of Mathematical Imaging and Vision 20, 89 (2004).
     """
-    from skimage.restoration import denoise_tv_chambolle
-
-    values, usable = pixels.beam_pixels(image, mask)
-    weight = pixels.checked_number("weight", weight, above=0, unit="px")
-    iterations = pixels.checked_integer("iterations", iterations, least=1)
-    report = Reporter(None, should_stop)
-    complete = values if usable.all() else pixels.fill_masked(values, usable, report)
-    mean = values[usable].mean()
-    report("source", 0)
-    relative = (complete / mean).astype(np.float32)
-    # By scikit-image's own tolerance, fields would change by 17 to 64 times their noise error.
-    smooth: FloatArray = denoise_tv_chambolle(  # type: ignore[no-untyped-call]
-        relative, weight, eps=1e-7, max_num_iter=iterations
-    )
-    return pixels.with_flux_of(mean * smooth.astype(np.float64), values, usable)
-
-
-class TotalVariationEstimate(Estimate):
-    """The shot without small structures, but with its edges."""
 
     title = "total variation"
-    function = staticmethod(total_variation_source)
     place = 60
     method: Literal["total-variation"] = "total-variation"
     weight: float = Field(
         default=2.0,
         gt=0,
+        allow_inf_nan=False,
         title="Weight (px)",
         description="Strength of the smoothing, in px: c·r/2 removes a disc of radius r px and "
         "contrast c.",
@@ -298,6 +241,21 @@ class TotalVariationEstimate(Estimate):
         description="Maximum iterations; an object of radius r px needs about r².",
     )
 
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        from skimage.restoration import denoise_tv_chambolle
+
+        complete = values if usable.all() else pixels.fill_masked(values, usable, report)
+        mean = values[usable].mean()
+        report("source", 0)
+        relative = (complete / mean).astype(np.float32)
+        # By scikit-image's own tolerance, fields would change by 17 to 64 times their noise error.
+        smooth: FloatArray = denoise_tv_chambolle(  # type: ignore[no-untyped-call]
+            relative, self.weight, eps=1e-7, max_num_iter=self.iterations
+        )
+        return pixels.with_flux_of(mean * smooth.astype(np.float64), values, usable)
+
     def coarsen(self, factor: int) -> Estimate:
         # A step reaches one pixel farther: fewer steps go as far in larger pixels.
         steps = max(1, self.iterations // factor**2)
@@ -305,11 +263,22 @@ class TotalVariationEstimate(Estimate):
 
 
 class InterpolatedEstimate(Estimate):
-    """The shot, with the masked part filled in from around it."""
+    """The shot, with the masked part filled in from around it.
+
+    Notes
+    -----
+    The filling u minimises ∑(u - image)² over the usable pixels + width²ᵖ ∑ u(-Δ)ᵖu over
+    all, with p = 2 (a thin plate) or p = 1 (a membrane) and mirrored borders, by conjugate
+    gradients preconditioned with the discrete cosine transform, from coarse to fine.
+
+    References
+    ----------
+    D. Garcia, "Robust smoothing of gridded data in one and higher dimensions with missing
+    values", Computational Statistics & Data Analysis 54, 1167 (2010).
+    """
 
     needs_mask = True
     title = "filled in under the mask"
-    function = staticmethod(pixels.interpolated_source)
     place = 70
     method: Literal["interpolated"] = "interpolated"
     width: float = width_field(
@@ -327,15 +296,30 @@ class InterpolatedEstimate(Estimate):
         "gaps at the edge.",
     )
 
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        power = 2 if self.kind == "biharmonic" else 1
+        return pixels.with_filled_part(values, usable, report, self.width, power)
+
 
 class KrigedEstimate(Estimate):
-    """A smooth random beam, predicted from around the object with its error."""
+    """A smooth random beam, predicted from around the object with its error.
+
+    The mask must hide the object with its halo: there is a caution if the beam next to the masked
+    pixels is not as the pixels farther away predict it. An `InputError` also refuses an image in
+    which hardly a pixel is free of the object, or every one.
+    """
 
     needs_mask = True
     title = "predicted under the mask"
-    function = staticmethod(kriged_source)
     place = 80
     method: Literal["kriged"] = "kriged"
+
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        return kriged_source(values, usable, report, on_caution)
 
     def beam_prior(
         self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
@@ -344,31 +328,11 @@ class KrigedEstimate(Estimate):
         return kriged_prior(image, mask, should_stop=should_stop)
 
 
-def gaussian_source(
-    image: ArrayLike,
-    *,
-    mask: ArrayLike | None = None,
-    notable: float = 1.5,
-    should_stop: ShouldStop | None = None,
-    on_caution: OnCaution | None = None,
-) -> FloatArray:
-    """Elliptical Gaussian plus a constant, fitted to the image.
+class GaussianEstimate(Estimate):
+    """An elliptical Gaussian plus a constant, fitted to the shot.
 
-    It is an estimate as in `napari_shadowinv.preprocessing.estimates`.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    mask, should_stop : optional
-    notable : float, default 1.5
-        Rise under the mask, over the brightest pixel that was fitted, above which it is doubtful.
-    on_caution : callable, optional
-        Receives a `Caution` if the fit is doubtful. Default: `warnings.warn` with its text.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        Uniform if the fit rises under the mask to ten times the brightest usable pixel.
+    There is a caution if it rises under the mask to 1.5 times the brightest pixel that was fitted;
+    a rise to ten times makes the source uniform.
 
     Notes
     -----
@@ -379,37 +343,34 @@ def gaussian_source(
     narrower than 1/256 of the image, higher than 1000 times the mean, or more than three sides
     away from the middle of the usable pixels is not considered.
     """
-    values, usable = pixels.beam_pixels(image, mask)
-    side, mean = max(values.shape), values[usable].mean()
-    y, x, sample = _block_samples(values / mean, usable)
-    parameters = _fit_gaussian(y / side, x / side, sample, Reporter(None, should_stop))
-    rows, columns = (np.arange(n) / side for n in values.shape)
-    beam = _gaussian(parameters, rows[:, None], columns)
-    rise = float(beam.max() / sample.max())
-    report_caution = on_caution or warn_of
-    if rise > pixels.MAX_EXTRAPOLATION:
-        text = (
-            "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
-            "uniform: mask less, or choose another estimate"
-        )
-        report_caution(Caution("source", text))
-        return uniform_source(image, mask=mask)
-    if rise > notable:
-        text = (
-            f"the Gaussian beam rises to {to_figures(rise)} times the fitted data under the mask: "
-            "compare it with another estimate, or mask less"
-        )
-        report_caution(Caution("source", text))
-    return pixels.with_flux_of(mean * beam, values, usable)
-
-
-class GaussianEstimate(Estimate):
-    """A fitted elliptical spot."""
 
     title = "fitted Gaussian"
-    function = staticmethod(gaussian_source)
     place = 30
     method: Literal["gaussian"] = "gaussian"
+
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        side, mean = max(values.shape), values[usable].mean()
+        y, x, sample = _block_samples(values / mean, usable)
+        parameters = _fit_gaussian(y / side, x / side, sample, report)
+        rows, columns = (np.arange(n) / side for n in values.shape)
+        beam = _gaussian(parameters, rows[:, None], columns)
+        rise = float(beam.max() / sample.max())
+        if rise > pixels.MAX_EXTRAPOLATION:
+            text = (
+                "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
+                "uniform: mask less, or choose another estimate"
+            )
+            on_caution(Caution("source", text))
+            return np.full(values.shape, mean)
+        if rise > _NOTABLE_RISE:
+            text = (
+                f"the Gaussian beam rises to {to_figures(rise)} times the fitted data under the "
+                "mask: compare it with another estimate, or mask less"
+            )
+            on_caution(Caution("source", text))
+        return pixels.with_flux_of(mean * beam, values, usable)
 
 
 def _block_samples(
@@ -429,7 +390,7 @@ def _block_samples(
 
 def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Reporter) -> FloatArray:
     """Fit the parameters of `_gaussian` to samples, by repeated robust least squares."""
-    # Without bounds it may hide behind a mask: see the notes of `gaussian_source`.
+    # Without bounds it may hide behind a mask: see the notes of `GaussianEstimate`.
     ranges = [
         *[(0, 1e3)] * 2,
         *((axis.mean() - 3, axis.mean() + 3) for axis in (y, x)),
@@ -540,56 +501,6 @@ def uniform_cautions(
     return (Caution("source", text),)
 
 
-def isotropic_source(
-    image: ArrayLike,
-    setup: Setup,
-    *,
-    centre_y: float | None = None,
-    centre_x: float | None = None,
-    mask: ArrayLike | None = None,
-) -> FloatArray:
-    """Beam of a point that shines evenly in all directions, on a flat detector.
-
-    It is an estimate as in `napari_shadowinv.preprocessing.estimates`; an `InputError` also refuses
-    a setup with a collimated beam.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-        The shot; only its flux is used.
-    setup : Setup
-        The experiment: distance of the point, and side of a pixel.
-    centre_y, centre_x : float, optional
-        Pixel in which the detector faces the point. Default: the middle of the image.
-    mask : array_like of bool, shape (H, W), optional
-
-    Notes
-    -----
-    A pixel receives its share of the solid angle; for small pixels that is proportional to
-    cos³θ, with θ the angle between its line of sight to the point and the detector's normal.
-
-    Examples
-    --------
-    >>> from napari_shadowinv import ProtonSetup
-    >>> beam = isotropic_source(np.ones((201, 201)), ProtonSetup.example())
-    >>> float(round(beam[0, 0] / beam[100, 100], 3))  # the corner, 9.3 degrees from the axis
-    0.961
-    """
-    values, usable = pixels.beam_pixels(image, mask)
-    distance = point_distance(setup)
-    centre = centre_within(values.shape, y=centre_y, x=centre_x)
-    edges = []
-    for axis, side, place in zip("yx", values.shape, centre, strict=True):
-        if not math.isfinite(place):
-            raise InputError(f"centre_{axis} is {place!r}, expected a finite number of px")
-        edges.append((np.arange(-0.5, side) - place) / distance)
-    y, x = edges[0][:, None], edges[1]
-    # Solid angle of the rectangle between the axis and each corner of the pixels.
-    angles = np.arctan2(y * x, np.sqrt(1 + y**2 + x**2))
-    beam = np.diff(np.diff(angles, axis=0), axis=1)
-    return np.asarray(beam * (values[usable].mean() / beam[usable].mean()))
-
-
 def _centre_field(axis: str, line: str) -> Any:
     return Field(
         default=None,
@@ -603,10 +514,26 @@ def _centre_field(axis: str, line: str) -> Any:
 
 
 class IsotropicEstimate(Estimate):
-    """A point that shines evenly in all directions, on a flat detector."""
+    """A point that shines evenly in all directions, on a flat detector.
+
+    It needs a setup with a point source, by `adapt_to`, for the distance of the point and the side
+    of a pixel.
+
+    Notes
+    -----
+    A pixel receives its share of the solid angle; for small pixels that is proportional to
+    cos³θ, with θ the angle between its line of sight to the point and the detector's normal.
+
+    Examples
+    --------
+    >>> from napari_shadowinv import ProtonSetup
+    >>> shape = (201, 201)
+    >>> beam = IsotropicEstimate().adapt_to(ProtonSetup.example(), shape).source(np.ones(shape))
+    >>> float(round(beam[0, 0] / beam[100, 100], 3))  # the corner, 9.3 degrees from the axis
+    0.961
+    """
 
     title = "isotropic point source"
-    function = staticmethod(isotropic_source)
     uses_mask = False
     place = 20
     method: Literal["isotropic"] = "isotropic"
@@ -627,9 +554,19 @@ class IsotropicEstimate(Estimate):
         y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
         return self._at(y, x, bin_setup(self._setup, factor))
 
-    def call(self, function: Callable[..., FloatArray], *args: Any, **options: Any) -> FloatArray:
-        point_distance(self._setup)  # refuses a missing setup before a wrong image
-        return super().call(function, *args, setup=self._setup, **options)
+    def _estimate(
+        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
+    ) -> FloatArray:
+        distance = point_distance(self._setup)
+        centre = centre_within(values.shape, y=self.centre_y, x=self.centre_x)
+        # Solid angle of the rectangle between the axis and each corner of the pixels.
+        y, x = (
+            (np.arange(-0.5, side) - place) / distance
+            for side, place in zip(values.shape, centre, strict=True)
+        )
+        angles = np.arctan2(y[:, None] * x, np.sqrt(1 + y[:, None] ** 2 + x**2))
+        beam = np.diff(np.diff(angles, axis=0), axis=1)
+        return np.asarray(beam * (values[usable].mean() / beam[usable].mean()))
 
     def _at(self, y: float, x: float, setup: Setup | None) -> Self:
         estimate = self.model_copy(update={"centre_y": y, "centre_x": x})

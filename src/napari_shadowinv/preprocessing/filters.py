@@ -1,14 +1,12 @@
 """Filters for images before an inversion, and for potentials after it.
 
-- keep only small or only large structures: `high_pass`, `low_pass`, `butterworth`
-- flatten an uneven beam: `remove_background`
-- replace broken pixels: `remove_hot_pixels`
-- each with its parameters, to be one step of a recipe: `LowPassFilter`, `HighPassFilter`,
-  `ButterworthFilter`, `BackgroundFilter`, `HotPixelFilter`; their base class: `Filter`
+- keep only small or only large structures: `HighPassFilter`, `LowPassFilter`, `ButterworthFilter`
+- flatten an uneven beam: `BackgroundFilter`
+- replace broken pixels: `HotPixelFilter`; which they are: `remove_hot_pixels`
+- their base class: `Filter`
 
-All take an image or a potential ``[y, x]``, in any unit, and return float64 of the same shape
-and unit. An `InputError` refuses an image that is not two-dimensional and finite, and a parameter
-out of range.
+Each is a step of a recipe, and filters one image by `Filter.filter_image`: an image or a potential
+``[y, x]``, in any unit, to float64 of the same shape and unit.
 
 An inversion amplifies low frequencies: a source that is wrong by little on a large scale
 makes a large false potential. Filtering the image, the potential, or both is the simple
@@ -22,7 +20,6 @@ by exactly its gain.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, Literal
 
@@ -44,23 +41,27 @@ class Filter(Step):
     """A step that changes the values of the image, and of a measured source alike."""
 
     moves_pixels = False
-    function: ClassVar[Callable[..., FloatArray]]
-    """Filters an image by the parameters; may take ``mask`` and ``should_stop``."""
 
     def filter_image(
-        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None = None
+        self,
+        image: ArrayLike,
+        mask: ArrayLike | None = None,
+        should_stop: ShouldStop | None = None,
     ) -> FloatArray:
-        """Apply the filter, so that masked pixels, even NaN, do not affect the others."""
-        values = np.asarray(image, dtype=np.float64)
-        if mask is not None and mask.any() and not mask.all():
-            filled = pixels.interpolated_source(values, mask, should_stop=should_stop)
-            values = np.where(mask, values, filled)
-        return self._filter(values, mask, should_stop)
+        """Return an image, shape (H, W), after the filter.
 
-    def _filter(
-        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
-    ) -> FloatArray:
-        return self.call(self.function, image, mask=mask, should_stop=should_stop)
+        Pixels where the mask is false, even NaN, do not affect the others. An `InputError` refuses
+        an image that is not two-dimensional and finite at the others.
+        """
+        values, usable = pixels.checked_pixels(image, mask)
+        report = Reporter(None, should_stop)
+        if not usable.all():
+            beam, _ = pixels.beam_pixels(image, mask)
+            values = np.where(usable, values, pixels.with_filled_part(beam, usable, report))
+        return self._filter(values, usable, report)
+
+    def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
+        raise NotImplementedError
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
         """Return a note on the changes by the filter."""
@@ -75,76 +76,47 @@ class Filter(Step):
         return replace(shot, image=image, source=source).add_notes(note)
 
 
-def low_pass(image: ArrayLike, width: float) -> FloatArray:
-    """Blur by a Gaussian; the mean stays.
+class LowPassFilter(Filter):
+    """Take away small structures, by a Gaussian blur; the mean stays.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    width : float
-        Standard deviation σ of the Gaussian in px. A wave of wave number k (rad/px) keeps
-        exp(-k²σ²/2) of its amplitude: half of it at a wavelength of 5.3 σ.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        Never below the least nor above the largest value of `image`, apart from rounding and,
-        for σ below 1 px, ringing.
+    A wave of wave number k (rad/px) keeps exp(-k²σ²/2) of its amplitude: half of it at a wavelength
+    of 5.3 σ. Apart from rounding and, for σ below 1 px, ringing, no pixel leaves the range of the
+    image.
 
     Examples
     --------
     >>> import numpy as np
     >>> wave = np.cos(np.pi * 8 * (np.arange(64) + 0.5) / 64) * np.ones((16, 1))
-    >>> float((low_pass(wave, 2.0) / wave).mean()), float(np.exp(-((np.pi / 8 * 2) ** 2) / 2))
+    >>> blurred = LowPassFilter(width=2).filter_image(wave)
+    >>> float((blurred / wave).mean()), float(np.exp(-((np.pi / 8 * 2) ** 2) / 2))
     (0.7346, 0.7346)
     """
-    values, _ = pixels.checked_pixels(image)
-    width = pixels.checked_number("width", width, above=0, unit="px")
-    return _apply_gain(values, np.exp(-0.5 * (width * _wave_numbers(values.shape)) ** 2))
-
-
-class LowPassFilter(Filter):
-    """Take away small structures."""
 
     title = "low-pass (smooth)"
-    function = staticmethod(low_pass)
     primary = "width"
     place = 80
     smooths: ClassVar[bool] = True
     step: Literal["low-pass"] = "low-pass"
     width: float = width_field(1.0, "Standard deviation of the Gaussian blur in px.", 0.1, 20.0)
 
+    def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
+        return blur(values, self.width)
 
-def high_pass(image: ArrayLike, width: float, *, keep_mean: bool = True) -> FloatArray:
-    """Remove the structures that a Gaussian blur would keep.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    width : float
-        Standard deviation σ of the Gaussian in px: structures much larger than σ vanish. A
-        wave of wave number k keeps 1 - exp(-k²σ²/2) of its amplitude.
-    keep_mean : bool, default True
-        Put the mean of `image` back, so that the total flux stays. Without it,
-        ``high_pass(image, width, keep_mean=False) + low_pass(image, width)`` is the image.
+class HighPassFilter(Filter):
+    """Take away large structures: all but the mean of what a Gaussian blur would keep.
+
+    A wave of wave number k keeps 1 - exp(-k²σ²/2) of its amplitude.
 
     Notes
     -----
     Where its blur exceeds an image by more than its mean, as in a dark spot near the centre of a
     strongly peaked beam, the result is negative. It is not clipped: that would add flux without a
     word. `invert` treats such pixels as its option `negative` says. For a beam that uneven,
-    dividing (`remove_background`, or a source estimate) serves better: it keeps the sign.
+    dividing (`BackgroundFilter`, or a source estimate) serves better: it keeps the sign.
     """
-    values, _ = pixels.checked_pixels(image)
-    mean = values.mean() if keep_mean else 0.0
-    return values - low_pass(values, width) + mean
-
-
-class HighPassFilter(Filter):
-    """Take away large structures."""
 
     title = "high-pass"
-    function = staticmethod(high_pass)
     primary = "width"
     place = 60
     flattens: ClassVar[bool] = True
@@ -153,35 +125,16 @@ class HighPassFilter(Filter):
         50.0, "Structures much larger than this standard deviation, in px, are removed.", 1.0, 200.0
     )
 
+    def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
+        return np.asarray(values - blur(values, self.width) + values.mean())
 
-def butterworth(
-    image: ArrayLike,
-    cutoff: float,
-    order: int = 2,
-    *,
-    kind: Literal["high", "low"] = "high",
-    keep_mean: bool = True,
-) -> FloatArray:
-    """Butterworth filter: flat up to the cutoff, then as steep as the order says.
 
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    cutoff : float
-        Wavelength in px, above 2, at which the amplitude falls by 1/√2.
-    order : int, default 2
-        Order n, up to 20; the amplitude falls as the n-th power of the wavelength. High orders
-        ring.
-    kind : {"high", "low"}, default "high"
-        Which wave numbers k pass, k_c being 2π / cutoff: "high" with a gain of
-        (1 + (k_c/k)^2n)^-½, "low" with (1 + (k/k_c)^2n)^-½.
-    keep_mean : bool, default True
-        Put the mean of `image` back after a high pass; a low pass always keeps it.
+class ButterworthFilter(Filter):
+    """Take away large or small structures, with a chosen steepness; the mean stays.
 
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        It can be negative, see `high_pass`.
+    The gain at the wave number k, with k_c = 2π / cutoff and the order n, is (1 + (k_c/k)^2n)^-½
+    for a high pass, whose result can be negative, see `HighPassFilter`, and (1 + (k/k_c)^2n)^-½
+    for a low pass.
 
     References
     ----------
@@ -192,36 +145,18 @@ def butterworth(
     --------
     >>> import numpy as np
     >>> wave = np.cos(np.pi * 8 * (np.arange(64) + 0.5) / 64) * np.ones((16, 1))
-    >>> float((butterworth(wave, 16.0, 3) / wave).mean())
+    >>> float((ButterworthFilter(cutoff=16, order=3).filter_image(wave) / wave).mean())
     0.7071
     """
-    from skimage.filters import butterworth as passed_by_butterworth
-
-    values, _ = pixels.checked_pixels(image)
-    cutoff = pixels.checked_number("cutoff", cutoff, above=2, unit="px")
-    order = pixels.checked_integer("order", order, least=1, most=20)
-    pixels.check_kind(kind, "high", "low")
-    # Doubled by its mirror image, as by a discrete cosine transform: nothing wraps around.
-    mirrored = np.pad(values, [(0, side) for side in values.shape], mode="symmetric")
-    frequency = 1 / min(cutoff, 1e6)  # of waves too long for any image
-    filtered: FloatArray = passed_by_butterworth(  # type: ignore[no-untyped-call]
-        mirrored, frequency, kind == "high", order, squared_butterworth=False
-    )
-    mean = values.mean() if kind == "high" and keep_mean else 0.0
-    return filtered[: values.shape[0], : values.shape[1]] + mean
-
-
-class ButterworthFilter(Filter):
-    """Take away large or small structures, with a chosen steepness."""
 
     title = "Butterworth"
-    function = staticmethod(butterworth)
     primary = "cutoff"
     place = 70
     step: Literal["butterworth"] = "butterworth"
     cutoff: float = Field(
         default=100.0,
         gt=2,
+        allow_inf_nan=False,
         title="Cutoff (px)",
         description="Wavelength in px at which the amplitude drops to 1/√2.",
         json_schema_extra={"slider": [3.0, 500.0]},
@@ -248,64 +183,27 @@ class ButterworthFilter(Filter):
     def smooths(self) -> bool:
         return self.kind == "low"
 
+    def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
+        from skimage.filters import butterworth
 
-def remove_background(
-    image: ArrayLike,
-    degree: int = 2,
-    *,
-    kind: Literal["divide", "subtract"] = "divide",
-    mask: ArrayLike | None = None,
-    should_stop: ShouldStop | None = None,
-) -> FloatArray:
-    """Flatten an image by a polynomial fitted to it as by `fit_polynomial`; the mean stays.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    degree : int, default 2
-        Total degree of the polynomial in y and x, from 0 to 10.
-    kind : {"divide", "subtract"}, default "divide"
-        "divide" for images: an uneven beam multiplies the object's modulation. "subtract"
-        for potentials, whose zero is arbitrary.
-    mask : array_like of bool, shape (H, W), optional
-        True where the fit may look; leave the object out if it is large. The pixels left out
-        are flattened as well. Their values must be finite.
-    should_stop : callable, optional
-        Asked at each step; when it returns true the fit ends.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        The flattened image, of the same mean. Divided, each pixel keeps its sign.
-
-    Raises
-    ------
-    InputError
-        Also if the mask leaves too few pixels, or the polynomial to divide by is not positive
-        all over the image.
-    InversionCancelled
-        If `should_stop` returned true.
-    """
-    pixels.check_kind(kind, "divide", "subtract")
-    values, _ = pixels.checked_pixels(image)
-    background = pixels.fit_polynomial(values, degree, mask=mask, should_stop=should_stop)
-    if kind == "subtract":
-        return np.asarray(values - background + background.mean())
-    if background.min() <= 0 or values.mean() <= 0:
-        raise InputError(
-            f"background of degree {degree} falls to {background.min():.4g} for an image of mean "
-            f"{values.mean():.4g}, expected both to be positive for division: use a lower "
-            "degree, or the kind 'subtract'"
+        # Doubled by its mirror image, as by a discrete cosine transform: nothing wraps around.
+        mirrored = np.pad(values, [(0, side) for side in values.shape], mode="symmetric")
+        frequency = 1 / min(self.cutoff, 1e6)  # of waves too long for any image
+        filtered: FloatArray = butterworth(  # type: ignore[no-untyped-call]
+            mirrored, frequency, self.flattens, self.order, squared_butterworth=False
         )
-    flat = values / background
-    return np.asarray(flat * (values.mean() / flat.mean()))
+        mean = values.mean() if self.flattens else 0.0
+        return filtered[: values.shape[0], : values.shape[1]] + mean
 
 
 class BackgroundFilter(Filter):
-    """Flatten by a polynomial."""
+    """Flatten by a polynomial; the mean stays.
+
+    It is fitted as by `fit_polynomial` where the mask is true. An `InputError` refuses a mask that
+    leaves too few pixels, and a polynomial to divide by that is not positive all over the image.
+    """
 
     title = "flatten (polynomial)"
-    function = staticmethod(remove_background)
     place = 50
     flattens: ClassVar[bool] = True
     step: Literal["background"] = "background"
@@ -316,14 +214,26 @@ class BackgroundFilter(Filter):
         description="'divide' by the polynomial (uneven beam) or 'subtract' it (stray light).",
     )
 
+    def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
+        background = pixels.fit_polynomial(
+            values, self.degree, mask=usable, should_stop=report.should_stop
+        )
+        if self.kind == "subtract":
+            return np.asarray(values - background + background.mean())
+        if background.min() <= 0 or values.mean() <= 0:
+            raise InputError(
+                f"background of degree {self.degree} falls to {background.min():.4g} for an image "
+                f"of mean {values.mean():.4g}, expected both to be positive for division: use a "
+                "lower degree, or the kind 'subtract'"
+            )
+        flat = values / background
+        return np.asarray(flat * (values.mean() / flat.mean()))
 
-def _wave_numbers(shape: tuple[int, ...]) -> FloatArray:
-    """Wave number k in rad/px of each coefficient of the discrete cosine transform."""
-    k_y, k_x = (np.pi * np.arange(side) / side for side in shape)
-    return np.asarray(np.hypot(k_y[:, None], k_x))
 
-
-def _apply_gain(values: FloatArray, gain: FloatArray) -> FloatArray:
+def blur(values: FloatArray, width: float) -> FloatArray:
+    """Blur by a Gaussian, of a standard deviation in px."""
+    k_y, k_x = (np.pi * np.arange(side) / side for side in values.shape)
+    gain = np.exp(-0.5 * (width * np.hypot(k_y[:, None], k_x)) ** 2)
     return np.asarray(scipy.fft.idctn(gain * scipy.fft.dctn(values, norm="ortho"), norm="ortho"))
 
 
@@ -342,10 +252,10 @@ class HotPixelFilter(Filter):
         json_schema_extra={"slider": [2.0, 20.0]},
     )
 
-    def _filter(
-        self, image: FloatArray, mask: BoolArray | None, should_stop: ShouldStop | None
-    ) -> FloatArray:
-        return remove_hot_pixels(image, threshold=self.threshold, should_stop=should_stop)[0]
+    def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
+        return remove_hot_pixels(values, threshold=self.threshold, should_stop=report.should_stop)[
+            0
+        ]
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
         usable = True if mask is None else mask

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.cautions import Caution, OnCaution, warn_of
+from napari_shadowinv.cautions import Caution, OnCaution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.options import BeamComponents, BeamPrior
@@ -48,35 +48,17 @@ class HaloCheck:
 
 
 def kriged_source(
-    image: ArrayLike,
-    mask: ArrayLike,
-    *,
-    should_stop: ShouldStop | None = None,
-    on_caution: OnCaution | None = None,
+    values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
 ) -> FloatArray:
-    """Beam predicted from the pixels without the object, as a Gaussian process.
-
-    It is an estimate as in `napari_shadowinv.preprocessing.estimates`; an `InputError` also refuses
-    an image in which hardly a pixel is free of the object, or every one.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    mask : array_like of bool, shape (H, W)
-        True where the image shows the bare beam, False where the object or its halo is.
-    should_stop : callable, optional
-    on_caution : callable, optional
-        Receives a `Caution` if the beam next to the masked pixels is not as the pixels farther
-        away predict it. Default: `warnings.warn` with its text.
-    """
-    blocks = _Blocks.of(image, mask)
+    """Beam predicted from the pixels without the object, as a Gaussian process."""
+    blocks = _Blocks.of(values, usable)
     with _one_thread():
-        fits = blocks.fits(Reporter(None, should_stop))
+        fits = blocks.fits(report)
         caution = _halo_caution(blocks, max(fits, key=lambda fit: fit.evidence))
         weighted = zip(_weights(fits), fits, strict=True)
         beam = np.asarray(sum(weight * fit.at_pixels for weight, fit in weighted if weight))
     if caution is not None:
-        (on_caution or warn_of)(caution)
+        on_caution(caution)
     return with_flux_of(blocks.level * np.exp(beam), blocks.values, blocks.usable)
 
 
@@ -127,11 +109,6 @@ class _Blocks:
         cls, image: ArrayLike, mask: ArrayLike, *, side: int = 64, dimmest: float = 0.01
     ) -> _Blocks:
         """Return `side` blocks or fewer along a side; refuse an image where few show the beam."""
-        if not np.any(mask):
-            raise InputError(
-                "no pixel is free of the object, so the beam behind it cannot be predicted: mask "
-                "less, or choose another estimate"
-            )
         values, usable = beam_pixels(image, mask)
         if usable.all():
             raise InputError(

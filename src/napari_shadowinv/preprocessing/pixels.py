@@ -3,13 +3,12 @@
 - values and usable pixels of an image: `checked_pixels`; of a beam, which has flux: `beam_pixels`
 - one number or integer: `checked_number`, `checked_integer`
 - fit a polynomial: `fit_polynomial`
-- fill in, from the surroundings, the beam under an object: `interpolated_source`
+- fill in, from the surroundings, the beam under an object: `with_filled_part`
 """
 
 from __future__ import annotations
 
 import operator
-from typing import Literal
 
 import numpy as np
 import scipy
@@ -29,52 +28,14 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
 
-def interpolated_source(
-    image: ArrayLike,
-    mask: ArrayLike,
-    *,
+def with_filled_part(
+    values: FloatArray,
+    usable: BoolArray,
+    report: Reporter,
     width: float = 5.0,
-    kind: Literal["biharmonic", "laplace"] = "biharmonic",
-    should_stop: ShouldStop | None = None,
+    power: int = 2,
 ) -> FloatArray:
-    """The image itself, with the part under the object filled in from its surroundings.
-
-    It is an estimate as in `napari_shadowinv.preprocessing.estimates`.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-    mask : array_like of bool, shape (H, W)
-        True where the image shows the bare beam, False where the object is.
-    width : float, default 5
-        Standard deviation in px of the blur applied to the surroundings before they are
-        extrapolated, so that noise does not spread into the gap. Wider gaps need more blur.
-    kind : {"biharmonic", "laplace"}, default "biharmonic"
-        "biharmonic" continues slope and curvature of the beam: for gaps inside the image.
-        "laplace" never leaves the range of the surroundings: for gaps at the image's edge.
-    should_stop : callable, optional
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        Where the mask is true, the image itself.
-
-    Notes
-    -----
-    The filling u minimises ∑(u - image)² over the usable pixels + width²ᵖ ∑ u(-Δ)ᵖu over
-    all, with p = 2 (a thin plate) or p = 1 (a membrane) and mirrored borders, by conjugate
-    gradients preconditioned with the discrete cosine transform, from coarse to fine.
-
-    References
-    ----------
-    D. Garcia, "Robust smoothing of gridded data in one and higher dimensions with missing
-    values", Computational Statistics & Data Analysis 54, 1167 (2010).
-    """
-    check_kind(kind, "biharmonic", "laplace")
-    values, usable = beam_pixels(image, mask)
-    width = checked_number("width", width, above=0, unit="px")
-    power = 2 if kind == "biharmonic" else 1
-    report = Reporter(None, should_stop)
+    """Return a beam whose part that is not usable is filled in from its surroundings."""
     beam = np.where(usable, values, fill_masked(values, usable, report, width, power))
     return with_flux_of(beam, values, usable)
 
@@ -178,12 +139,6 @@ def checked_integer(name: str, value: int, *, least: int, most: int | None = Non
 def complete_blocks(mask: BoolArray, block: int, share: float = 0.999) -> BoolArray:
     """Return which blocks of pixels are usable, by a least share of their pixels."""
     return complete_block_means(mask, block) > share
-
-
-def check_kind(kind: str, *kinds: str) -> None:
-    """Raise an `InputError` unless a kind is one of those that there are."""
-    if kind not in kinds:
-        raise InputError(f"kind is {kind!r}, expected {' or '.join(map(repr, kinds))}")
 
 
 def beam_pixels(image: ArrayLike, mask: ArrayLike | None) -> tuple[FloatArray, BoolArray]:

@@ -7,7 +7,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -51,13 +50,6 @@ class Choice(CheckedModel):
     def values(self) -> dict[str, Any]:
         """Return the values of its parameters."""
         return {name: getattr(self, name) for name in self.parameters()}
-
-    def call(self, function: Callable[..., FloatArray], *args: Any, **options: Any) -> FloatArray:
-        """Call a function with the parameters, and with those of the options that it takes."""
-        parameters = inspect.signature(function).parameters
-        if not any(each.kind is each.VAR_KEYWORD for each in parameters.values()):
-            options = {name: value for name, value in options.items() if name in parameters}
-        return function(*args, **self.values(), **options)
 
     @property
     def summary(self) -> str:

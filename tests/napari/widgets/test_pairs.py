@@ -17,7 +17,7 @@ from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
-from napari_shadowinv.preprocessing import polynomial_source
+from napari_shadowinv.preprocessing import PolynomialEstimate
 from napari_shadowinv.shot import shots_of
 
 SHAPE = (64, 72)
@@ -166,6 +166,6 @@ def test_an_estimate_becomes_a_layer(viewer: ViewerModel, opened: Any, qtbot: An
     name = "shot source: fitted polynomial"
     qtbot.waitUntil(lambda: name in viewer.layers, timeout=60_000)
     source, usable = viewer.layers[name], tool.source_masks.usable(shot)
-    np.testing.assert_allclose(source.data, polynomial_source(OBJECT, degree=2, mask=usable))
+    np.testing.assert_allclose(source.data, PolynomialEstimate(degree=2).source(OBJECT, usable))
     assert (tuple(source.scale), tuple(source.translate)) == ((2, 2), (5, 7))
     assert (role_of(source), is_estimate(source)) == ("source", True)
