@@ -42,8 +42,6 @@ from napari_shadowinv.preprocessing import filters, pixels
 from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
-_NOTABLE_RISE = 1.5  # of a Gaussian under the mask, over the brightest pixel that was fitted
-
 
 class Estimate(Choice):
     """A way to estimate the undisturbed beam from the shot."""
@@ -344,6 +342,7 @@ class GaussianEstimate(Estimate):
     away from the middle of the usable pixels is not considered.
     """
 
+    notable: ClassVar[float] = 1.5  # rise under the mask
     title = "fitted Gaussian"
     place = 30
     method: Literal["gaussian"] = "gaussian"
@@ -364,7 +363,7 @@ class GaussianEstimate(Estimate):
             )
             on_caution(Caution("source", text))
             return np.full(values.shape, mean)
-        if rise > _NOTABLE_RISE:
+        if rise > self.notable:
             text = (
                 f"the Gaussian beam rises to {to_figures(rise)} times the fitted data under the "
                 "mask: compare it with another estimate, or mask less"
