@@ -384,7 +384,7 @@ def traced_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 @pytest.mark.parametrize(
     ("times", "stages"),
-    [(4, ["transport"]), (3, ["from near", "smoothness", "full size", "samples"])],
+    [(4, ["transport", "samples"]), (3, ["from near", "smoothness", "full size"])],
 )
 def test_each_stage_ends_soon_after_cancel(
     window: Any,
