@@ -91,14 +91,13 @@ def explore(
     *,
     spacing: float = 1 / 3,
     checked: int = 2,
-    least_of_beams: int = 16,
-    steps_of_beams: int = 8,
+    solved_of_beams: tuple[int, int] = (16, 8),
 ) -> PosteriorSummary:
     """Draw samples around the best unknowns, and respond to a detector that nobody stated.
 
     Rays are `spacing` px apart. Of samples of an instrument, `checked` are solved, too. Where each
     image has a beam of its own, a few directions hold most of the error, along which images are not
-    linear: there are at least `least_of_beams` samples, each solved in `steps_of_beams` at most.
+    linear: `solved_of_beams` samples are the least, and steps the most in which each is solved.
     """
 
     def posterior_with(scene: Scene, start: Minimum, modes: SoftModes | None = None) -> Posterior:
@@ -113,7 +112,7 @@ def explore(
     count = options.samples if options.samples > 1 else 0
     steps = 20 if options.sampling == "resolve" else 0
     if count and "beam_between" in scene.imperfect.keys:
-        count, steps = max(count, least_of_beams), max(steps, steps_of_beams)
+        count, steps = map(max, (count, steps), solved_of_beams)
     samples = posterior.draw_samples(count)
     linear = samples if steps else samples[: checked if scene.imperfect.of_response else 0]
     solved = posterior.solve(linear, steps=steps or 1)
