@@ -126,7 +126,7 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
         description="'linear': random fields respond to noise and instrument to first order. "
         "'resolve': each is fitted to images with other noise and another instrument, which takes "
         "2 to 5 times as long as a linear one; for strong folds and instruments that are known "
-        "poorly. It is always so where the beams of energies differ.",
+        "poorly; always used where the beams of energies differ.",
     )
     evidence: bool = Field(
         default=False,
