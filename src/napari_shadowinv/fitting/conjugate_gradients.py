@@ -32,33 +32,17 @@ def product(first: FloatArray, second: FloatArray) -> float:
 class SoftModes:
     """Directions in which a matrix is small or large, for systems with nearly the same matrix.
 
-    `solve` uses them, and adds those that have cost it many steps. What they are changes the number
-    of steps, not the solution beyond its tolerance.
-
-    Attributes
-    ----------
-    most : int
-        Modes that are kept.
-    soft, stiff : float
-        Eigenvalues below and above which directions are modes; most are about 1.
-    worth : int
-        Least steps of a solution from which modes are taken.
-    outdated : int
-        Steps of a solution with as many modes as are kept, from which they belong to another
-        matrix.
-    found : float
-        Largest residual of an eigenvector over its eigenvalue.
-    independent : float
-        Least eigenvalue of the vectors' products; rounding makes copies of some.
+    `solve` uses them, and adds those that have cost it many steps. They change the number of steps,
+    not the solution beyond its tolerance.
     """
 
-    most: int = 120
-    soft: float = 0.5
-    stiff: float = 4.0
-    worth: int = 12
-    outdated: int = 100
-    found: float = 0.5
-    independent: float = 1e-4
+    most: int = 120  # modes that are kept
+    soft: float = 0.5  # eigenvalues below it are of modes; most are about 1
+    stiff: float = 4.0  # so are those above it
+    worth: int = 12  # least steps of a solution from which modes are taken
+    outdated: int = 100  # steps, with all modes, from which they belong to another matrix
+    found: float = 0.5  # largest residual of an eigenvector over its eigenvalue
+    independent: float = 1e-4  # least eigenvalue of products; rounding makes copies of some
     _vectors: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     _weights: FloatArray = field(default_factory=lambda: np.empty(0))
 
@@ -191,18 +175,9 @@ def solve(
 ) -> FloatArray:
     """Solve a positive definite system by conjugate gradients, from zero.
 
-    Parameters
-    ----------
-    times : callable
-        The matrix times a vector.
-    right : ndarray, shape (n,)
-        The right side.
-    tolerance : float
-        Length of the residual relative to the right side.
-    iterations : int
-        Most steps.
-    modes : SoftModes, optional
-        Of nearly the same matrix; modes of this solution are added.
+    `times` multiplies the matrix by a vector. The steps end at a residual of `tolerance` times the
+    `right` side, (n,). The modes are those of nearly the same matrix; modes of this solution are
+    added.
     """
     modes = SoftModes() if modes is None else modes
     history = _History(right.size, modes.worth)

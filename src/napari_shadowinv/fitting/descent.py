@@ -36,28 +36,11 @@ def minimise(
     after_step: Callable[[float], None] | None = None,
     kept: int = 20,
 ) -> tuple[FloatArray, float, int]:
-    """Minimise by L-BFGS, starting with the identity as Hessian.
+    """Minimise by L-BFGS, starting with the identity as Hessian; return point, value and steps.
 
-    Parameters
-    ----------
-    objective : callable
-        Returns value and gradient.
-    start : ndarray, shape (n,)
-        Where to start; scaled so that the Hessian is about the identity.
-    iterations : int
-        Most steps.
-    least_gain : float
-        Ends once five steps lower the value by less.
-    after_step : callable, optional
-        Receives the value.
-    kept : int, default 20
-        Pairs of steps and changes of the gradient that are kept.
-
-    Returns
-    -------
-    point : ndarray
-    value : float
-    steps : int
+    The objective returns value and gradient; the start, (n,), is scaled so that the Hessian is
+    about the identity. Steps end once five lower the value by less than `least_gain`; `after_step`
+    receives the value. The last pairs of steps and changes of the gradient are `kept`.
     """
     point = start
     value, gradient = objective(point)
@@ -167,29 +150,11 @@ def descend(
     descents: int = 3,
     few: int = 10,
 ) -> tuple[Unknowns, float, int]:
-    """Minimise a scene's objective; the numbers of rays are renewed between descents.
+    """Minimise a scene's objective; return the unknowns, the objective, and the number of steps.
 
-    Parameters
-    ----------
-    scene, start
-        The images and the starting point.
-    iterations : int
-        Most steps.
-    least_gain : float
-        Ends where five steps lower the objective by less; chance changes it by about 1.
-    after_step : callable, optional
-        Receives the objective after each step.
-    descents : int, default 3
-        Most descents.
-    few : int, default 10
-        Steps after which the numbers of rays still fit.
-
-    Returns
-    -------
-    unknowns : Unknowns
-    value : float
-        The objective.
-    steps : int
+    The numbers of rays are renewed between `descents`, of which there are 3 at most; after `few`
+    steps they still fit. Steps end where five lower the objective by less than `least_gain`; chance
+    changes it by about 1. `after_step` receives the objective.
     """
     scales = Preconditioner(scene)
     unknowns, steps, value = start, 0, np.inf

@@ -33,33 +33,17 @@ _SIGMAS = 4.0  # how far Gaussians reach
 class Scene(PriorTerms):
     """Images, all that is known about how they were made, and the prior, in pixels of one size.
 
-    Attributes
-    ----------
-    images, weights : ndarray, shape (L, H, W)
-        Data, and 1 / σ², zero where a pixel is not used.
-    strengths : ndarray, shape (L, M)
-        Displacement in image l by each field's displacement.
-    beams : ndarray, shape (L, …)
-        Known flux of the beams, as `RayModel.around` returns it.
-    psf : sequence of float or ndarray
-        Standard deviation in px of each image's point spread, or its kernel.
-    pad, spacing, threads
-        See `RayModel`.
-    free_brightness : bool
-        Whether the brightness of each image is unknown.
-    free_frames : ndarray of bool, shape (6,)
-        Which numbers of a frame are unknown, but for the first image.
-    blur : float
-        Standard deviation in px by which residuals are blurred.
-    imperfect : Imperfect
-        Standard deviations of an instrument that is not exact.
-    held : frozenset of str
-        Imperfections whose numbers do not change.
-    spread : ndarray, shape (n, n), or None
-        Root of the covariance of the numbers of `response_units`. Default: as before the images.
-    force : Unknowns or None
-        Derivatives that are subtracted from the objective's: a random one makes its least
-        a sample of the prior.
+    `images` and `weights` (L, H, W) are the data and 1 / σ², zero where a pixel is not used;
+    `strengths` (L, M) the displacement in image l by each field's displacement; `beams` (L, …) the
+    known flux of the beams, as `RayModel.around` returns it; `psf` the standard deviation in px of
+    each image's point spread, or its kernel. For `pad`, `spacing` and `threads` see `RayModel`.
+
+    The brightness of each image is unknown if `free_brightness`, and those numbers of a frame for
+    which `free_frames` (6,) is true, but for the first image. Residuals are blurred by `blur` px.
+    Numbers of an `imperfect` instrument that are `held` do not change; `spread` (n, n) is a root of
+    the covariance of the numbers of `response_units`, by default as before the images. The
+    derivatives in `force` are subtracted from the objective's: a random one makes its least a
+    sample of the prior.
     """
 
     images: FloatArray
@@ -412,17 +396,10 @@ class _Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class Linear:
-    """A scene to first order in changes of unknowns.
+    """A scene to first order in changes of the unknowns around which it is linear.
 
-    Attributes
-    ----------
-    scene, unknowns
-        The scene and the unknowns around which it is linear.
-    jacobians : list of csr_array
-        As `RayModel.jacobian` returns them, for each image; without the beam's and the frame's
-        columns if neither is unknown.
-    seen : list
-        The images without their brightness, and how they are seen.
+    For each image, a Jacobian as `RayModel.jacobian` returns it, without the columns of beam and
+    frame if neither is unknown; and the image without its brightness, with how it is `seen`.
     """
 
     scene: Scene

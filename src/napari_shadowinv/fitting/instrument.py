@@ -45,16 +45,10 @@ class Part(NamedTuple):
 class Imperfect:
     """Standard deviations of what an instrument does to an image, in pixels of one size.
 
-    Attributes
-    ----------
-    responses : dict of str to float
-        Of the responses of a pixel, by the keys of `RESPONSES`.
-    blur : float
-        Of the variance of the point spread along each axis, px².
-    other_strengths : ndarray, shape (L, M), or None
-        Of the displacement by another field, as shares of that by each field in the first image.
-    shapes : tuple of Shapes
-        Changes of the beams, of the shape of a scene's beams.
+    `responses` are those of a pixel, by the keys of `RESPONSES`; `blur` is of the variance of the
+    point spread along each axis, px²; `other_strengths` (L, M) of the displacement by another
+    field, as shares of that by each field in the first image; `shapes` are changes of a scene's
+    beams.
     """
 
     responses: dict[str, float] = field(default_factory=dict)
@@ -249,18 +243,11 @@ def imperfect_instrument(
 ) -> Imperfect:
     """Return the standard deviations of an instrument's numbers for the images of a fit.
 
-    Parameters
-    ----------
-    beam : BeamPrior
-        Of the difference of beams and sources.
-    sources : ndarray, shape (L, H, W)
-        Recorded or assumed, in units of their means; `is_common` if that of all images is the same.
-    used : ndarray of bool, shape (H, W)
-        Pixels in which the variation of beams has its r.m.s.
-    around : pairs of int
-        Pixels by which the scene's beams reach beyond the images.
-    other_strengths : ndarray, shape (L, M), or None
-        Of the displacement by another field, if one was equal to each field in the first image.
+    The prior of the `beam` is for the difference of beams and `sources` (L, H, W), which are
+    recorded or assumed, in units of their means; `is_common` if all images have the same. In the
+    `used` pixels (H, W) the variation of beams has its r.m.s.; the scene's beams reach `around` px
+    beyond the images. `other_strengths` (L, M) is for another field that is equal to each field in
+    the first image.
     """
     shapes = []
     if beam.rms:

@@ -96,17 +96,9 @@ class FitData:
     reference_noise: FloatArray  # (L,), standard deviation of the beams' own, as far as it is left
 
     def noise_of(self, weights: FloatArray) -> FloatArray:
-        """Return the standard deviation of each image's noise, or of each pixel's if it varies.
+        """Return the standard deviation of each image's noise, (L,), or (L, H, W) if it varies.
 
-        Parameters
-        ----------
-        weights : ndarray, shape (L, H', W')
-            Of the pixels of a scene, 0 where masked.
-
-        Returns
-        -------
-        ndarray, shape (L,) or (L, H, W)
-            In the unit of the images; NaN where masked.
+        It is in the unit of the images, NaN where the weights of a scene's pixels are 0.
         """
         height, width = self.size
         weights = weights[:, :height, :width]
@@ -367,19 +359,8 @@ def strengths_of(
 ) -> FloatArray:
     """Return the displacement by each field in each image relative to the first, shape (L, M).
 
-    Parameters
-    ----------
-    setups : sequence of Setup
-        One for each image, with pixels of the same size at the object.
-    fields : sequence of str
-        Keys of `deflector_titles`.
-    names : sequence of str, optional
-        Names in messages. Default: their numbers.
-
-    Raises
-    ------
-    InputError
-        If a field does not bend the beam, or pixels differ.
+    Fields are keys of `deflector_titles`. An `InputError`, with names or else numbers of the
+    images, if a field does not bend the beam, or pixels at the object differ.
     """
     first, titles = setups[0], deflector_titles()
     for k, setup in enumerate(setups):

@@ -17,16 +17,9 @@ class NoiseMatch:
     Weights are made for the power of the noise on long waves, where it bends fields: correlated
     noise has more of it than white noise of the same pixels, smoothed counts less per pixel.
 
-    Attributes
-    ----------
-    factors : ndarray, shape (L,)
-        The variance that is used over that which is given or estimated from single pixels.
-    expected_chi2 : ndarray, shape (L,)
-        Variance of a pixel over the one that is used.
-    correlation : float
-        Standard deviation of the Gaussian that has blurred the noise, px; 0 for white noise.
-    is_estimated : bool
-        Whether the noise was estimated.
+    `factors` (L,) are the variance that is used over that which is given or estimated from single
+    pixels, `expected_chi2` (L,) the variance of a pixel over the one that is used; `correlation` is
+    the standard deviation of the Gaussian that has blurred the noise, px, 0 for white noise.
     """
 
     factors: FloatArray
@@ -42,12 +35,10 @@ class NoiseMatch:
         return np.maximum(self.factors * chi2, np.minimum(relative, 1.0))
 
     def with_long_waves(self, more: FloatArray) -> NoiseMatch:
-        """Return the match with noise that is seen on long waves alone, as shares of the variance.
+        """Return the match with noise that is seen on long waves alone.
 
-        Parameters
-        ----------
-        more : ndarray, shape (L,)
-            Its variance in pixels of white noise that are as noisy on long waves.
+        Its variance, (L,), is in pixels of white noise as noisy on long waves, as a share of the
+        other's.
         """
         factors, expected = self.factors * (1 + more), self.expected_chi2 / (1 + more)
         return replace(self, factors=factors, expected_chi2=expected)
@@ -70,17 +61,10 @@ def match_noise(
 ) -> NoiseMatch:
     """Compare the noise of images with its standard deviations, all in units of the beams.
 
-    Parameters
-    ----------
-    deviations, excess, brightness : ndarray, shape (L, H, W)
-        Standard deviations, images less beams, images.
-    used : ndarray of bool, shape (L, H, W)
-    width : float or None
-        Standard deviation of the blur that correlates the noise, px, if it is stated.
-    is_estimated : bool
-        Whether the standard deviations are those of differences between neighbouring pixels.
-    too_large : float, default 2.5
-        Ratio to the variance of the calm parts beyond which a variance is too large.
+    All have shape (L, H, W): `excess` is images less beams, `brightness` the images. `width` is the
+    standard deviation of the blur that correlates the noise, px, if it is stated. A variance is too
+    large beyond `too_large` times that of the calm parts. The deviations of noise that
+    `is_estimated` are from differences between neighbouring pixels.
     """
     factors, expected = np.ones((2, len(excess)))
     correlation = 0.0

@@ -40,22 +40,13 @@ def pattern_strength(
 ) -> float:
     """Return how far a smoothed residual stands out of smoothed noise of its own r.m.s.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (H, W)
-        Image minus model over the standard deviation of the noise in each pixel.
-    used : ndarray of bool, shape (H, W)
-        The pixels that were fitted.
-    correlation : float, default 0
-        Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise.
-    widths : sequence of float, default (2, 4, 8)
-        Standard deviations of the Gaussians that smooth the residual, px.
+    It is the power of the smoothed residual, minus the expected one, in standard deviations of
+    that, the largest for Gaussians of all `widths`, px. White noise gives about 0 ± 1, and less
+    where the model has absorbed part of it.
 
-    Returns
-    -------
-    float
-        Power of the smoothed residual, minus the expected one, in standard deviations of that; the
-        largest. White noise gives about 0 ± 1, and less where the model has absorbed part of it.
+    The residual (H, W) is image minus model over the standard deviation of the noise in each pixel,
+    on the `used` pixels that were fitted. The noise was blurred by a Gaussian of `correlation` px;
+    0 for white noise.
     """
     values = np.where(used, residual, 0.0)
     variance = float((values**2).sum() / max(used.sum(), 1))
@@ -119,16 +110,9 @@ def blur_score(residuals: FloatArray, roots: FloatArray, made: FloatArray) -> fl
     """Return how much the residuals look like missing blur, in standard deviations of noise.
 
     Blur adds the Laplacian of an image to it. The fit has removed the part that fields can imitate
-    from the residual, so noise gives less than 1.
-
-    Parameters
-    ----------
-    residuals : ndarray, shape (L, H, W)
-        Image minus model over the standard deviation of the noise.
-    roots : ndarray, shape (L, H, W)
-        One over that standard deviation, zero where a pixel is not used.
-    made : ndarray, shape (L, H, W)
-        The model.
+    from the residual, so noise gives less than 1. All have shape (L, H, W): `residuals` in standard
+    deviations of the noise; `roots`, one over that deviation, zero where a pixel is not used; and
+    `made`, the model.
     """
     change = roots * np.stack([laplace(image, mode="nearest") for image in made])
     size = float(np.sqrt((change**2).sum()))
@@ -140,18 +124,9 @@ def lack_of_noise(
 ) -> tuple[float, float]:
     """Return by how much the variance of white residuals is below 1, and its standard deviation.
 
-    Structure of more than a few pixels, of which a fit absorbs the noise, is left out.
-
-    Parameters
-    ----------
-    residuals : ndarray, shape (L, H, W)
-        Image minus model over the standard deviation of the noise.
-    used : ndarray of bool, shape (L, H, W)
-        The pixels to use.
-    width : float, default 2
-        Standard deviation of the Gaussian that finds structure, px.
-    mostly : float, default 0.9
-        Least share of it on used pixels.
+    Structure of more than a few pixels, of which a fit absorbs the noise, is left out; a Gaussian
+    of `width` px with at least a share `mostly` on used pixels finds it. `residuals` (L, H, W) are
+    image minus model over the standard deviation of the noise.
     """
     inside, around = used.astype(np.float64), (0, width, width)
     near = np.maximum(gaussian_filter(inside, around, mode="nearest"), 1e-9)
@@ -179,29 +154,16 @@ def _squared_difference(values: FloatArray, used: BoolArray, distance: int) -> f
 class Pattern:
     """Structure in the residuals of a fit.
 
-    Attributes
-    ----------
-    strengths : ndarray, shape (L,)
-        Of each image, in standard deviations; see `pattern_strength`.
-    correlation : float
-        Standard deviation in px of the Gaussian that has blurred the noise; 0 for white noise.
-    chi2 : float
-        The largest of all images.
-    blur_score : float
-        See `blur_score`.
-    missing_counts : float
-        Share by which the noise is smaller than counts imply, as a dark level of that share
-        makes it.
-    counts_deviation : float
-        Standard deviation of `missing_counts`.
-    cause : str
-        The likeliest cause, as a clause; "" if none wins or none was looked for.
-    tried : str
-        All causes that were looked for.
-    suspect : float
-        Strength beyond which the model is wrong. Of fits with a right model it is -5 to 2, once
-        4.2: a deep fold at 30 counts a pixel. With a beam that is 2 % off it is 31 and more, with
-        absorption of 5 % 5.4 to 12.6.
+    `strengths` (L,) of the images are in standard deviations, as `pattern_strength` returns them;
+    `correlation` is the standard deviation in px of the Gaussian that has blurred the noise, 0 for
+    white noise; `chi2` the largest of all images. The noise is smaller than counts imply by a share
+    of `missing_counts`, with its deviation `counts_deviation`, as a dark level of that share makes
+    it. The `cause` is the likeliest, as a clause; "" if none wins or none was looked for; `tried`
+    are all that were.
+
+    A model is wrong beyond a strength of `suspect`. Of fits with a right model it is -5 to 2, once
+    4.2: a deep fold at 30 counts a pixel. With a beam that is 2 % off it is 31 and more, with
+    absorption of 5 % 5.4 to 12.6.
     """
 
     strengths: FloatArray
@@ -268,12 +230,7 @@ def find_pattern(data: FitData, refined: FineMinimum, least_counts: float = 5.0)
 def log_evidence(data: FitData, scene: Scene, best: Minimum, on_step: OnStep) -> float:
     """Return the log evidence at the likeliest λ and κ, where it depends least on their accuracy.
 
-    Parameters
-    ----------
-    data, scene, best
-        The fit; its fields have random probes that are the same for all models.
-    on_step : callable
-        Receives the stage and the objective.
+    The fields have random probes that are the same for all models.
     """
     if data.options.smoothness is None:
         scene = replace(scene, smoothness=scene.smoothness / SMOOTHNESS_RATIO)

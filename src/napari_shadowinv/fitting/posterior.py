@@ -74,18 +74,9 @@ class Response(NamedTuple):
 class Posterior:
     """The Gaussian around unknowns at which a scene's objective is least.
 
-    Parameters
-    ----------
-    scene, unknowns
-        The scene and its best unknowns.
-    rng : numpy.random.Generator
-        For all random choices.
-    after_step : callable, optional
-        Called after each step, to report progress and to stop.
-    modes : SoftModes, optional
-        Of the Hessians of this scene, from scenes of the same pixels and priors.
-    linear : Linear, optional
-        The scene to first order near these unknowns. Default: at these.
+    The `modes` are of the Hessians of this scene, from scenes of the same pixels and priors. The
+    scene is `linear` near these unknowns, by default at them. `after_step` is called after each
+    step, to report progress and to stop.
     """
 
     def __init__(
@@ -379,13 +370,7 @@ class Posterior:
     ) -> list[Unknowns]:
         """Return the changes of the unknowns if the beams differ from their sources.
 
-        Parameters
-        ----------
-        variations : sequence of ndarray, shape (L, …)
-            Differences as shares of the beams, of the shape of the scene's beams, in which the
-            images are linear.
-        tolerance : float, default 0.01
-            Of the equations.
+        The variations are shares of the scene's beams, (L, …), in which the images are linear.
         """
         changed = (replace(self.scene, beams=each * self.scene.beams) for each in variations)
         images = (each.model(self._unknowns, self._counts) for each in changed)
@@ -471,24 +456,10 @@ class Posterior:
 def draw_variations(
     scene: Scene, length: float, count: int, rng: np.random.Generator, waves: int = 60
 ) -> FloatArray:
-    """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image.
+    """Return random smooth fields with a mean of 0 and an r.m.s. of 1 over the image, (count, …).
 
-    Parameters
-    ----------
-    scene : Scene
-        Its beams, of the shape (L, …), reach beyond the image.
-    length : float
-        Distance over which the fields vary, px of the scene.
-    count : int
-        Number of fields.
-    rng : numpy.random.Generator
-        For the waves.
-    waves : int, default 60
-        Number of waves in each field.
-
-    Returns
-    -------
-    ndarray, shape (count, …)
+    They are of the shape of a scene's beams, which reach beyond the image, and sums of `waves` that
+    vary over a `length` in px of the scene.
     """
     height, width = scene.beams.shape[1:]
     inside = np.s_[scene.pad : height - scene.pad, scene.pad : width - scene.pad]
@@ -603,27 +574,12 @@ def sampled_potentials(
     size: tuple[int, int],
     seed: int,
 ) -> FloatArray:
-    """Return random changes of each field's potential, px², that its total error allows.
+    """Return random changes of each field's potential that its total error allows, (M, n, H, W).
 
-    Changes by unfitted numbers are random combinations of `shifts`.
-
-    Parameters
-    ----------
-    scene : Scene
-        In recorded pixels.
-    samples : sequence of Sample
-        The posterior's.
-    shifts : sequence of Unknowns
-        Independent changes of one standard deviation each.
-    size : tuple of int
-        Height H and width W of the images.
-    seed : int
-        Of the combinations.
-
-    Returns
-    -------
-    ndarray of float32, shape (M, len(samples), H, W)
-        Their mean over the border is 0.
+    They are in px², in single precision, with a mean over the border of 0, one for each of n
+    samples of the posterior. Changes by unfitted numbers are random combinations, by the seed, of
+    `shifts`: independent changes of one standard deviation each. The scene is in recorded pixels;
+    `size` is that of the images.
     """
     changes = [potentials_of(scene, sample.change, size) for sample in samples]
     if shifts:

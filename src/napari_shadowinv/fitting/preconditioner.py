@@ -221,22 +221,9 @@ def _beam_cosines(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the cosines of smooth changes of the beams, within the image, by their first numbers.
 
-    Parameters
-    ----------
-    scene : Scene
-    longest : int, default 24
-        Cosines along each axis, of the longest waves.
-    most : int, default 150
-        Numbers of each beam.
-
-    Returns
-    -------
-    places : ndarray, shape (n,)
-        Of the numbers among all values but the potentials.
-    images : ndarray, shape (n, L)
-        1 where a number acts.
-    waves : ndarray, shape (n, …)
-        Cosines at the knots by each number of 1.
+    They are the `longest` waves along each axis, for at most `most` numbers of each beam. Returns
+    the places of n numbers among all values but the potentials, in which images, (n, L), each acts
+    (1), and the cosines at the knots by each number of 1, (n, …).
     """
     lines: list[FloatArray] = []
     knots: list[FloatArray] = []

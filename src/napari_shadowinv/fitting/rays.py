@@ -37,16 +37,9 @@ class Pulls(NamedTuple):
 class TracedBeam(NamedTuple):
     """A beam behind a potential, as a detector sees it.
 
-    Attributes
-    ----------
-    potential : ndarray
-        The coefficients.
-    counts : ndarray of int64
-        As `RayModel.ray_counts` returns them.
-    beam : ndarray
-        As `RayModel.around` returns it.
-    frame : ndarray of 6, optional
-        Where the detector sees the rays. Default: where they land.
+    Coefficients of the potential, `RayModel.ray_counts` of it, the beam as `RayModel.around`
+    returns it, and the frame, 6 numbers, in which the detector sees the rays: by default where they
+    land.
     """
 
     potential: FloatArray
@@ -60,22 +53,13 @@ class RayModel:
     """Image of a beam behind a potential, by ray tracing.
 
     A potential is an array of coefficients with `shape`, in px², of cubic B-splines with a knot
-    every 2 px. A beam is the flux of each pixel, including the strip: `around` continues one
-    from the image. A frame maps the landing point (y, x) to the detector:
-    (f0 + f1 y + f2 x, f3 + f4 y + f5 x), in px from the image's middle.
+    every 2 px. A beam is the flux of each pixel, including the strip: `around` continues one from
+    the image. A frame maps the landing point (y, x) to the detector: (f0 + f1 y + f2 x, f3 + f4 y +
+    f5 x), in px from the image's middle.
 
-    Attributes
-    ----------
-    size : tuple of int
-        Height and width of the image in px.
-    pad : int
-        Width in px, even, of the strip around the image from which rays may enter.
-    beyond : int
-        Width in px of a strip around the image that is evaluated, too.
-    spacing : float
-        Largest distance in px between the landing points of neighbouring rays.
-    threads : int or None
-        Number of threads. Default: all cores. It does not affect the result.
+    Rays may enter from a strip of `pad` px, an even number, around the image; a strip of `beyond`
+    px is evaluated, too. Landing points of neighbouring rays are at most `spacing` px apart. The
+    number of threads, by default all cores, does not affect the result.
     """
 
     size: tuple[int, int]
@@ -114,17 +98,7 @@ class RayModel:
         return np.pad(image, ((self.pad, rows), (self.pad, columns)), mode="edge")
 
     def ray_counts(self, potential: FloatArray) -> IntArray:
-        """Return how many rays along y and x each cell needs to land so densely.
-
-        Parameters
-        ----------
-        potential : ndarray
-            The coefficients.
-
-        Returns
-        -------
-        ndarray of int64, shape (2, *cells)
-        """
+        """Return the rays along y and x that each cell needs to land so densely, (2, *cells)."""
         middle = potential[1:-1, 1:-1]
         yy = (potential[2:, 1:-1] - 2 * middle + potential[:-2, 1:-1]) / KNOT**2
         xx = (potential[1:-1, 2:] - 2 * middle + potential[1:-1, :-2]) / KNOT**2
@@ -155,13 +129,8 @@ class RayModel:
     ) -> Pulls:
         """Return the derivatives of ``(pull * image(traced)).sum()`` at fixed `counts`.
 
-        Parameters
-        ----------
-        traced : TracedBeam
-        pull : ndarray
-            Weight of each pixel, with the shape `seen`.
-        of_beam, of_frame : bool, default True
-            Whether to compute the derivatives by the beam and by the frame; else they are zero.
+        The pull is a weight of each pixel, with the shape `seen`. Derivatives by beam and frame are
+        zero unless they are wanted.
         """
         potentials, beam = np.zeros((_BANDS, *self.shape)), np.zeros(traced.beam.shape)
         pulls = Pulls(potentials, beam, np.zeros((_BANDS, 6)))
@@ -174,18 +143,10 @@ class RayModel:
     def jacobian(
         self, traced: TracedBeam, *, of_beam: bool = True, of_frame: bool = True
     ) -> csr_array:
-        """Return the derivatives of each pixel of the image at fixed `counts`.
+        """Return the derivatives of each pixel of the image at fixed `counts`, in single precision.
 
-        Parameters
-        ----------
-        traced, of_beam, of_frame
-            As for `gradient`.
-
-        Returns
-        -------
-        csr_array
-            A row for each pixel; columns, in no order, for the coefficients, the beam's pixels and
-            the frame; in single precision.
+        A row for each pixel; columns, in no order, for the coefficients, the beam's pixels and the
+        frame, of which the last two may be left out as in `gradient`.
         """
         reached = np.empty((*self.cells, 4), np.int64)
         self._in_ranges(kernels.boxes, len(reached), traced, reached)
@@ -233,16 +194,9 @@ class RayModel:
     ) -> tuple[list[FloatArray], list[FloatArray]]:
         """Return Jᵀ s w (s J v + l) and w (s J v + l) of each image, in one pass over J.
 
-        Parameters
-        ----------
-        jacobians, changes : sequence
-            J and v, changes of its columns.
-        weights, slopes, lights : sequence of ndarray
-            w, s and l: images with the shape `seen`.
-        parts : int, default 2
-            Of the rows of a Jacobian, each with sums of its own.
-        fewest : int, default 100,000
-            Entries of a Jacobian that are worth a thread.
+        The jacobians are J, the changes of their columns v; weights, slopes and lights are w, s and
+        l, images with the shape `seen`. Each of the `parts` of a Jacobian's rows has sums of its
+        own; a thread is worth its while from the `fewest` entries on.
         """
         pulls = [np.empty(self.seen) for _ in jacobians]
         totals = [np.zeros((parts, each.shape[1])) for each in jacobians]

@@ -27,28 +27,16 @@ def smooth_references(
     A fit would use that noise: a beam that is moved by half a pixel is an average of pixels, with
     less noise, so that such displacements explain images best, true or not.
 
-    Parameters
-    ----------
-    beams, images, deviations : ndarray, shape (L, H, W)
-        The last are about the standard deviations of the images' noise.
-    used : ndarray of bool, shape (L, H, W)
-        Pixels that can be used.
-    widths : sequence of float
-        Standard deviations of the Gaussians that are tried, px. The one whose beams are nearest to
-        the images is taken, as these have noise of their own.
-    calm_share : float
-        Share of the pixels that are compared: those where image and beam differ least on average.
-    least_gain : float
-        By how much the sum of the squared normalised differences must fall.
-    least_certain : float
-        Least error that is not chance, of the variance, times the root of the number of pixels.
+    Gaussians of the `widths` in px are tried. The one whose beams are nearest to the images is
+    taken, as these have noise of their own. Only a `calm_share` of the pixels is compared: those
+    where image and beam differ least on average. The sum of the squared normalised differences must
+    fall by `least_gain`. An error of less than `least_certain` of the variance, times the root of
+    the number of pixels, is chance.
 
-    Returns
-    -------
-    blurred : ndarray, shape (L, H, W)
-    remaining : ndarray, shape (L,)
-        Standard deviation of the beams' errors beyond differences of neighbouring pixels of image
-        and blurred beam, in units of `deviations`; 0 where the beams were not blurred.
+    All have shape (L, H, W); the deviations are about those of the images' noise. Returns the
+    blurred beams, and the standard deviation of their errors beyond differences of neighbouring
+    pixels of image and blurred beam, (L,), in units of the deviations; 0 where a beam was not
+    blurred.
     """
     if not np.ptp(beams, axis=(1, 2)).any():
         return beams, np.zeros(len(beams))

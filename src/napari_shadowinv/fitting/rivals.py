@@ -128,21 +128,11 @@ def compare_rivals(
     hopeless: float = 3.0,
     behind: float = 10.0,
 ) -> Comparison:
-    """Compare a fit with rivals that free one quantity each.
+    """Compare a fit with rivals that free one quantity each, or `only` one cause.
 
-    Parameters
-    ----------
-    data, scene, best
-        The fit.
-    on_step : callable
-        Receives the stage and the objective.
-    only : str, default ""
-        The one cause to look for. Default: all.
-    hopeless : float, default 3
-        Times the least objective in larger pixels, beyond which a rival is left out.
-    behind : float, default 10
-        How far the objective in larger pixels may be above the fit's where a number is tried: on
-        images with and without blur a rival that was worse there was worse in recorded pixels.
+    A rival is left out beyond `hopeless` times the least objective in larger pixels. Where a number
+    is tried, the objective in larger pixels may be above the fit's by `behind`: on images with and
+    without blur a rival that was worse there was worse in recorded pixels.
     """
     # A field that hides a flaw is rougher than any that rivals need.
     least = SMOOTHNESS_RATIO**2 * FIRST_SMOOTHNESS

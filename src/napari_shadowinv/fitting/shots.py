@@ -26,12 +26,8 @@ Shots = Shot | ArrayLike | Sequence[Shot | ArrayLike]
 class NearField:
     """A field near the true one, from which alone a fit starts: no alternatives are looked for.
 
-    Attributes
-    ----------
-    potential : ndarray, shape (H, W)
-        In px², of the first field.
-    smoothness : tuple of float
-        The weights λ and κ of a similar fit, as `FittedField.smoothness`; they are not estimated.
+    The potential (H, W) of the first field is in px²; the smoothness, λ and κ of a similar fit, is
+    not estimated.
     """
 
     potential: FloatArray
@@ -39,13 +35,7 @@ class NearField:
 
 
 def list_shots(shots: Shots) -> list[Shot]:
-    """Return the shots of one image or of several.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
+    """Return the shots of one image or of several; an `InputError` if there is none."""
     images: Any = shots
     is_one = isinstance(images, (Shot, str, Path)) or np.ndim(images) == 2
     listed = [
@@ -65,21 +55,9 @@ def names_of(shots: Sequence[Shot]) -> tuple[str, ...]:
 def common_values(
     names: Sequence[str], values: Sequence[Any], quantity: str
 ) -> tuple[Any, ...] | None:
-    """Return the values of all images, or None if none has one.
+    """Return a quantity's value in each image, by their names, or None if none has one.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Names of the images.
-    values : sequence
-        A value for each image, or None.
-    quantity : str
-        Its name.
-
-    Raises
-    ------
-    InputError
-        If some images have a value and others have none.
+    An `InputError` if some images have a value and others have none.
     """
     without = [name for name, value in zip(names, values, strict=True) if value is None]
     if len(without) == len(names):
@@ -98,13 +76,7 @@ def values_of(shots: Sequence[Shot], attribute: str) -> tuple[Any, ...] | None:
 
 
 def value_of_first(shots: Sequence[Shot], attribute: str) -> Any:
-    """Return a value that only the first image may have.
-
-    Raises
-    ------
-    InputError
-        If a later image has one.
-    """
+    """Return a value that only the first image may have; an `InputError` if a later one has it."""
     if any(getattr(shot, attribute) is not None for shot in shots[1:]):
         raise InputError(
             f"received {attribute} of a later image: expected them in the first image, whose "

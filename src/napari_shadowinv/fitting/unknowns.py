@@ -81,20 +81,10 @@ _NORMAL = np.array(1.0)  # 1 / s² of the numbers of an instrument
 class PriorTerms:
     """How far unknowns are held, in pixels of one size.
 
-    Attributes
-    ----------
-    smoothness : ndarray, shape (M, 2)
-        λ and κ of each field.
-    tie, decay : float
-        µ, and the length ℓ in px over which potentials fade in the pad.
-    fiducials : Fiducials or None
-        Displacements known at points.
-    bin : int
-        Side of a pixel in recorded pixels.
-    shift_spread : float
-        Standard deviation of an image's shift, px of the recorded image.
-    stretch_spread, brightness_spread : float
-        Of turns, magnifications and shears, and of the logarithm of the brightness.
+    `smoothness` (M, 2) is λ and κ of each field, `tie` is µ, and `decay` the length ℓ in px over
+    which potentials fade in the pad; `bin` is the side of a pixel in recorded pixels. Standard
+    deviations are `shift_spread` of an image's shift, in px of the recorded image, `stretch_spread`
+    of turns, magnifications and shears, and `brightness_spread` of the logarithm of the brightness.
     """
 
     smoothness: FloatArray
@@ -111,12 +101,7 @@ class PriorTerms:
 class Prior(PriorTerms):
     """Gaussian prior of the unknowns.
 
-    Attributes
-    ----------
-    rays : RayModel
-        The rays of all images.
-    strengths : ndarray, shape (M,)
-        Displacement in the first image by each field's displacement.
+    `strengths` (M,) are the displacement in the first image by each field's displacement.
     """
 
     rays: RayModel

@@ -31,23 +31,12 @@ def hidden_contrast(
     rim_width: int = 4,
     smoothing: float = 1.0,
 ) -> float:
-    """Return the contrast around the holes of a mask, as a share of the strongest.
+    """Return the contrast around the holes of a mask, as a share of the strongest; 0 without holes.
 
-    Parameters
-    ----------
-    contrast : ndarray, shape (L, H, W)
-        Model images over their beams, minus 1.
-    used : ndarray of bool, shape (L, H, W)
-        The pixels that were fitted. A hole is where no image has any.
-    radius : float, default 6
-        Smaller holes are bridged by their surroundings, px.
-    rim_width, smoothing : float, default 4 and 1
-        Width of the rim of a hole, and standard deviation of a blur of the contrast, px.
-
-    Returns
-    -------
-    float
-        The largest of all images; 0 without holes.
+    The contrast (L, H, W) is that of model images to their beams, the largest of all images counts.
+    A hole is where no image has a pixel that was fitted; holes of a smaller `radius` in px are
+    bridged by their surroundings. `rim_width` is that of a hole's rim, `smoothing` the standard
+    deviation of a blur of the contrast, px.
     """
     used_anywhere = used.any(axis=0)
     # Holes begin where pixels are missing inside the image, not at its edge.
@@ -103,23 +92,10 @@ class VerdictLimits:
 class Evidence:
     """Evidence for the verdict on a fit, whose own verdict does not matter.
 
-    Attributes
-    ----------
-    fit : Fit
-    pattern : Pattern
-        Structure in the residuals.
-    jacobian : ndarray, shape (H, W)
-        Determinant of the map to the image where it is folded most.
-    single : bool
-        Whether there is one image only, or several with the same information.
-    beam_unknown : bool
-        Whether the beam is fitted, too.
-    hidden : float
-        Contrast around the mask's holes as a share of the strongest; see `hidden_contrast`.
-    searched : bool, default True
-        Whether the fit has started from several fields.
-    noise : NoiseMatch, optional
-        The noise of the images against the one that is given or estimated.
+    The `pattern` is the structure in its residuals; `jacobian` (H, W) the determinant of the map to
+    the image where it is folded most; `single` is true for one image, or several with the same
+    information; `hidden` as `hidden_contrast` returns it. A fit is `searched` if it has started
+    from several fields.
     """
 
     fit: Fit
