@@ -244,15 +244,9 @@ def assess(case: Case, rules: Iterable[Callable[[Case], Assessment | None]]) -> 
 class Headline:
     """A result in one line of at most `MOST_WORDS`, which begins with its title.
 
-    Attributes
-    ----------
-    level : Level
-        Failed if the solver did not converge, doubtful with a warning, else by the verdict.
-    text : str
-        The peak of the main field with its error, its limit, the next step, and the first warning
-        in a few words.
-    verdict : Verdict, optional
-        None for results without one.
+    The level is failed if the solver did not converge, doubtful with a warning, else by the
+    verdict, which some results have not. The text is the peak of the main field with its error, its
+    limit, the next step, and the first warning in a few words.
     """
 
     MOST_WORDS: ClassVar = 25

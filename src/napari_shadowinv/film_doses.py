@@ -214,12 +214,9 @@ class FilmDoses(Summarised):
         }
 
     def to_dataset(self) -> xarray.Dataset:
-        """Return everything as one labelled dataset, with units.
+        """Return everything as one labelled dataset, with units and dimensions layer, y and x.
 
-        Returns
-        -------
-        xarray.Dataset
-            Dimensions layer, y and x. Pack, warnings and setups are JSON texts in the attributes.
+        Pack, warnings and setups are JSON texts in the attributes.
         """
         import xarray as xr
 
@@ -253,13 +250,7 @@ class FilmDoses(Summarised):
 
     @classmethod
     def from_dataset(cls, dataset: xarray.Dataset) -> FilmDoses:
-        """Rebuild the doses from their dataset.
-
-        Raises
-        ------
-        InputError
-            If a variable or attribute is missing or damaged.
-        """
+        """Rebuild the doses; an `InputError` if a variable or attribute is missing or damaged."""
         refuse_missing(dataset, "result of a film pack", (*_VARIABLES, "energy", *_BANDS))
         with as_input_errors("the film pack"):
             return cls._from_parts(dataset)

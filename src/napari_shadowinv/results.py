@@ -21,10 +21,7 @@ if TYPE_CHECKING:
 def result_from_dataset(dataset: xarray.Dataset) -> AnyResult:
     """Return the result in a dataset; its attributes decide on the kind.
 
-    Raises
-    ------
-    InputError
-        If a variable or attribute is missing or damaged.
+    An `InputError` if a variable or attribute is missing or damaged.
     """
     from napari_shadowinv.film_doses import FilmDoses
     from napari_shadowinv.fitting import Fit

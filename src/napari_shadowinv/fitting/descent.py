@@ -194,30 +194,13 @@ def settle(
     """Minimise a scene's objective from nearby: Gauss-Newton steps, and a descent if they fail.
 
     They also converge in directions that are barely determined, where a descent would end early.
+    They end where one step, or five of a descent, lower the objective by less than `least_gain`, or
+    the next would.
 
-    Parameters
-    ----------
-    scene, start, after_step
-        As for `descend`.
-    steps : int
-        Most steps.
-    least_gain : float
-        Ends where one step, or five of a descent, lower the objective by less, or the next would.
-    modes : SoftModes, optional
-        Of the Hessians of this scene, from scenes of the same pixels and priors.
-    linear : Linear, optional
-        The scene to first order near the start: used for all steps while these succeed.
-    limits : NewtonSteps, optional
-        Of the Gauss-Newton steps.
-
-    Returns
-    -------
-    unknowns : Unknowns
-    value : float
-        The objective; of a rough end, by the numbers of rays of its start.
-    steps : int
-    ended : bool
-        Whether steps were left.
+    The `modes` are of the Hessians of this scene, from scenes of the same pixels and priors. A
+    scene that is `linear` near the start serves for all steps while these succeed. Returns the
+    unknowns; the objective, of a rough end by the numbers of rays of its start; the number of
+    steps; and whether steps were left.
     """
     scales = Preconditioner(scene)
     # Scales of numbers that fields may replace, and of frames, are rough.

@@ -75,18 +75,10 @@ def correlation_length(
 ) -> float:
     """Return the standard deviation in px of the Gaussian that has blurred white noise.
 
-    Differences of pixels are compared over two distances. Medians are taken, so that bright lines
-    that the model misses do not count. 0 if the noise is white.
-
-    Parameters
-    ----------
-    residual, used : ndarray, shape (H, W)
-        As for `pattern_strength`.
-    apart : tuple of int, default (1, 4)
-        Distances, px.
-    most : float, default 0.85
-        Largest ratio of their variances for noise that is not white. White noise has 1 ± 0.03 on
-        64 × 64 px, noise blurred by 0.4 px 0.84.
+    Differences of pixels are compared over two distances `apart`, px. Medians are taken, so that
+    bright lines that the model misses do not count. 0 if the noise is white: the ratio of the
+    variances is at `most` 0.85 for other noise. White noise has 1 ± 0.03 on 64 × 64 px, noise
+    blurred by 0.4 px 0.84. Residual and used pixels, (H, W), are those of `pattern_strength`.
     """
     near, far = (_squared_difference(residual, used, distance) for distance in apart)
     if not far > 0 or near / far > most:

@@ -388,16 +388,8 @@ def _with_excess(
 class InstrumentDraws:
     """Random effects of an instrument on a recorded shot, by independent normal numbers.
 
-    Attributes
-    ----------
-    recorded : RecordedShot
-        The shot without them.
-    names : tuple of str
-        Effects with their sizes.
-    count : int
-        Number of normal numbers.
-    is_even : ndarray of bool, shape (count,)
-        Numbers whose square acts.
+    The `recorded` shot is without them; `names` are effects with their sizes; numbers for which
+    `is_even` (count,) is true act by their square.
     """
 
     def __init__(self, shot: RecordedShot, instrument: Instrument, beam: BeamPrior) -> None:

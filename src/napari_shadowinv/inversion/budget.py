@@ -70,12 +70,8 @@ _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 def discretisation_share(times: float, rate: float = _USUAL_RATE) -> float:
     """Return the discretisation error of a solution, as a share of its last change.
 
-    Parameters
-    ----------
-    times : float
-        Ratio of the numbers of sites, finer to coarser solution; above 1.
-    rate : float
-        Ratio of the changes by two successive fourfold increases of the number of sites.
+    `times` is the ratio of the numbers of sites, finer to coarser solution, above 1; `rate` the
+    ratio of the changes by two successive fourfold increases of the number of sites.
     """
     return float((times ** (2 * _power_of(rate)) - 1) ** -0.5)
 

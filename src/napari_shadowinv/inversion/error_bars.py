@@ -160,15 +160,9 @@ FIT_LINEARITY = LinearityCheck(0.5, 0.3)
 class Linearity:
     """Linear samples against those that were solved as well.
 
-    Attributes
-    ----------
-    nonlinearity : float
-        Deviation of linear samples from solved ones, as a share of the change (r.m.s. over the
-        image).
-    spread_ratio : float
-        Size of the solved changes relative to the linear ones (r.m.s.).
-    mean_shift : float
-        Difference of their means, relative to the r.m.s. standard deviation.
+    They deviate by the `nonlinearity`, as a share of the change (r.m.s. over the image). Solved
+    changes are `spread_ratio` times as large (r.m.s.), and differ in the mean by `mean_shift`,
+    relative to the r.m.s. standard deviation.
     """
 
     nonlinearity: float

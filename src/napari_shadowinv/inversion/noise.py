@@ -58,24 +58,10 @@ def beam_difference(
 ) -> float:
     """Return the r.m.s. relative difference of image and source outside the object.
 
-    Parameters
-    ----------
-    prepared : Prepared
-        Image and source in units of the source's power of two.
-    noise : ImageNoise
-        Noise of that image; differences that it explains do not count.
-    patterns : ndarray, shape (k, H, W), optional
-        Changes of the source by one standard deviation of each number that is known so well, as of
-        its registration; what they explain does not count, either.
-    tiles : QuietTiles, optional
-        Parts of the frame that are compared.
-
-    Returns
-    -------
-    float
-        0 where the difference is within the noise, or where too little of the frame along the
-        edge is free of the object for a comparison, as where even calm parts have structure that
-        hides the noise.
+    It is 0 where the difference is within the noise, or where too little of the frame along the
+    edge is free of the object for a comparison, as where even calm parts have structure that hides
+    the noise. The patterns, (k, H, W), are changes of the source by one standard deviation of each
+    number that is known so well, as of its registration; what they explain does not count, either.
     """
     shape = prepared.mask.shape
     cell = min(shape) // (tiles.tiles * tiles.cells)
@@ -215,22 +201,13 @@ class ImageNoise:
     It is correlated as by a Gaussian blur of a stated width, px, or as measured. A stated variance
     of more than `most_stated` times the measured one is not used.
 
-    Attributes
-    ----------
-    largest, typical : float
-        Standard deviation of a pixel with hot pixels and the finest structure, and without.
-    clumping : float
-        Variance of the sum of many pixels over the sum of their variances; 1 for white noise.
-    correlation_length : float
-        Standard deviation of the Gaussian blur that clumps white noise as much, px; 0 for white
-        noise.
-    variance_terms : ndarray, shape (3,)
-        Terms of a pixel's variance: constant, in proportion to its brightness, and to its square.
-    is_bound : bool
-        Whether structure hides the noise: it is then at most as large.
-    is_correlated_far : bool
-        Whether calm parts vary over more pixels than a correlation can be measured: all of the
-        above is then too small.
+    A pixel has the standard deviation `largest` with hot pixels and the finest structure, `typical`
+    without. `clumping` is the variance of the sum of many pixels over the sum of their variances, 1
+    for white noise; `correlation_length` the standard deviation of the Gaussian blur that clumps
+    white noise as much, px, 0 for white noise. The `variance_terms` (3,) are constant, in
+    proportion to a pixel's brightness, and to its square. If structure hides the noise, it
+    `is_bound`: at most as large. If calm parts vary over more pixels than a correlation can be
+    measured, it `is_correlated_far`: all of the above is then too small.
     """
 
     def __init__(
@@ -377,15 +354,8 @@ def measure_correlation(
     structure up to the structure's size: V(1) to V(6) are compared with V of blurred noise, and no
     V may be exceeded. Of the widths that fit alike, the one with most noise on long waves is used.
 
-    Parameters
-    ----------
-    excess, brightness : ndarray, shape (H, W)
-        Image less source, and image, over the source's mean.
-    mask : ndarray of bool, shape (H, W)
-        The pixels to use.
-    width : float, optional
-        Standard deviation of the blur, px, if it is known.
-    limits : CorrelationLimits, optional
+    The excess is image less source, the brightness the image, over the source's mean, (H, W); the
+    width of the blur is in px, if it is known.
     """
     differences = _CalmDifferences.of(excess, brightness, mask, limits)
     lags, variances = differences.curve(limits.calm_share)

@@ -166,16 +166,9 @@ def _add_slopes(
 
 
 class LinearResponse:
-    """Response of one level's solution.
+    """Response of the solution of a level of n sites, `spacing` px apart.
 
-    Attributes
-    ----------
-    level : SiteLevel
-        The level, of n sites.
-    spacing : float
-        Distance between its sites, px.
-    flux, area : ndarray, shape (n,)
-        The image's flux in each cell, and its area in pixels.
+    The image's `flux` (n,) is that in each cell, the `area` (n,) the cell's in pixels.
     """
 
     def __init__(self, solution: LevelSolution, target: Target, plan: SitePlan) -> None:

@@ -302,26 +302,11 @@ def _far_correlation(noise: ImageNoise) -> str:
 def mark_caustics(
     jacobian: FloatArray, mask: BoolArray, n_sites: int, threshold: float
 ) -> BoolArray:
-    """Mark the pixels where rays cross or nearly cross.
+    """Mark the pixels where rays cross or nearly cross, of those in a mask, (H, W).
 
-    Wherever the field compresses the beam, noise takes single pixels below the threshold. A region
-    below it is a caustic if its Jacobian averaged over the spacing of the sites, the resolution of
-    the map, falls below the threshold, too.
-
-    Parameters
-    ----------
-    jacobian : ndarray, shape (H, W)
-        Jacobian determinant of the map.
-    mask : ndarray of bool, shape (H, W)
-        Pixels that were used; no other is marked.
-    n_sites : int
-        Number of sites.
-    threshold : float
-        Upper limit of the determinant in a caustic, `InversionOptions.caustic_jacobian`.
-
-    Returns
-    -------
-    ndarray of bool, shape (H, W)
+    Wherever the field compresses the beam, noise takes single pixels below the threshold, an
+    `InversionOptions.caustic_jacobian`. A region below it is a caustic if its Jacobian averaged
+    over the spacing of the sites, the resolution of the map, falls below the threshold, too.
     """
     below = (jacobian < threshold) & mask
     if not below.any():

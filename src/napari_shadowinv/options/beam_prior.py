@@ -39,22 +39,14 @@ _HALF_WIDTH = np.exp(-0.5)  # correlation at the length of a prior
 class BeamComponents:
     """Shapes in which a beam varies relative to its mean, known block by block.
 
-    Attributes
-    ----------
-    patterns : ndarray, shape (k, h, w)
-        Relative changes by one standard deviation of each shape, means of square blocks.
-    block : int
-        Side of a block, px.
-    shape : tuple of int
-        Height and width of the image.
-    rest : float
-        Relative r.m.s. of the variation that the shapes leave; it has the length of the prior.
-    basis : str
-        Origin: 'references'; 'outside' for an image outside its object; 'assumed' or 'stated' for
-        the remains after filters and a source estimate; 'filtered' for the part that they take from
-        an object in an exact beam.
-    mean : ndarray, shape (H, W), optional
-        The mean beam, whose mean is 1.
+    `patterns` (k, h, w) are relative changes by one standard deviation of each shape, means of
+    square blocks with a side of `block` px, of an image with a `shape`. The shapes leave a
+    variation with a relative r.m.s. of `rest`, which has the length of the prior. The `mean` beam
+    (H, W) has a mean of 1.
+
+    The basis is their origin: 'references'; 'outside' for an image outside its object; 'assumed' or
+    'stated' for the remains after filters and a source estimate; 'filtered' for the part that they
+    take from an object in an exact beam.
     """
 
     patterns: FloatArray

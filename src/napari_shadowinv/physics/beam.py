@@ -50,19 +50,10 @@ def unit_in_title(title: str | None) -> str:
 
 
 def number_in_unit(text: str, unit: str) -> float:
-    """Read a number, exact to the last digit.
+    """Read a number such as ``"1.3 mm"``, ``"1e19 cm⁻³"`` or ``"inf"``, exact to the last digit.
 
-    Parameters
-    ----------
-    text : str
-        Such as ``"1.3 mm"``, ``"1e19 cm⁻³"`` or ``"inf"``; a bare number is in `unit`.
-    unit : str
-        Unit of the answer, such as "m" or "MeV"; may be empty.
-
-    Raises
-    ------
-    ValueError
-        If the text is no number, or its unit does not measure the same.
+    A bare number is in the unit, such as "m", "MeV" or "". A ValueError if the text is no number,
+    or its unit does not measure the same.
     """
     text = text.strip()
     if text.lower() in ("inf", "infinity", "infinite", "∞"):

@@ -47,26 +47,12 @@ def push_particles(
 ) -> None:
     """Move particles from anywhere on their straight path before the grid to where they leave it.
 
-    Parameters
-    ----------
-    first, last : int
-        Range of the particles.
-    field, origin, spacing
-        Field, and the grid's first node and spacing along x, y, z in m.
-    particles : ndarray, shape (N, 6)
-        Positions in m and momenta over m c; unchanged for particles that meet no field.
-    status, steps : ndarray of int, shape (N,)
-        Status of each particle, and the number of its steps.
-    charge : float
-        q / (m c) in 1 / (T m).
-    longest : float
-        Longest step in m.
-    max_turn : float
-        Largest change of direction in a step in rad.
-    peaks : ndarray, shape (2,)
-        Largest |B| in T and |E| / c in T on the grid; they limit the step.
-    max_path : float
-        Length of a path inside the grid in m beyond which a particle is trapped.
+    The grid has its first node at `origin` and a `spacing` along x, y, z, in m. Particles, (N, 6),
+    are positions in m and momenta over m c, unchanged if they meet no field; each gets a status,
+    (N,), and its number of steps, (N,). The charge is q / (m c) in 1 / (T m). A step is at most
+    `longest`, in m, and turns by `max_turn` rad, as limited by the `peaks` (2,): largest |B| in T
+    and |E| / c in T on the grid. Beyond a path of `max_path`, in m, inside the grid a particle is
+    trapped.
     """
     rim_x, rim_y, rim_z = field.shape[1] - 1.0, field.shape[0] - 1.0, field.shape[2] - 1.0
     inv_x, inv_y, inv_z = 1.0 / spacing[0], 1.0 / spacing[1], 1.0 / spacing[2]
