@@ -244,16 +244,15 @@ def assess(case: Case, rules: Iterable[Callable[[Case], Assessment | None]]) -> 
 class Headline:
     """A result in one line of at most `MOST_WORDS`, which begins with its title.
 
-    The level is failed if the solver did not converge, doubtful with a warning, else by the
-    verdict, which some results have not. The text is the peak of the main field with its error, its
-    limit, the next step, and the first warning in a few words.
+    Its text is the peak of the main field with its error, its limit, the next step, and the first
+    warning in a few words.
     """
 
     MOST_WORDS: ClassVar = 25
 
-    level: Level
+    level: Level  # failed if not converged, doubtful with a warning, else by the verdict
     text: str
-    verdict: Verdict | None = None
+    verdict: Verdict | None = None  # of results that have one
 
     @classmethod
     def of(

@@ -30,20 +30,15 @@ _PART = {"nogil": True, "error_model": "numpy", "fastmath": _FAST, "inline": "al
 
 
 class Rays(NamedTuple):
-    """A `TracedBeam` of a `RayModel`, as kernels trace its rays.
-
-    `tables` are values and slopes of splines by the number of rays along a cell's side, flat;
-    `frame` is about the corner of a detector of `size`, with the guard around it; `steepness`
-    is by how much a ray's share in the next pixel rises in a px.
-    """
+    """A `TracedBeam` of a `RayModel`, as kernels trace its rays."""
 
     potential: FloatArray
     counts: IntArray
     beam: FloatArray
-    tables: FloatArray
-    frame: FloatArray
+    tables: FloatArray  # values and slopes of splines by the rays along a cell's side, flat
+    frame: FloatArray  # about the corner of a detector of `size`, with the guard around it
     pad: int
-    steepness: float
+    steepness: float  # rise of a ray's share in the next pixel in a px
     size: tuple[int, int]
 
 

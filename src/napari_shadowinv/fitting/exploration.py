@@ -41,21 +41,18 @@ from napari_shadowinv.inversion.samples import Pairs
 class PosteriorSummary:
     """How far the images leave the best unknowns open, and how far an instrument would move them.
 
-    There is a `posterior` for counts alone; `sampling` is how samples were found, as in
-    `FitOptions`; `pairs` compares some to first order with those that are solved in full;
-    `errors`, `by_part` and `by_beam` are displacements, `sensitivities` shares of each field's,
-    (M,). `assumed` are the likely changes by a detector of which nothing was stated.
+    Errors are displacements.
     """
 
-    posterior: Posterior | None
+    posterior: Posterior | None  # for counts alone
     samples: list[Sample]
-    sampling: str
-    pairs: Pairs | None
+    sampling: str  # how samples were found, as in `FitOptions`
+    pairs: Pairs | None  # samples to first order and solved in full
     errors: FloatArray | None
     by_part: dict[str, FloatArray]
     by_beam: BeamShifts | None
-    assumed: dict[str, Unknowns]
-    sensitivities: dict[str, FloatArray]
+    assumed: dict[str, Unknowns]  # likely changes by a detector of which nothing was stated
+    sensitivities: dict[str, FloatArray]  # shares of each field's displacement, (M,)
 
 
 def find_basins(

@@ -33,33 +33,26 @@ _SIGMAS = 4.0  # how far Gaussians reach
 class Scene(PriorTerms):
     """Images, all that is known about how they were made, and the prior, in pixels of one size.
 
-    `images` and `weights` (L, H, W) are the data and 1 / σ², zero where a pixel is not used;
-    `strengths` (L, M) the displacement in image l by each field's displacement; `beams` (L, …) the
-    known flux of the beams, as `RayModel.around` returns it; `psf` the standard deviation in px of
-    each image's point spread, or its kernel. For `pad`, `spacing` and `threads` see `RayModel`.
-
-    The brightness of each image is unknown if `free_brightness`, and those numbers of a frame for
-    which `free_frames` (6,) is true, but for the first image. Residuals are blurred by `blur` px.
-    Numbers of an `imperfect` instrument that are `held` do not change; `spread` (n, n) is a root of
-    the covariance of the numbers of `response_units`, by default as before the images. The
-    derivatives in `force` are subtracted from the objective's: a random one makes its least a
-    sample of the prior.
+    Of the six numbers of a frame, except the first image's, `free_frames` are unknown. The
+    covariance of the numbers of `response_units` is by default as before the images. A `force` is
+    subtracted from the objective's derivatives: a random one makes its least a sample of the prior.
+    For `pad`, `spacing` and `threads` see `RayModel`.
     """
 
-    images: FloatArray
-    weights: FloatArray
-    strengths: FloatArray
-    beams: FloatArray
-    psf: Sequence[float | FloatArray]
+    images: FloatArray  # (L, H, W)
+    weights: FloatArray  # (L, H, W), 1 / σ²; zero where a pixel is not used
+    strengths: FloatArray  # (L, M), displacement in image l by each field's displacement
+    beams: FloatArray  # (L, …), known flux of the beams, as `RayModel.around` returns it
+    psf: Sequence[float | FloatArray]  # of each image, standard deviation in px or kernel
     pad: int = 16
-    free_brightness: bool = False
+    free_brightness: bool = False  # whether that of each image is unknown
     free_frames: BoolArray = field(default_factory=lambda: np.zeros(6, bool))
-    blur: float = 0.0
+    blur: float = 0.0  # of residuals, px
     spacing: float = 0.25
     threads: int | None = None
     imperfect: Imperfect = EXACT
-    held: frozenset[str] = frozenset()
-    spread: FloatArray | None = None
+    held: frozenset[str] = frozenset()  # imperfections whose numbers do not change
+    spread: FloatArray | None = None  # (n, n), root of that covariance
     force: Unknowns | None = None
 
     @cached_property
@@ -396,16 +389,12 @@ class _Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class Linear:
-    """A scene to first order in changes of the unknowns around which it is linear.
-
-    For each image, a Jacobian as `RayModel.jacobian` returns it, without the columns of beam and
-    frame if neither is unknown; and the image without its brightness, with how it is `seen`.
-    """
+    """A scene to first order in changes of the unknowns around which it is linear."""
 
     scene: Scene
     unknowns: Unknowns
-    jacobians: list[csr_array]
-    seen: list[_Seen]
+    jacobians: list[csr_array]  # without columns of beam and frame if neither is unknown
+    seen: list[_Seen]  # images without their brightness, and how they are seen
 
     def normal_times(self, change: Unknowns) -> Unknowns:
         """Return `pull` of `push` of a change of what is free."""

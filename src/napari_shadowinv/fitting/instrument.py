@@ -45,16 +45,14 @@ class Part(NamedTuple):
 class Imperfect:
     """Standard deviations of what an instrument does to an image, in pixels of one size.
 
-    `responses` are those of a pixel, by the keys of `RESPONSES`; `blur` is of the variance of the
-    point spread along each axis, px²; `other_strengths` (L, M) of the displacement by another
-    field, as shares of that by each field in the first image; `shapes` are changes of a scene's
-    beams.
+    Another field displaces by `other_strengths` (L, M), as shares of the displacement by each field
+    in the first image.
     """
 
-    responses: dict[str, float] = field(default_factory=dict)
-    blur: float = 0.0
+    responses: dict[str, float] = field(default_factory=dict)  # keys of `RESPONSES`
+    blur: float = 0.0  # of the variance of the point spread along each axis, px²
     other_strengths: FloatArray | None = None
-    shapes: tuple[Shapes, ...] = ()
+    shapes: tuple[Shapes, ...] = ()  # changes of a scene's beams
 
     @cached_property
     def parts(self) -> tuple[Part, ...]:

@@ -16,15 +16,11 @@ class NoiseMatch:
 
     Weights are made for the power of the noise on long waves, where it bends fields: correlated
     noise has more of it than white noise of the same pixels, smoothed counts less per pixel.
-
-    `factors` (L,) are the variance that is used over that which is given or estimated from single
-    pixels, `expected_chi2` (L,) the variance of a pixel over the one that is used; `correlation` is
-    the standard deviation of the Gaussian that has blurred the noise, px, 0 for white noise.
     """
 
-    factors: FloatArray
-    expected_chi2: FloatArray
-    correlation: float
+    factors: FloatArray  # (L,), variance as used over that given or estimated from single pixels
+    expected_chi2: FloatArray  # (L,), variance of a pixel over the one that is used
+    correlation: float  # standard deviation of the Gaussian that has blurred the noise, px
     is_estimated: bool
 
     def relative_chi2(self, chi2: FloatArray) -> FloatArray:

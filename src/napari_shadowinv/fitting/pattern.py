@@ -146,26 +146,19 @@ def _squared_difference(values: FloatArray, used: BoolArray, distance: int) -> f
 class Pattern:
     """Structure in the residuals of a fit.
 
-    `strengths` (L,) of the images are in standard deviations, as `pattern_strength` returns them;
-    `correlation` is the standard deviation in px of the Gaussian that has blurred the noise, 0 for
-    white noise; `chi2` the largest of all images. The noise is smaller than counts imply by a share
-    of `missing_counts`, with its deviation `counts_deviation`, as a dark level of that share makes
-    it. The `cause` is the likeliest, as a clause; "" if none wins or none was looked for; `tried`
-    are all that were.
-
     A model is wrong beyond a strength of `suspect`. Of fits with a right model it is -5 to 2, once
     4.2: a deep fold at 30 counts a pixel. With a beam that is 2 % off it is 31 and more, with
     absorption of 5 % 5.4 to 12.6.
     """
 
-    strengths: FloatArray
-    correlation: float = 0.0
-    chi2: float = 1.0
+    strengths: FloatArray  # (L,), see `pattern_strength`
+    correlation: float = 0.0  # px, see `correlation_length`
+    chi2: float = 1.0  # the largest of all images
     blur_score: float = 0.0
-    missing_counts: float = 0.0
-    counts_deviation: float = np.inf
-    cause: str = ""
-    tried: str = ""
+    missing_counts: float = 0.0  # share by which noise is too small, as by a dark level of it
+    counts_deviation: float = np.inf  # standard deviation of `missing_counts`
+    cause: str = ""  # the likeliest, as a clause; "" if none wins or none was looked for
+    tried: str = ""  # all causes that were looked for
     suspect: float = 5.0
 
     @property

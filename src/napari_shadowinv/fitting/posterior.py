@@ -45,30 +45,21 @@ _BEAM_SEED = 1
 
 @dataclass(frozen=True)
 class Sample:
-    """A random change of the unknowns, and what causes it.
-
-    `noise` (L, H, W) are random changes of the data over their standard deviations, `force` are
-    random derivatives of the prior.
-    """
+    """A random change of the unknowns, and what causes it."""
 
     change: Unknowns
-    noise: FloatArray
-    force: Unknowns
+    noise: FloatArray  # (L, H, W), random changes of the data over their standard deviations
+    force: Unknowns  # random derivatives of the prior
 
 
 class Response(NamedTuple):
-    """How well images determine n numbers of an instrument that change the response to fields.
+    """How well images determine n numbers of an instrument that change the response to fields."""
 
-    `changes` of all unknowns by each number, the `numbers`, the derivatives of the misfit by them
-    (`slopes`) and what is `expected` of these if the numbers are right, and the misfit's
-    `curvature` (n, n).
-    """
-
-    changes: list[Unknowns]
+    changes: list[Unknowns]  # of all unknowns by each number
     numbers: FloatArray
-    slopes: FloatArray
-    expected: FloatArray
-    curvature: FloatArray
+    slopes: FloatArray  # of the misfit by the numbers
+    expected: FloatArray  # slopes if the numbers are right
+    curvature: FloatArray  # (n, n), of the misfit
 
 
 class Posterior:
@@ -522,15 +513,11 @@ def displacement_errors(
 
 @dataclass(frozen=True)
 class BeamShifts:
-    """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W).
+    """Standard deviations of each field's displacement by its beam in px, (M, 2, H, W)."""
 
-    `by_percent` is for beams that vary by 1 %. `errors` is for beams that vary as far as is stated
-    or assumed, which `changes` times independent normal numbers add up to.
-    """
-
-    by_percent: FloatArray
-    errors: FloatArray
-    changes: tuple[Unknowns, ...] = ()
+    by_percent: FloatArray  # for beams that vary by 1 %
+    errors: FloatArray  # for beams that vary as far as is stated or assumed
+    changes: tuple[Unknowns, ...] = ()  # add up to `errors`, times independent normal numbers
 
 
 def shifts_by_beam(

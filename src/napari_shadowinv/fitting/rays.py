@@ -35,17 +35,12 @@ class Pulls(NamedTuple):
 
 
 class TracedBeam(NamedTuple):
-    """A beam behind a potential, as a detector sees it.
+    """A beam behind a potential, as a detector sees it."""
 
-    Coefficients of the potential, `RayModel.ray_counts` of it, the beam as `RayModel.around`
-    returns it, and the frame, 6 numbers, in which the detector sees the rays: by default where they
-    land.
-    """
-
-    potential: FloatArray
-    counts: IntArray
-    beam: FloatArray
-    frame: FloatArray | None = None
+    potential: FloatArray  # the coefficients
+    counts: IntArray  # as `RayModel.ray_counts` returns them
+    beam: FloatArray  # as `RayModel.around` returns it
+    frame: FloatArray | None = None  # 6 numbers; by default the detector sees rays where they land
 
 
 @dataclass(frozen=True)
@@ -55,17 +50,13 @@ class RayModel:
     A potential is an array of coefficients with `shape`, in px², of cubic B-splines with a knot
     every 2 px. A beam is the flux of each pixel, including the strip: `around` continues one from
     the image. A frame maps the landing point (y, x) to the detector: (f0 + f1 y + f2 x, f3 + f4 y +
-    f5 x), in px from the image's middle.
-
-    Rays may enter from a strip of `pad` px, an even number, around the image; a strip of `beyond`
-    px is evaluated, too. Landing points of neighbouring rays are at most `spacing` px apart. The
-    number of threads, by default all cores, does not affect the result.
+    f5 x), in px from the image's middle. The result does not depend on the number of threads.
     """
 
-    size: tuple[int, int]
-    pad: int = 12
-    beyond: int = 0
-    spacing: float = 0.25
+    size: tuple[int, int]  # height and width of the image
+    pad: int = 12  # width, even, of the strip around the image from which rays may enter, px
+    beyond: int = 0  # width of a strip around the image that is evaluated, too, px
+    spacing: float = 0.25  # largest distance between landing points of neighbouring rays, px
     threads: int | None = None
 
     @property

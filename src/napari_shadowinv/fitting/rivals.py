@@ -52,15 +52,12 @@ _ALIGNED = {"shift": np.array([True, False, False] * 2), "scale": np.ones(6, boo
 
 @dataclass(frozen=True)
 class Rival:
-    """A scene that frees some quantities, of which the last is its cause, and where it starts.
-
-    `tried` numbers are not fitted, but tried.
-    """
+    """A scene that frees some quantities, of which the last is its cause, and where it starts."""
 
     frees: tuple[str, ...]
     scene: Scene
     unknowns: Unknowns
-    tried: int = 0
+    tried: int = 0  # numbers that are not fitted, but tried
 
     def descend(self, start: Minimum, on_step: OnStep) -> Minimum:
         """Return the minimum near a start."""

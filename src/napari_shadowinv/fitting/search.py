@@ -41,15 +41,12 @@ Stages = tuple[tuple[int, float], ...]
 
 @dataclass(frozen=True)
 class Start:
-    """Where a descent begins: a potential in px² at the pixels, or none; and its stages.
-
-    In all but the last an unknown beam may be held.
-    """
+    """Where a descent begins, with its stages."""
 
     name: str
     stages: Stages
-    potential: FloatArray | None = None
-    beam_held: bool = False
+    potential: FloatArray | None = None  # px² at the pixels
+    beam_held: bool = False  # whether an unknown beam is held in all stages but the last
 
 
 @dataclass(frozen=True)
@@ -379,17 +376,14 @@ def settle_minimum(
 
 
 class FineMinimum(NamedTuple):
-    """Where a descent in recorded pixels has ended, and whether within the allowed steps.
-
-    The images of its model, (L, H', W'), are `seen`.
-    """
+    """Where a descent in recorded pixels has ended."""
 
     scene: Scene
     unknowns: Unknowns
-    seen: FloatArray
+    seen: FloatArray  # (L, H', W'), images of the model
     objective: float
     iterations: int
-    converged: bool
+    converged: bool  # within the allowed steps
 
 
 def refine_minimum(

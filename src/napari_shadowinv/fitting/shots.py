@@ -24,14 +24,10 @@ Shots = Shot | ArrayLike | Sequence[Shot | ArrayLike]
 
 @dataclass(frozen=True, eq=False)
 class NearField:
-    """A field near the true one, from which alone a fit starts: no alternatives are looked for.
+    """A field near the true one, from which alone a fit starts: no alternatives are looked for."""
 
-    The potential (H, W) of the first field is in px²; the smoothness, λ and κ of a similar fit, is
-    not estimated.
-    """
-
-    potential: FloatArray
-    smoothness: tuple[float, float]
+    potential: FloatArray  # (H, W), px², of the first field
+    smoothness: tuple[float, float]  # λ and κ of a similar fit, which are not estimated
 
 
 def list_shots(shots: Shots) -> list[Shot]:

@@ -35,15 +35,12 @@ from napari_shadowinv.physics.significance import deviation_along
 
 @dataclass(frozen=True)
 class FieldErrors:
-    """Errors of displacements, (M, 2, H, W) px: in all, and by each part.
-
-    With samples of potentials, (M, n, H, W), and the sides beyond which an object may lie.
-    """
+    """Errors of displacements, (M, 2, H, W) px: in all, and by each part."""
 
     in_all: FloatArray
     by_part: dict[str, FloatArray]
-    samples: FloatArray
-    sides: tuple[str, ...] = ()
+    samples: FloatArray  # of potentials, (M, n, H, W)
+    sides: tuple[str, ...] = ()  # beyond which an object may lie
 
     def with_part(self, key: str, errors: FloatArray) -> FieldErrors:
         """Return the same with another part."""

@@ -28,18 +28,13 @@ from napari_shadowinv.fitting.rays import RayModel, at_rest
 
 
 class Unknowns(NamedTuple):
-    """The unknowns of a fit, or derivatives by them, or changes of them.
+    """The unknowns of a fit, or derivatives by them, or changes of them."""
 
-    `potentials` (M, …) are B-spline coefficients of the fields' potentials, `common` (n,) and
-    `separate` (L, n) the numbers of an `Imperfect` instrument and of its beam, `brightness` (L,)
-    logarithms, `frames` (L, 6) as a `RayModel` takes them.
-    """
-
-    potentials: FloatArray
-    common: FloatArray
-    brightness: FloatArray
-    frames: FloatArray
-    separate: FloatArray
+    potentials: FloatArray  # (M, …), B-spline coefficients of the fields' potentials
+    common: FloatArray  # (n,), numbers of an `Imperfect` instrument and of its beam
+    brightness: FloatArray  # (L,), logarithms
+    frames: FloatArray  # (L, 6), as a `RayModel` takes them
+    separate: FloatArray  # (L, n), numbers of the instrument and the beam in each image
 
     def flat(self) -> FloatArray:
         """Return all values as one array."""
@@ -61,15 +56,11 @@ class Unknowns(NamedTuple):
 
 
 class Fiducials(NamedTuple):
-    """Points whose displacement in the first image is known: crossings of a mesh, say.
+    """Points whose displacement in the first image is known: crossings of a mesh, say."""
 
-    `places` (n, 2) in px from the image's corner, `displacements` (n, 2) and their standard
-    deviations `errors` (n,) in px.
-    """
-
-    places: FloatArray
-    displacements: FloatArray
-    errors: FloatArray
+    places: FloatArray  # (n, 2), px from the image's corner
+    displacements: FloatArray  # (n, 2), px
+    errors: FloatArray  # (n,), standard deviations, px
 
 
 POWERS = (4, 6)  # of the wave number squared: |∇⁴φ|² and |∇⁶φ|²
@@ -79,33 +70,24 @@ _NORMAL = np.array(1.0)  # 1 / s² of the numbers of an instrument
 
 @dataclass(frozen=True, kw_only=True)
 class PriorTerms:
-    """How far unknowns are held, in pixels of one size.
+    """How far unknowns are held, in pixels of one size."""
 
-    `smoothness` (M, 2) is λ and κ of each field, `tie` is µ, and `decay` the length ℓ in px over
-    which potentials fade in the pad; `bin` is the side of a pixel in recorded pixels. Standard
-    deviations are `shift_spread` of an image's shift, in px of the recorded image, `stretch_spread`
-    of turns, magnifications and shears, and `brightness_spread` of the logarithm of the brightness.
-    """
-
-    smoothness: FloatArray
-    tie: float = 30.0
-    decay: float = np.inf
+    smoothness: FloatArray  # (M, 2), λ and κ of each field
+    tie: float = 30.0  # µ
+    decay: float = np.inf  # length ℓ in px over which potentials fade in the pad
     fiducials: Fiducials | None = None
-    bin: int = 1
-    shift_spread: float = 5.0
-    stretch_spread: float = 0.05
-    brightness_spread: float = 1.0
+    bin: int = 1  # side of a pixel in recorded pixels
+    shift_spread: float = 5.0  # standard deviation of an image's shift, px of the recorded image
+    stretch_spread: float = 0.05  # of turns, magnifications and shears
+    brightness_spread: float = 1.0  # of the logarithm of the brightness
 
 
 @dataclass(frozen=True, kw_only=True)
 class Prior(PriorTerms):
-    """Gaussian prior of the unknowns.
-
-    `strengths` (M,) are the displacement in the first image by each field's displacement.
-    """
+    """Gaussian prior of the unknowns."""
 
     rays: RayModel
-    strengths: FloatArray
+    strengths: FloatArray  # (M,), displacement in the first image by each field's displacement
 
     def value_and_slope(self, unknowns: Unknowns) -> tuple[float, Unknowns]:
         """Return the sum of all terms, and its derivatives."""

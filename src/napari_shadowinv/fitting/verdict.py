@@ -90,21 +90,15 @@ class VerdictLimits:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Evidence for the verdict on a fit, whose own verdict does not matter.
-
-    The `pattern` is the structure in its residuals; `jacobian` (H, W) the determinant of the map to
-    the image where it is folded most; `single` is true for one image, or several with the same
-    information; `hidden` as `hidden_contrast` returns it. A fit is `searched` if it has started
-    from several fields.
-    """
+    """Evidence for the verdict on a fit, whose own verdict does not matter."""
 
     fit: Fit
-    pattern: Pattern
-    jacobian: FloatArray
-    single: bool
+    pattern: Pattern  # in the residuals
+    jacobian: FloatArray  # (H, W), determinant of the map to the image where it is folded most
+    single: bool  # one image, or several with the same information
     beam_unknown: bool
-    hidden: float
-    searched: bool = True
+    hidden: float  # as `hidden_contrast` returns it
+    searched: bool = True  # whether the fit has started from several fields
     noise: NoiseMatch | None = None
     limits: VerdictLimits = VerdictLimits()
 

@@ -158,16 +158,11 @@ FIT_LINEARITY = LinearityCheck(0.5, 0.3)
 
 @dataclass(frozen=True)
 class Linearity:
-    """Linear samples against those that were solved as well.
+    """Linear samples against those that were solved as well."""
 
-    They deviate by the `nonlinearity`, as a share of the change (r.m.s. over the image). Solved
-    changes are `spread_ratio` times as large (r.m.s.), and differ in the mean by `mean_shift`,
-    relative to the r.m.s. standard deviation.
-    """
-
-    nonlinearity: float
-    spread_ratio: float
-    mean_shift: float
+    nonlinearity: float  # deviation as a share of the change, r.m.s. over the image
+    spread_ratio: float  # of the solved changes to the linear ones, r.m.s.
+    mean_shift: float  # relative to the r.m.s. standard deviation
 
     def caution(self, check: LinearityCheck, cause: str, option: str) -> Caution | None:
         """Warn if the response to a cause is not linear; `option` lets all samples be solved."""

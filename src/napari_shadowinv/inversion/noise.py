@@ -313,14 +313,11 @@ def _clipped_rms(differences: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class CorrelatedNoise:
-    """Noise that is partly white, partly blurred by a Gaussian of a width, px.
+    """Noise that is partly white, partly blurred by a Gaussian."""
 
-    The variances are those of a pixel as bright as the source's mean.
-    """
-
-    white: float
-    blurred: float = 0.0
-    width: float = 0.0
+    white: float  # variance of a pixel as bright as the source's mean
+    blurred: float = 0.0  # another such variance
+    width: float = 0.0  # of the Gaussian, px
     is_bound: bool = False
     is_far: bool = False
 

@@ -39,22 +39,17 @@ _HALF_WIDTH = np.exp(-0.5)  # correlation at the length of a prior
 class BeamComponents:
     """Shapes in which a beam varies relative to its mean, known block by block.
 
-    `patterns` (k, h, w) are relative changes by one standard deviation of each shape, means of
-    square blocks with a side of `block` px, of an image with a `shape`. The shapes leave a
-    variation with a relative r.m.s. of `rest`, which has the length of the prior. The `mean` beam
-    (H, W) has a mean of 1.
-
     The basis is their origin: 'references'; 'outside' for an image outside its object; 'assumed' or
     'stated' for the remains after filters and a source estimate; 'filtered' for the part that they
     take from an object in an exact beam.
     """
 
-    patterns: FloatArray
-    block: int
-    shape: tuple[int, int]
-    rest: float
+    patterns: FloatArray  # (k, h, w), relative, by one standard deviation of each, means of blocks
+    block: int  # side of a square block, px
+    shape: tuple[int, int]  # of the image
+    rest: float  # relative r.m.s. of what they leave, with the length of the prior
     basis: Literal["references", "outside", "assumed", "stated", "filtered"]
-    mean: FloatArray | None = None
+    mean: FloatArray | None = None  # (H, W), whose mean is 1
 
     def check_shape(self, shape: tuple[int, ...]) -> None:
         """Raise an `InputError` if an image has another shape."""

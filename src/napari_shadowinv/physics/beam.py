@@ -120,41 +120,30 @@ class SIField:
 
 @dataclass(frozen=True)
 class MainField:
-    """The vector among a setup's SI fields that figures and layers show, and how.
-
-    `components` are the symbols along y and x; `arrows` is the title of the field's own arrows,
-    empty where they would point along the displacement.
-    """
+    """The vector among a setup's SI fields that figures and layers show, and how."""
 
     name: str
     title: str
     symbol: str
-    components: tuple[str, str]
-    arrows: str = ""
+    components: tuple[str, str]  # symbols along y and x
+    arrows: str = ""  # title of its own arrows; empty where they would point along the displacement
 
 
 @dataclass(frozen=True)
 class Deflector:
-    """Cause of a deflection.
+    """Cause of a deflection."""
 
-    `key` names it in a fit, `title` in words, in projections and in files, `label` in forms.
-    """
-
-    key: str
-    title: str
-    label: str
+    key: str  # in a fit
+    title: str  # in words, in projections and in files
+    label: str  # in forms
 
 
 @dataclass(frozen=True)
 class BeamQuantity:
-    """Quantity that differs between the beams of several images of one object, such as the energy.
+    """Quantity that differs between the beams of images of one object, such as the energy."""
 
-    `name` is the field of the setup, the column of tables and the coordinate of datasets; `noun`
-    is for sentences.
-    """
-
-    name: str
-    noun: str
+    name: str  # of the setup's field, the column of tables and the coordinate of datasets
+    noun: str  # for sentences
     unit: str
     long_name: str
     description: str

@@ -60,14 +60,11 @@ _JOULES_PER_MEV = 1e6 * _ELEMENTARY_CHARGE
 
 @dataclass(frozen=True)
 class Particle:
-    """Rest mass in kg and charge in C, with its sign, of a species of beam particle.
+    """Particle of a beam."""
 
-    Its usual energies in radiography are in MeV.
-    """
-
-    mass: float
-    charge: float
-    usual_energies: tuple[float, float]
+    mass: float  # at rest, kg
+    charge: float  # with its sign, C
+    usual_energies: tuple[float, float]  # in radiography, MeV
 
 
 def _particle(name: str, charge_number: int, least: float, most: float) -> Particle:

@@ -259,13 +259,9 @@ def _solve_from(
 
 @dataclass(frozen=True)
 class Target:
-    """The image and its margin, in which the flux arrives.
+    """The image and its margin, in which the flux arrives."""
 
-    The image, shape (H, W), is positive everywhere, and has the flux of the source unless there is
-    a margin.
-    """
-
-    density: Density
+    density: Density  # image, positive; with the flux of the source unless there is a margin
     margin: Margin | None
     options: InversionOptions
 
