@@ -34,10 +34,7 @@ def result_from_dataset(dataset: xarray.Dataset) -> AnyResult:
 
 
 def unpack_result(result: Any) -> AnyResult:
-    """Return a result, or the result in a dataset, of a single shot.
-
-    An `InputError` if it is neither, or is a stack or a damaged dataset.
-    """
+    """Return a result, or the result in a dataset, of a single shot; else an `InputError`."""
     if hasattr(type(result), "headline"):
         content: AnyResult = result
         return content

@@ -100,10 +100,7 @@ def _step_along(
     decrease: float = 1e-4,
     remaining: float = 0.9,
 ) -> tuple[float, float, FloatArray] | None:
-    """A step that lowers the value enough and leaves less slope, as Wolfe has it: bisection.
-
-    It begins `here`, at a value and a slope.
-    """
+    """A step from `here`, a value and a slope, to less of both, as Wolfe has it: bisection."""
     shortest, longest = 0.0, np.inf
     best, (value, slope) = None, here
     for _ in range(trials):

@@ -396,10 +396,7 @@ class Posterior:
         return total / probes / 2 - self._scales.log_size()
 
     def log_evidence(self, chances: Sequence[np.random.Generator]) -> float:
-        """Return the logarithm of how likely the model makes the data, but for a constant.
-
-        `chances` are the random generators of the fields.
-        """
+        """Return the log evidence but for a constant, by a random generator for each field."""
         value = self.scene.value(self._unknowns, self._counts)
         return -value - self.log_volume(chances)
 

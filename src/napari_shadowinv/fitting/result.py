@@ -370,13 +370,7 @@ class Fit(Summarised):
         return self.facts_with_names([each.file for each in self._origins])
 
     def facts_with_names(self, names: Sequence[str]) -> tuple[Fact, ...]:
-        """Return the facts with names of the images, which may be empty.
-
-        Parameters
-        ----------
-        names : sequence of str
-            A name for each image, or none.
-        """
+        """Return the facts with names of the images, which may be empty."""
         numbers = ", ".join(to_figures(chi2, 3) for chi2 in self.chi2)
         fields = [fact for field in self.fields for fact in self._field_facts(field)]
         facts = (
@@ -487,13 +481,7 @@ class Fit(Summarised):
     @classmethod
     @as_input_errors("the fit")
     def from_dataset(cls, dataset: xarray.Dataset) -> Fit:
-        """Rebuild a fit from its dataset.
-
-        Raises
-        ------
-        InputError
-            If a variable or attribute is missing or damaged.
-        """
+        """Rebuild a fit from its dataset; an `InputError` if a part is missing or wrong."""
         refuse_missing(dataset, _CONTENT, (*_VARIABLES, "field", "basin"), _ATTRIBUTES)
         arrays = {name: numbers_of(dataset, name) for name in _VARIABLES}
         attributes = dataset.attrs

@@ -56,17 +56,11 @@ class Shapes:
         rms: float = 1.0,
         share: float = VARIANCE,
     ) -> Shapes:
-        """Return a smooth field, whose correlation is a Gaussian.
+        """Return a smooth field, whose correlation is a Gaussian with a standard deviation in px.
 
-        Parameters
-        ----------
-        length : float
-            Standard deviation of the Gaussian, px.
-        weights : ndarray, shape (H, W)
-            Weights of the pixels: the weighted mean of each shape is 0, and the root of the
-            expected weighted square of their sum is `rms`.
-        share : float, default 0.999
-            Of the variance that the shapes hold.
+        By the `weights` (H, W) of the pixels, the weighted mean of each shape is 0, and the root of
+        the expected weighted square of their sum is `rms`. The shapes hold a `share` of the
+        variance.
         """
         along_y, along_x = (_line_modes(size, length, share) for size in weights.shape)
         shares = weights / weights.sum()

@@ -248,10 +248,7 @@ class Budget:
     ) -> tuple[
         dict[str, ErrorEstimate], dict[str, ErrorEstimate], dict[str, float], tuple[str, ...]
     ]:
-        """Return stated effects, sensitivities, sizes, and the names of assumed effects.
-
-        Effects, sensitivities and sizes are by the names of the effects.
-        """
+        """Return stated effects, sensitivities, sizes, all by name, and which were assumed."""
         prepared = self._prepared.in_units()
         shot = SolvedShot(
             displacement=displacement,

@@ -275,12 +275,9 @@ class ErrorBudget:
         return replace(self, beam=beam, effects=effects, assumed=assumed, sampled=sampled)
 
     def condition(self, share: float) -> Condition | None:
-        """Return the condition on assumed parts; None if a small total takes more than that.
+        """Return the condition on assumed parts for a total of at most a share of the displacement.
 
-        Parameters
-        ----------
-        share : float
-            Largest total of the displacement (r.m.s.).
+        Both are r.m.s. None if a total that small takes more than these parts.
         """
         if not self.rms > 0:
             return None
@@ -336,17 +333,10 @@ class ErrorBudget:
         return f"{measured.limit} and {self._title(largest)} (assumed, {self.share_text})"
 
     def measure_next(self, share: float) -> str:
-        """Return what has to be known better for a total of at most `share`, and that total.
+        """Return what has to be known better for a total of at most a share of the displacement.
 
-        Parameters
-        ----------
-        share : float
-            Of the displacement (r.m.s.).
-
-        Returns
-        -------
-        str
-            Such as "the beam known to 0.5 % for errors of 12 %"; empty if the total is no larger.
+        Both are r.m.s. The text has that total, as in "the beam known to 0.5 % for errors of 12 %";
+        it is empty if the total is no larger.
         """
         if not self.rms > 0:
             return ""

@@ -493,13 +493,7 @@ class Inversion(Summarised):
         return replace(self, errors=errors, report=report)
 
     def with_cautions(self, cautions: Iterable[Caution]) -> Inversion:
-        """Return the same inversion with more cautions in its report.
-
-        Parameters
-        ----------
-        cautions : iterable of Caution
-            To be appended.
-        """
+        """Return the same inversion with more cautions in its report, after its own."""
         report = replace(self.report, cautions=(*self.report.cautions, *cautions))
         return replace(self, report=report)
 
@@ -553,13 +547,7 @@ class Inversion(Summarised):
     @classmethod
     @as_input_errors("the result")
     def from_dataset(cls, dataset: xarray.Dataset) -> Inversion:
-        """Rebuild an inversion from the dataset of `to_dataset`.
-
-        Raises
-        ------
-        InputError
-            If a variable or attribute is missing or damaged.
-        """
+        """Rebuild an inversion from its dataset; an `InputError` if a part is missing or wrong."""
         attributes = "options", "instrument", "report"
         refuse_missing(dataset, "result of an inversion", VARIABLES, attributes)
         arrays: dict[str, Any] = {name: numbers_of(dataset, name) for name in VARIABLES}

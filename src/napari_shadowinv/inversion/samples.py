@@ -232,10 +232,7 @@ def plan_of(
     *,
     measured: bool,
 ) -> SitePlan:
-    """Return the plan of one level with given sites, (n, 2), px of the source.
-
-    A `measured` source was recorded.
-    """
+    """Return the plan of one level with sites, (n, 2), px of a source that was recorded or not."""
     width = margin_around(source.shape, options) if options.boundary == "free" else 0
     region = [(-0.5, -0.5), tuple(side + 2 * width - 0.5 for side in source.shape)]
     triangulation = RegularTriangulation(sites + width, region=region)

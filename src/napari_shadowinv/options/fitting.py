@@ -62,10 +62,7 @@ def _any_of(names: Iterable[str]) -> str:
 class FitOptions(CheckedModel, allow_inf_nan=False):
     """Choices of a fit; all have a default that suits most images.
 
-    Raises
-    ------
-    InputError
-        If a value is out of range or a name is unknown.
+    An `InputError` if a value is out of range or a name is unknown.
 
     Examples
     --------
@@ -178,11 +175,8 @@ Noise = Annotated[KindOfNoise | float, BeforeValidator(_parse_noise)]
 class FitChoices(CheckedModel, allow_inf_nan=False):
     """Unknowns of a fit, and knowledge about its images.
 
-    Raises
-    ------
-    InputError
-        If a value is out of range, a name is unknown, or the point spread is
-        given both in px and in m.
+    An `InputError` if a value is out of range, a name is unknown, or the point spread is given both
+    in px and in m.
 
     Examples
     --------

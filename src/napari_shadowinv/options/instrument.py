@@ -258,12 +258,8 @@ class Instrument(CheckedModel, allow_inf_nan=False):
     def beam_of(self, *, measured: bool, source: FloatArray | None = None) -> BeamPrior:
         """Return the prior of the beam, assumed unless stated.
 
-        Parameters
-        ----------
-        measured : bool
-            Whether the source was recorded.
-        source : ndarray, optional
-            That source, 0 where masked: a uniform one is the beam itself, not a record of it.
+        A source that was `measured` is a record of the beam; a uniform one, 0 where masked, is the
+        beam itself.
         """
         default = (REFERENCE_BEAM if measured else ASSUMED_BEAM).rms
         if measured and source is not None and not np.ptp(source[source != 0]) > 0:

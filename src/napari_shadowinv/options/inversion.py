@@ -28,10 +28,7 @@ _RARE: Any = {"rare": True}
 class InversionOptions(CheckedModel, allow_inf_nan=False):
     """Choices of an inversion; all have a default that suits most images.
 
-    Raises
-    ------
-    InputError
-        If a value is out of range or a name is unknown.
+    An `InputError` if a value is out of range or a name is unknown.
 
     Examples
     --------
@@ -208,14 +205,7 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
     def paper(cls, **changes: Any) -> InversionOptions:
         """Make the choices of the paper: 50 Lloyd steps, L-BFGS in one stage, centroids.
 
-        Parameters
-        ----------
-        **changes
-            Options to set otherwise.
-
-        Returns
-        -------
-        InversionOptions
+        The changes are options to set otherwise.
 
         References
         ----------

@@ -378,8 +378,6 @@ def displacement_from_potential(potential: ArrayLike) -> FloatArray:
     Takes the normalised potential in px², shape (H, W); returns px, shape (2, H, W), of second
     order up to the border. An `InputError` if the potential is no plane, or smaller than 3 × 3.
 
-    Examples
-    --------
     >>> displacement_from_potential(np.tile(np.arange(4.0) ** 2, (3, 1)))[1, 0, 1:]
     array([-2., -4., -6.])
     """
@@ -427,8 +425,6 @@ def geometry_text(setup: BeamSetup, shape: tuple[int, int] | None = None) -> str
 
     Without the shape of the image, the size of a pixel takes the place of the field of view.
 
-    Examples
-    --------
     >>> from napari_shadowinv.physics.setup import ProtonSetup
     >>> lengths = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2}
     >>> geometry_text(ProtonSetup(energy=14.7, pixel_size=1.5e-6, **lengths), (200, 200))
@@ -463,8 +459,6 @@ def setup_cautions(
     Without the shape of the image in px, the field of view is not checked. Its metadata may have
     the ``geometry`` in its file and the factor of its ``bin``.
 
-    Examples
-    --------
     >>> from napari_shadowinv.physics.setup import ProtonSetup
     >>> lengths = {"source_object_distance": 0.28, "object_image_distance": 0.01}
     >>> (caution,) = setup_cautions(ProtonSetup(energy=14.7, pixel_size=1e-6, **lengths))

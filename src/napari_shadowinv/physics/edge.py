@@ -155,8 +155,6 @@ def edge_doubt(error: float, others: float, largest: float, sides: Sequence[str]
     large move a field at the edge by chance. Errors up to `largest` need no words; the sides are of
     `SIDES`.
 
-    Examples
-    --------
     >>> edge_doubt(0.4, 0.1, 0.05, ["left", "right"])[:80]
     '40 % of the displacement (r.m.s.) rests on what lies beyond the left and right e'
     >>> edge_doubt(0.4, 0.3, 0.05, ["left"])
@@ -173,8 +171,6 @@ def edge_doubt(error: float, others: float, largest: float, sides: Sequence[str]
 def beyond_sides(sides: Sequence[str]) -> str:
     """Return in words where an object goes on.
 
-    Examples
-    --------
     >>> beyond_sides(["top", "left"]), beyond_sides(SIDES)
     ('beyond the top and left edges', 'beyond the image, on all sides')
     """

@@ -190,9 +190,9 @@ def displacement_ratio(
 def default_deflector(recorded_with: Setup, setup: Setup) -> str:
     """Return the default cause of the deflection.
 
-    It is a magnetic field for particles, and a refractive index for light of the same wavelength,
-    for which a plasma gives the same result. An `InputError` is raised if the wavelengths differ,
-    or if one experiment uses particles and the other light.
+    A magnetic field for particles, and a refractive index for light of the same wavelength, for
+    which a plasma gives the same result. An `InputError` if the wavelengths differ, or one
+    experiment uses particles and the other light.
     """
     _require_same_kind(recorded_with, setup)
     return setup.default_deflector(recorded_with)

@@ -40,8 +40,6 @@ def deviation_along(displacement: FloatArray, std: FloatArray) -> FloatArray:
     The errors of its components count as independent, to first order. 0 where the displacement is
     0, for which there is no direction.
 
-    Examples
-    --------
     >>> deviation_along(np.array([3.0, 4.0]), np.array([0.5, 0.5])).item()
     0.5
     """
@@ -58,8 +56,6 @@ def significance(displacement: FloatArray, std: FloatArray) -> FloatArray:
     displacement is 0; infinite where it is not, but has no error; NaN where it, or its error, is
     NaN.
 
-    Examples
-    --------
     >>> significance(np.array([3.0, 4.0]), np.array([0.5, 0.5])).item()
     10.0
     """

@@ -304,8 +304,7 @@ def traced_displacement(
 ) -> FloatArray:
     """Return the displacement, (2, H, W) in px, of the ray through each pixel, without an image.
 
-    Takes the arguments of `trace`, and raises its errors; also an `InputError` if a ray misses the
-    detector.
+    Takes the arguments of `trace`, and raises its errors; also if a ray misses the detector.
     """
     check_particles(setup)
     size, threads = checked_shape(shape), usable_threads(None)
