@@ -7,6 +7,7 @@
 - two masks together: `join_masks`; enough usable pixels: `check_usable`
 - size of a pixel by the coordinates: `coordinate_spacing`
 - blocks of a plane: `block_sums`, `block_means`, `complete_block_means`
+- noise by differences of neighbouring pixels: `estimated_noise`, `finest_differences`
 - places of values in their order: `order_by_value`; their `checksum`
 
 Everything else, dask arrays included, passes through untouched.
@@ -280,6 +281,24 @@ def block_means(values: FloatArray, block: int) -> FloatArray:
     """Return means over square blocks; incomplete ones at the far edges are mirrored."""
     padding = [(0, -side % block) for side in values.shape]
     return complete_block_means(np.pad(values, padding, mode="symmetric"), block)
+
+
+def finest_differences(values: FloatArray, used: BoolArray) -> FloatArray:
+    """Return |a - b - c + d| / 2 of four neighbours each, of those that are all used."""
+    if not used.any():
+        return np.zeros(1)
+    finest = values[1:, 1:] - values[1:, :-1]
+    finest -= values[:-1, 1:]
+    finest += values[:-1, :-1]
+    finest /= 2
+    np.abs(finest, out=finest)
+    return finest.ravel() if used.all() else finest[used]
+
+
+def estimated_noise(image: FloatArray, used: BoolArray) -> float:
+    """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
+    all_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
+    return float(NORMAL_MAD * np.median(finest_differences(image, all_used)))
 
 
 def order_by_value(values: FloatArray) -> AnyArray:

@@ -20,6 +20,7 @@ from napari_shadowinv._system.arrays import (
     check_plane,
     check_shape,
     check_usable,
+    estimated_noise,
     join_masks,
     plain_array,
     unpack_array,
@@ -46,7 +47,6 @@ from napari_shadowinv.fitting.shots import (
 )
 from napari_shadowinv.fitting.unknowns import Fiducials
 from napari_shadowinv.instrument.shapes import Around
-from napari_shadowinv.inversion.noise import estimated_noise
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,

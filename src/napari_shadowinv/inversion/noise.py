@@ -26,7 +26,12 @@ from functools import lru_cache
 import numpy as np
 from scipy import ndimage
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, complete_block_means, order_by_value
+from napari_shadowinv._system.arrays import (
+    NORMAL_MAD,
+    complete_block_means,
+    finest_differences,
+    order_by_value,
+)
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.options import InversionOptions
@@ -281,24 +286,6 @@ class ImageNoise:
         mean = max(mean - math.log(max(self.grain, 1.0)) / (2 * math.pi), deviation)
         level *= math.sqrt(self.clumping)
         return level * math.sqrt(mean), level * math.sqrt(mean + _DEVIATIONS * deviation)
-
-
-def finest_differences(values: FloatArray, used: BoolArray) -> FloatArray:
-    """Return |a - b - c + d| / 2 of four neighbours each, of those that are all used."""
-    if not used.any():
-        return np.zeros(1)
-    finest = values[1:, 1:] - values[1:, :-1]
-    finest -= values[:-1, 1:]
-    finest += values[:-1, :-1]
-    finest /= 2
-    np.abs(finest, out=finest)
-    return finest.ravel() if used.all() else finest[used]
-
-
-def estimated_noise(image: FloatArray, used: BoolArray) -> float:
-    """Return the standard deviation of an image's noise, from neighbouring pixels' differences."""
-    all_used = used[1:, 1:] & used[1:, :-1] & used[:-1, 1:] & used[:-1, :-1]
-    return float(NORMAL_MAD * np.median(finest_differences(image, all_used)))
 
 
 def _rms(values: FloatArray) -> float:

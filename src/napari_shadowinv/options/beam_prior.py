@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr
 
 from napari_shadowinv._system.arrays import (
-    NORMAL_MAD,
     block_means,
     check_finite,
     check_plane,
     check_shape,
+    estimated_noise,
 )
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
@@ -143,7 +143,7 @@ class BeamPrior(CheckedModel, allow_inf_nan=False):
         weights = level / level.sum()
         bright = level > _DIMMEST * level.mean()
         ratios = np.where(bright, coarse / np.where(bright, level, 1.0) - 1, 0.0)
-        noises = [_noise_variance(ratio, bright) for ratio in ratios]
+        noises = [estimated_noise(ratio, bright) ** 2 for ratio in ratios]
         noise = float(np.mean(noises))
         rows = (np.sqrt(weights) * ratios).reshape(len(beams), -1)
         _, strengths, shapes = np.linalg.svd(rows, full_matrices=False)
@@ -196,14 +196,6 @@ def _normalise(images: Iterable[ArrayLike]) -> list[FloatArray]:
             "from their differences"
         )
     return beams
-
-
-def _noise_variance(ratio: FloatArray, bright: Any) -> float:
-    finest = (ratio[1:, 1:] - ratio[1:, :-1] - ratio[:-1, 1:] + ratio[:-1, :-1]) / 2
-    used = bright[1:, 1:] & bright[1:, :-1] & bright[:-1, 1:] & bright[:-1, :-1]
-    if not used.any():
-        return 0.0
-    return float((NORMAL_MAD * np.median(np.abs(finest[used]))) ** 2)
 
 
 def _share_beyond(rows: FloatArray, noise: float) -> float:

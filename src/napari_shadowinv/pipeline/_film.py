@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from napari_shadowinv._system.arrays import estimated_noise
 from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.tables import read_rows
@@ -42,7 +43,6 @@ from napari_shadowinv.film.scans import (
 )
 from napari_shadowinv.film.unfolding import ResponseMatrix, unfold
 from napari_shadowinv.film_doses import FilmDoses
-from napari_shadowinv.inversion.noise import estimated_noise
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.images import INCH_M, Scan, read_scan
 from napari_shadowinv.pipeline.inversion_run import picture_mask
