@@ -47,6 +47,7 @@ from napari_shadowinv.fitting.shots import (
 )
 from napari_shadowinv.fitting.unknowns import Fiducials
 from napari_shadowinv.instrument.shapes import Around
+from napari_shadowinv.inversion.normalise import are_alike, check_source
 from napari_shadowinv.options import (
     KINDS_OF_NOISE,
     MAX_STRENGTH,
@@ -55,7 +56,7 @@ from napari_shadowinv.options import (
     FitOptions,
     Instrument,
 )
-from napari_shadowinv.physics.projection import transferred_displacement
+from napari_shadowinv.physics.projection import displacement_ratio
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.shot import Shot
 
@@ -372,13 +373,9 @@ def strengths_of(
                 f"object, the first of {first.object_pixel_size * 1e6:.6g} µm: bring all images "
                 "to the same pixels first"
             )
-    block = np.ones((2, 4, 4))
     return np.array(
         [
-            [
-                transferred_displacement(block, first, setup, deflector=titles[field])[0, 0, 0]
-                for field in fields
-            ]
+            [displacement_ratio(first, setup, deflector=titles[field]) for field in fields]
             for setup in setups
         ]
     )
@@ -415,7 +412,10 @@ def _checked_planes(
     if sources is not None:
         unpacked = [unpack_array(source, "source") for source in sources]
         masks = [join_masks(mask, lit) for mask, (_, lit) in zip(masks, unpacked, strict=True)]
-        beams = np.array([_checked_source(beam, data.shape[1:]) for beam, _ in unpacked])
+        checked = [check_source(source) for source, _ in unpacked]
+        for source in checked:
+            check_shape("source", source.shape, data.shape[1:])
+        beams = np.array(checked)
     used = np.array(masks)
     for name, image, plane in zip(names, data, used, strict=True):
         bad = int((~np.isfinite(image) & plane).sum())
@@ -432,16 +432,6 @@ def _checked_planes(
         if not image[plane].mean() > 0:
             raise InputError(f"{name} has no flux: expected a beam; check its background")
     return data, beams, used
-
-
-def _checked_source(source: Any, shape: tuple[int, ...]) -> FloatArray:
-    beam = as_numbers("source", check_plane(source, "source"))
-    check_shape("source", beam.shape, shape)
-    if not np.isfinite(beam).all() or beam.min() < 0 or not beam.any():
-        raise InputError(
-            "source has pixels that are negative or not finite, or no flux: expected a beam"
-        )
-    return beam
 
 
 def _common_noise(noises: Sequence[Any] | None) -> Any:
@@ -497,28 +487,16 @@ def _refuse_what_is_given_twice(
     names: Sequence[str],
 ) -> None:
     for k, (image, beam, use) in enumerate(zip(data, beams, used, strict=True)):
-        if strengths[k].any() and _are_alike(image[use], beam[use]):
+        if strengths[k].any() and are_alike(image, beam, use):
             raise InputError(
                 f"the source is {names[k]} itself, so that nothing would have deflected: give "
                 "an image of the beam without the object"
             )
         for earlier in range(k):
-            both = use & used[earlier]
-            if _are_alike(image[both], data[earlier][both]):
+            if are_alike(image, data[earlier], use & used[earlier]):
                 raise InputError(
                     f"{names[earlier]} and {names[k]} are the same: give each image once"
                 )
-
-
-def _are_alike(first: FloatArray, second: FloatArray, rounding: float = 1e-6) -> bool:
-    """Whether two images are the same but for a factor and rounding to 32 bits, and not flat."""
-    if not first.size or first.mean() <= 0 or second.mean() <= 0:
-        return False
-    first_relative, second_relative = first / first.mean(), second / second.mean()
-    return bool(
-        np.abs(first_relative - second_relative).max() <= rounding
-        and np.ptp(first_relative) > 2 * rounding
-    )
 
 
 def _means(planes: FloatArray, used: BoolArray) -> FloatArray:

@@ -85,7 +85,7 @@ def prepare(
         beam = np.where(usable, values.sum() / usable.sum(), 0.0)
     else:
         beam = np.array(check_source(source, usable))
-        if _is_same_pattern(values, beam, usable):
+        if are_alike(values, beam, usable):
             raise InputError(
                 "the source is the image itself, so the deflection would be zero: give an image "
                 "of the beam without the object, or an estimate of it"
@@ -184,10 +184,14 @@ def flooring_for(
     return apply_floor
 
 
-def _is_same_pattern(image: FloatArray, beam: FloatArray, usable: BoolArray) -> bool:
-    """Return whether an image is a structured beam, up to a factor and rounding to 32 bits."""
-    used = [values.ravel() if usable.all() else values[usable] for values in (image, beam)]
+def are_alike(first: FloatArray, second: FloatArray, usable: BoolArray) -> bool:
+    """Return whether images with structure are the same but for a factor and 32-bit rounding."""
+    if not usable.any():
+        return False
+    used = [values.ravel() if usable.all() else values[usable] for values in (first, second)]
     means = [values.mean() for values in used]
+    if min(means) <= 0:
+        return False
     for step in (_SAMPLE_STEP, 1):  # images that differ do so in a few samples already
         relative = [values[::step] / mean for values, mean in zip(used, means, strict=True)]
         if not np.abs(relative[1] - relative[0]).max() <= _MAX_ROUNDING:
