@@ -270,7 +270,7 @@ def test_beams_are_fitted_as_uneven_as_is_assumed_of_their_source() -> None:
         known = {"strength": STRENGTHS, "noise": NOISE, "source": source}
         data = collect_data(shots_of(shots(), **known), options=FEW)
         assert data.beam.rms == rms
-        assert [part.key for part in data.scene.imperfect.parts] == ["beam"] * (rms > 0)
+        assert [*data.scene.imperfect.parts] == ["beam"] * (rms > 0)
         assert data.common
 
 

@@ -85,7 +85,8 @@ class Scene(PriorTerms):
         other = self.imperfect.other_strengths
         if other is None:
             return self.strengths
-        return self.strengths + unknowns.common[self.imperfect.place("other_field")] * other
+        place = self.imperfect.parts["other_field"].places
+        return self.strengths + unknowns.common[place] * other
 
     def potentials(self, unknowns: Unknowns) -> FloatArray:
         """Return the coefficients of each image's own potential, shape (L, …)."""
@@ -248,7 +249,7 @@ class Scene(PriorTerms):
 
     def _response_numbers(self) -> Iterator[tuple[Part, int]]:
         """The imperfection of each number of `response_units`, and its image."""
-        for part in self.imperfect.parts:
+        for part in self.imperfect.parts.values():
             if part.key in self.imperfect.of_response:
                 for k in range(1 if part.is_common else len(self.images)):
                     yield part, k
@@ -281,9 +282,8 @@ class Scene(PriorTerms):
             spread = rays if isinstance(self.psf[k], float) else _spread(rays, self.psf[k])
             wider = self._inner(widening(spread, variance + extra))
             derivatives["blur"] = imperfect.blur * slope * wider
-        effects = _Effects(
-            (part, derivatives[part.key]) for part in imperfect.parts if part.key in derivatives
-        )
+        parts = imperfect.parts.items()
+        effects = _Effects((part, derivatives[key]) for key, part in parts if key in derivatives)
         return _Seen(image, slope, effects)
 
     def _variance(self, k: int) -> float:
@@ -318,7 +318,7 @@ class Scene(PriorTerms):
             slope.frames[k] += each.frame
             if other is not None:
                 along = np.einsum("m,myx,yx->", other[k], unknowns.potentials, each.potential)
-                slope.common[self.imperfect.place("other_field")] += along
+                slope.common[self.imperfect.parts["other_field"].places] += along
         if entering:
             of_logarithm = np.stack([each.beam for each in pulls])
             of_logarithm = of_logarithm * np.stack([each.light for each in entering])
@@ -474,7 +474,7 @@ class Linear:
         strengths = self.scene.strengths_with(self.unknowns)
         changes = _sums_of_fields(strengths, change.potentials)
         if imperfect.other_strengths is not None:
-            other = change.common[imperfect.place("other_field")] * imperfect.other_strengths
+            other = change.common[imperfect.parts["other_field"].places] * imperfect.other_strengths
             changes += _sums_of_fields(other, self.unknowns.potentials)
         return changes
 

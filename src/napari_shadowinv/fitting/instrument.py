@@ -55,8 +55,8 @@ class Imperfect:
     shapes: tuple[Shapes, ...] = ()  # changes of a scene's beams
 
     @cached_property
-    def parts(self) -> tuple[Part, ...]:
-        """All imperfections, with the places of their numbers."""
+    def parts(self) -> dict[str, Part]:
+        """All imperfections by their keys, with the places of their numbers."""
         sizes = [
             *((each.key, each.is_common, int(each.key in self.responses)) for each in RESPONSES),
             ("blur", True, int(self.blur > 0)),
@@ -64,18 +64,19 @@ class Imperfect:
         ]
         sizes.sort(key=lambda each: not each[1])
         sizes += ((each.key, each.is_common, len(each)) for each in self.shapes)
-        parts, ends = [], {True: 0, False: 0}
+        parts, ends = dict[str, Part](), {True: 0, False: 0}
         for key, is_common, size in sizes:
             begin, ends[is_common] = ends[is_common], ends[is_common] + size
             if size:
-                parts.append(Part(key, is_common, slice(begin, ends[is_common])))
-        return tuple(parts)
+                parts[key] = Part(key, is_common, slice(begin, ends[is_common]))
+        return parts
 
     @property
     def counts(self) -> tuple[int, int]:
         """How many numbers are common, and how many each image has."""
+        parts = self.parts.values()
         common, separate = (
-            max((part.places.stop for part in self.parts if part.is_common is kind), default=0)
+            max((part.places.stop for part in parts if part.is_common is kind), default=0)
             for kind in (True, False)
         )
         return common, separate
@@ -83,7 +84,7 @@ class Imperfect:
     @property
     def keys(self) -> frozenset[str]:
         """The imperfections."""
-        return frozenset(part.key for part in self.parts)
+        return frozenset(self.parts)
 
     @property
     def of_response(self) -> frozenset[str]:
@@ -106,14 +107,11 @@ class Imperfect:
         adapted = unknowns._replace(
             common=np.zeros(common), separate=np.zeros((len(unknowns.separate), separate))
         )
-        places = {part.key: part for part in before.parts}
-        for part in self.parts:
-            numbers = part.of(adapted.common, adapted.separate)
-            if part.key not in places:
-                continue
-            known = places[part.key].of(unknowns.common, unknowns.separate)
+        for key in self.keys & before.keys:
+            numbers = self.parts[key].of(adapted.common, adapted.separate)
+            known = before.parts[key].of(unknowns.common, unknowns.separate)
             if known.shape == numbers.shape:
-                numbers[...] = known * before.size(part.key) / self.size(part.key)
+                numbers[...] = known * before.size(key) / self.size(key)
         return adapted
 
     def size(self, key: str) -> float:
@@ -123,15 +121,14 @@ class Imperfect:
 
     def variance(self, common: FloatArray) -> float:
         """Return what adds to the variance of the point spread, px²."""
-        return self.blur * float(common[self.place("blur")][0]) if self.blur else 0.0
+        return self.blur * float(common[self.parts["blur"].places][0]) if self.blur else 0.0
 
     def detector(
         self, common: FloatArray, separate: FloatArray
     ) -> Iterator[tuple[Part, PixelResponse, float, float]]:
         """Yield each response of an image in the order of the light, with its size and number."""
-        places = {part.key: part for part in self.parts}
         for each in RESPONSES:
-            if part := places.get(each.key):
+            if part := self.parts.get(each.key):
                 number = float(part.of(common, separate)[0])
                 yield part, each, self.responses[each.key], number
 
@@ -168,12 +165,7 @@ class Imperfect:
 
     def shape_parts(self) -> Iterator[tuple[Part, Shapes]]:
         """Yield the changes of beams, with the places of their numbers."""
-        places = {part.key: part for part in self.parts}
-        return ((places[each.key], each) for each in self.shapes if each.key in places)
-
-    def place(self, key: str) -> slice | None:
-        """Return the places of an imperfection's numbers; None if it is exact."""
-        return next((part.places for part in self.parts if part.key == key), None)
+        return ((self.parts[each.key], each) for each in self.shapes if each.key in self.parts)
 
 
 EXACT = Imperfect()
@@ -202,7 +194,7 @@ def numbers_in_units(
     units = {"blur": imperfect.blur, **imperfect.responses}
     shapes = {each.key: each for each in imperfect.shapes}
     report = {}
-    for part in imperfect.parts:
+    for part in imperfect.parts.values():
         values, *spread = (
             np.atleast_2d(part.of(each.common, each.separate)) for each in (unknowns, *changes)
         )

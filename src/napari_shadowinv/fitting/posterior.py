@@ -225,7 +225,7 @@ class Posterior:
         if scene.spread is not None:
             units = np.stack([unit.flat() for unit in scene.response_units()])
             return numbers.like(np.einsum("n,nx->x", scene.spread @ normal, units))
-        for part in scene.imperfect.parts:
+        for part in scene.imperfect.parts.values():
             if part.key in scene.held:
                 block = part.of(numbers.common, numbers.separate)
                 block[...] = self._rng.normal(size=block.shape)
@@ -293,7 +293,7 @@ class Posterior:
 
         def effects_in(change: Unknowns) -> dict[str, Unknowns]:
             numbers: dict[str, Unknowns] = {}
-            for part in self.scene.imperfect.parts:
+            for part in self.scene.imperfect.parts.values():
                 # A change of all beams is common, or one of each.
                 key = "beam" if part.key == "beam_between" else part.key
                 moved = numbers.setdefault(key, change.zeros())
@@ -323,7 +323,7 @@ class Posterior:
         scene, counts = self.scene, self._counts
         slope = scene.value_and_gradient(self._unknowns, counts)[1] if asked else none
         pulls, squares, slopes = {}, [], []
-        for part in scene.imperfect.parts:
+        for part in scene.imperfect.parts.values():
             numbers = self._unknowns.zeros()
             width = part.places.stop - part.places.start
             block = part.of(numbers.common, numbers.separate)

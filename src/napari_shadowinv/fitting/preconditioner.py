@@ -203,7 +203,7 @@ def _number_scales(scene: Scene) -> tuple[FloatArray, FloatArray]:
     shapes = {each.key: each for each in imperfect.shapes}
     sides = zip(scene.beams.shape[1:], weights.shape[1:], strict=True)
     around = [(scene.pad, beams - scene.pad - image) for beams, image in sides]
-    for part in imperfect.parts:
+    for part in imperfect.parts.values():
         if part.key in shapes:
             curvature = np.stack(
                 [shapes[part.key].squares(np.pad(each, around)) for each in weights]

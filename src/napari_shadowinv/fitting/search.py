@@ -218,7 +218,7 @@ def estimate_smoothness(
             return scene, end
     else:
         # How rough a field is hardly depends on numbers that all images share.
-        shared = {part.key for part in scene.imperfect.parts if part.is_common}
+        shared = {part.key for part in scene.imperfect.parts.values() if part.is_common}
         free, scene = scene.held, replace(scene, held=scene.held | shared)
         end = settle_minimum(scene, end, on_step, limits=_ROUGH)
         smoothness, end = _likely_smoothness(scene, end, rng, on_step)
