@@ -49,6 +49,7 @@ class SideFit:
     """Search for films on the bed, and for lines along their sides; lengths in px."""
 
     brightness: float = 0.75  # of a film, over the bed's, in the film's darkest colour
+    least: float = 0.02  # area of a film, of the scan's
     dust: int = 2
     ends: float = 0.08  # of a side, where it does not count: corners are cut and bent
     offset: float = 0.04  # of the film's size, from a side to its border
@@ -88,26 +89,21 @@ class BurnCheck:
     margin: int = MarkCheck.margin
 
 
-def find_films(
-    scan: ArrayLike, *, least_side: float | None = None, sides: SideFit = SideFit()
-) -> list[FloatArray]:
+def find_films(scan: ArrayLike, sides: SideFit = SideFit()) -> list[FloatArray]:
     """Return the corners, (4, 2), of the films on a scan, row by row as one reads.
 
-    The scan, (H, W, 3), has films on a bright bed, none of which touches another. The smaller side
-    of the smallest film is `least_side` px, by default a seventh of the scan's. Corners are those
-    of straight lines along the sides; chips and notches do not count. An `InputError` if there is
-    no film, or the scan has no colours.
+    The scan, (H, W, 3), has films on a bright bed, none of which touches another, or is smaller
+    than a seventh of the scan's sides. Corners are those of straight lines along the sides; chips
+    and notches do not count. An `InputError` if there is no film, or the scan has no colours.
     """
     values = checked_scan(scan)
     darkest = values.min(axis=-1)
     dark = darkest < sides.brightness * np.percentile(darkest, 99.0)
     inside = ndimage.binary_opening(dark, np.ones((3, 3)), iterations=sides.dust)
-    height, width = dark.shape
-    area = 0.02 * height * width if least_side is None else least_side**2
     labels, _ = ndimage.label(inside)
     sizes = np.bincount(labels.ravel())
     boxes = enumerate(ndimage.find_objects(labels), 1)
-    films = [(number, box) for number, box in boxes if sizes[number] >= area]
+    films = [(number, box) for number, box in boxes if sizes[number] >= sides.least * dark.size]
     if not films:
         raise InputError(
             "no film was found on the scan: expected films darker than a bright bed around them; "

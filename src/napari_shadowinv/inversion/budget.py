@@ -127,7 +127,7 @@ class Budget:
         self._plan, self._prepared = plan, prepared
         self._is_shift_assumed = is_shift_assumed
         self._noise, self.options = noise, options
-        self.instrument = instrument if plan.measured else instrument.without_reference()
+        self.instrument = instrument if plan.measured else instrument.with_registration(0.0)
         if self._beam.components is not None:
             self._beam.components.check_shape(prepared.mask.shape)
         self._places = _places(prepared)

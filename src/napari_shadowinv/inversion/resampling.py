@@ -296,7 +296,7 @@ def instrument_draws(
 ) -> InstrumentDraws | None:
     """Return the imperfections to be drawn; None if the instrument is exact."""
     if not measured:
-        instrument = instrument.without_reference()
+        instrument = instrument.with_registration(0.0)
     beam = instrument.beam_of(measured=measured, source=shot.source)
     if errors.beam_variation != beam.rms:  # more was seen
         beam = BeamPrior(rms=min(errors.beam_variation, _MAX_BEAM_RMS), length=beam.length)

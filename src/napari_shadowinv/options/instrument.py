@@ -237,12 +237,8 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         """Whether anything is stated that changes an image."""
         return bool(self.stated.keys() - {"energy", "noise_correlation"})
 
-    def without_reference(self) -> Self:
-        """Return the instrument for an estimated source, which is in register with its image."""
-        return self.with_registration(0.0)
-
     def with_registration(self, error: float) -> Self:
-        """Return the instrument for a source in register to within an error, px."""
+        """Return the instrument for a source in register to within an error, px; 0 if estimated."""
         return self.model_copy(update={"registration": error})
 
     def with_beam(self, beam: BeamPrior) -> Instrument:
