@@ -5,11 +5,11 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from napari_shadowinv.errors import InputError
 
@@ -160,6 +160,12 @@ def validate(
         return model_class.model_validate(mapping)
     except ValidationError as error:
         raise FieldError(model_class, error, where, names) from error
+
+
+@cache
+def schema_of(content_class: type) -> TypeAdapter[Any]:
+    """Return pydantic's schema of a dataclass, to check what a file has of it."""
+    return TypeAdapter(content_class)
 
 
 def map_paths(model: Model, move: Callable[[Path], Path]) -> Model:

@@ -6,13 +6,12 @@ import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydantic import TypeAdapter
 
 from napari_shadowinv._system.safety import as_input_errors
+from napari_shadowinv._system.validation import schema_of
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import (
@@ -511,18 +510,13 @@ class Fit(Summarised):
                 advice=str(attributes["advice"]),
                 explanation=str(attributes["explanation"]),
             ),
-            report=_report_schema().validate_python(json.loads(attributes["report"])),
+            report=schema_of(FitReport).validate_python(json.loads(attributes["report"])),
             options=FitOptions.model_validate_json(attributes["options"]),
             instrument=Instrument.model_validate_json(attributes["instrument"]),
             setups=_setups(dataset),
             provenance=Provenance.of(attributes, dataset.variables),
             noise=_noise(dataset),
         )
-
-
-@cache
-def _report_schema() -> TypeAdapter[FitReport]:
-    return TypeAdapter(FitReport)
 
 
 def _image_facts(fit: Fit, names: Sequence[str]) -> Iterator[Fact]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from pydantic import ConfigDict, TypeAdapter
+from pydantic import ConfigDict
 
+from napari_shadowinv._system.validation import schema_of
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import limit_text, percent, round_down, to_figures
@@ -156,7 +156,7 @@ class ErrorBudget:
         content: Mapping[str, Any], causes: Iterable[str], per_pixel: FloatArray | None
     ) -> ErrorBudget:
         """Return the budget of a dict by `to_dict`, with the values of pixels."""
-        budget = _schema().validate_python(content)
+        budget: ErrorBudget = schema_of(ErrorBudget).validate_python(content)
         return replace(budget, per_pixel=per_pixel, causes=tuple(map(str, causes)))
 
     @property
@@ -491,11 +491,6 @@ class ErrorBudget:
 def per_pixel_of(errors: ErrorBudget | None) -> FloatArray | None:
     """Return the standard deviation of the displacement in every pixel, if it is known."""
     return None if errors is None else errors.per_pixel
-
-
-@cache
-def _schema() -> TypeAdapter[ErrorBudget]:
-    return TypeAdapter(ErrorBudget)
 
 
 def root_of(square: float, square_at_peak: float) -> ErrorEstimate:

@@ -6,15 +6,14 @@ import dataclasses
 import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import TypeAdapter
 
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import as_input_errors
+from napari_shadowinv._system.validation import schema_of
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
@@ -558,7 +557,7 @@ class Inversion(Summarised):
         return cls(
             **arrays,
             cells=cells,
-            report=_report_schema().validate_python(content),
+            report=schema_of(Report).validate_python(content),
             options=InversionOptions.model_validate_json(dataset.attrs["options"]),
             instrument=Instrument.model_validate_json(dataset.attrs["instrument"]),
             setup=setup_from_dataset(dataset),
@@ -602,11 +601,6 @@ def _by_total(case: Inversion) -> Assessment:
 
 def _is_of_cells(name: str) -> bool:
     return "site" in VARIABLES[name][0]
-
-
-@cache
-def _report_schema() -> TypeAdapter[Report]:
-    return TypeAdapter(Report)
 
 
 def _errors_in(dataset: xarray.Dataset) -> ErrorBudget | None:
