@@ -20,7 +20,7 @@ class NoiseMatch:
 
     factors: FloatArray  # (L,), variance as used over that given or estimated from single pixels
     expected_chi2: FloatArray  # (L,), variance of a pixel over the one that is used
-    correlation: float  # standard deviation of the Gaussian that has blurred the noise, px
+    correlation: float  # of the Gaussian that has blurred the noise, px; 0 for white noise
     is_estimated: bool
 
     def relative_chi2(self, chi2: FloatArray) -> FloatArray:

@@ -57,7 +57,7 @@ class RayModel:
     pad: int = 12  # width, even, of the strip around the image from which rays may enter, px
     beyond: int = 0  # width of a strip around the image that is evaluated, too, px
     spacing: float = 0.25  # largest distance between landing points of neighbouring rays, px
-    threads: int | None = None
+    threads: int | None = None  # all cores
 
     @property
     def _at_rest(self) -> int:

@@ -96,7 +96,7 @@ class Evidence:
     pattern: Pattern  # in the residuals
     jacobian: FloatArray  # (H, W), determinant of the map to the image where it is folded most
     single: bool  # one image, or several with the same information
-    beam_unknown: bool
+    beam_unknown: bool  # it is fitted, too
     hidden: float  # as `hidden_contrast` returns it
     searched: bool = True  # whether the fit has started from several fields
     noise: NoiseMatch | None = None
