@@ -49,7 +49,7 @@ def test_a_name_or_an_ending_means_one_format() -> None:
 
 @pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)
 def test_its_functions_exist(each: Format) -> None:
-    roles = (each.test, each.reader, each.named_reader, each.counter, each.default)
+    roles = (each.test, each.reader, each.named_reader, each.counter, each.lister)
     roles += (each.image_writer, each.result_writer)
     assert all(callable(function(name)) for name in roles if name)
     assert bool(each.reader or each.named_reader) == bool(each.title)  # what can be read is listed

@@ -234,7 +234,7 @@ def test_why_arrays_are_no_images(tmp_path):
         file["names"] = np.full((2, 2), b"a")
         file["elsewhere"] = h5py.ExternalLink("other.h5", "/data")
         file["times"] = np.arange(3.0)
-    with pytest.raises(FileFormatError, match="with no image") as error:
+    with pytest.raises(FileFormatError, match="has no image") as error:
         read(path)
     for words in ("complex", "compound", "text", "in another file, 'other.h5'"):
         assert words in str(error.value)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,9 @@ from napari_shadowinv.io.hdf5 import (
     check_arrays,
     load_dataset,
     member,
-    members,
     open_hdf5,
     plain_value,
+    walk,
 )
 from napari_shadowinv.physics.field_grid import AXES, FieldGrid, field_grid
 
@@ -44,7 +45,7 @@ def is_field_grid(path: Path) -> bool:
     with open_hdf5(path) as content:
         return "openPMD" in content.attrs or any(
             _COMPONENT.fullmatch(name) and getattr(item, "ndim", 0) >= len(AXES)
-            for name, item in members(content)
+            for name, item in takewhile(lambda entry: "/" not in entry[0], walk(content))
         )
 
 

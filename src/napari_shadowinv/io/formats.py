@@ -41,8 +41,7 @@ class Format:
     # Of a path, and the name of an array if it is known: the lengths of the axes that count frames.
     # The readers then take the number of a frame, by default that of the first.
     counter: str = ""
-    default: str = ""  # of a path: the name of the array that is read without one
-    lister: str = ""  # of a path: the names of all images that it may hold
+    lister: str = ""  # of a path: the names of the images in it, and all arrays
     image_writer: str = ""  # of a path, an image and its pixel size (m) or None
     result_writer: str = ""  # of a path and a dataset
     results: tuple[ResultKind, ...] = ()  # kinds of the results that it writes
@@ -55,12 +54,13 @@ class Format:
 
     def array_name(self, path: Path, variable: str | None) -> str | None:
         """Return the name of the array that is read, if arrays have names."""
-        named = variable is not None or not self.default
-        return variable if named else function(self.default)(path)
+        if variable is not None or not self.lister:
+            return variable
+        return str(function("arrays:only_image")(path, *function(self.lister)(path)))
 
     def image_names(self, path: Path) -> list[str]:
         """Return the names of the images in a file; none where they have no names."""
-        return function(self.lister)(path) if self.lister else []
+        return function(self.lister)(path)[0] if self.lister else []
 
     def read(self, path: Path, variable: str | None = None, number: int | None = None) -> Any:
         """Return the content of a file, one of its arrays, or one of the frames; see `reader`.
@@ -82,7 +82,7 @@ class Format:
 
     def count_frames(self, path: Path, variable: str | None = None) -> tuple[int, ...]:
         """Return the lengths of the axes that count frames; none if the file holds one image."""
-        if not self.counter or (variable is not None and not self.named_reader):
+        if not self.counter or (variable is None) == bool(self.named_reader):
             return ()
         axes = function(self.counter)(path, *(() if variable is None else (variable,)))
         return axes if isinstance(axes, tuple) else (axes,)
@@ -126,8 +126,7 @@ NPY = Format(
 )
 MATLAB = Format(
     "mat", (".mat",), "MATLAB", ((0, b"MATLAB"),), test="matlab:is_matlab",
-    reader="matlab:read_mat", named_reader="matlab:read_mat", counter="matlab:count_mat",
-    lister="matlab:image_names",
+    lister="matlab:list_images", named_reader="matlab:read_mat", counter="matlab:count_mat",
 )
 PCO = Format("b16", (".b16",), "PCO .b16", ((0, b"PCO-"), (0, b"pco-")), reader="cameras:read_b16")
 RESULT = Format(
@@ -145,7 +144,7 @@ PRADFORMAT = Format(
 )
 HDF5 = Format(
     "hdf5", (*PRADFORMAT.suffixes, ".hdf", ".nxs", ".nx5", ".cxi", ".nc"), "HDF5 (NeXus, NetCDF 4)",
-    _HDF5, default="hdf5_arrays:default_array", lister="hdf5_arrays:image_names",
+    _HDF5, lister="hdf5_arrays:list_images",
     named_reader="hdf5_arrays:read_plane", counter="hdf5_arrays:count_frames",
 )
 CPSA = Format(

@@ -1,6 +1,6 @@
 """Structure of HDF5 files; images in them are in `hdf5_arrays`.
 
-- `open_hdf5`; an item, `member`, or all of a group, `members`; its values, `load_dataset`, and an
+- `open_hdf5`; an item, `member`, or all of a file, `walk`; its values, `load_dataset`, and an
   attribute, `plain_value`
 - refuse a file whose arrays are elsewhere or too large: `check_arrays`
 - write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
@@ -12,7 +12,9 @@ reader follows them, because the content of another file would pass for the file
 from __future__ import annotations
 
 import hashlib
+import math
 import os
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
@@ -75,13 +77,33 @@ def plain_value(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def members(group: Any) -> Iterator[tuple[str, Any]]:
-    """Yield names and items of a group, except items in other files."""
+def walk(file: Any, most_visits: float = math.inf) -> Iterator[tuple[str, Any]]:
+    """Yield names and items of a file once each, from the top down.
+
+    An item in another file is the name of that file.
+    """
     import h5py
 
-    for name in group:
-        if group.id.links.get_info(name.encode()).type == h5py.h5l.TYPE_HARD:
-            yield name, group[name]
+    groups, addresses, visited = deque([("", file)]), set(), 0
+    while groups:
+        prefix, group = groups.popleft()
+        for name in group:
+            visited += 1
+            if visited > most_visits:
+                return
+            link = group.id.links.get_info(name.encode())
+            if link.type == h5py.h5l.TYPE_EXTERNAL:
+                target = group.id.links.get_val(name.encode())[0]
+                yield f"{prefix}{name}", target.decode(errors="replace")
+            if link.type != h5py.h5l.TYPE_HARD:
+                continue
+            item = group[name]
+            address = h5py.h5o.get_info(item.id).addr
+            if address not in addresses:
+                addresses.add(address)
+                yield f"{prefix}{name}", item
+                if isinstance(item, h5py.Group):
+                    groups.append((f"{prefix}{name}/", item))
 
 
 def load_dataset(path: Path, dataset: Any) -> AnyArray:
@@ -139,24 +161,18 @@ def stored_elsewhere(dataset: Any) -> str:
 
 def check_arrays(path: Path) -> None:
     """Refuse a file whose arrays are in other files or do not fit into memory together."""
-    total = 0
-    with open_hdf5(path) as file:
-        for dataset in _iterate_datasets(path, file):
-            total = check_array(path, dataset, dataset.size, total)
-            # The length of a dimension without coordinates is an array without values.
-            if dataset.id.get_storage_size() or "CLASS" not in dataset.attrs:
-                _check_promise(path, dataset)
-
-
-def _iterate_datasets(path: Path, group: Any) -> Iterator[Any]:
     import h5py
 
-    for name in group:
-        item = member(path, group, name)
-        if isinstance(item, h5py.Dataset):
-            yield item
-        elif isinstance(item, h5py.Group):
-            yield from _iterate_datasets(path, item)
+    total = 0
+    with open_hdf5(path) as file:
+        for name, item in walk(file):
+            if isinstance(item, str):
+                _refuse_other_file(path, name, f"links to {item!r}")
+            if isinstance(item, h5py.Dataset):
+                total = check_array(path, item, item.size, total)
+                # The length of a dimension without coordinates is an array without values.
+                if item.id.get_storage_size() or "CLASS" not in item.attrs:
+                    _check_promise(path, item)
 
 
 @contextmanager

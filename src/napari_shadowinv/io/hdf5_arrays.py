@@ -2,26 +2,31 @@
 
 - an array, or one of its frames: `read_hdf5`; as an image with all that the file says of it:
   `read_plane`
-- the number of frames: `count_frames`; the array to take without a name: `default_array`
-- the choice, for messages: `list_arrays`; all arrays: `list_sizes`
+- the number of frames: `count_frames`
+- the names of images: `list_images`; of all arrays: `list_sizes`
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from napari_shadowinv._system.safety import as_file_errors, check_regular
-from napari_shadowinv._system.validation import nearest
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.arrays import FRAME_INDEX, frame_axes, frame_number
+from napari_shadowinv.io.arrays import (
+    ONE_AXIS,
+    ArrayEntry,
+    find_array,
+    frame_axes,
+    frame_number,
+    list_arrays,
+)
 from napari_shadowinv.io.conventions import (
     decode_values,
     is_of_matlab,
@@ -36,9 +41,9 @@ from napari_shadowinv.io.hdf5 import (
     open_hdf5,
     plain_value,
     stored_elsewhere,
+    walk,
 )
 
-_ONE_AXIS = "1 axis"
 _DEFAULTS = ("signal", "default")  # attributes of a NeXus group: its array, or the group to look in
 _KINDS = {"c": "complex", "S": "text", "U": "text", "O": "text or references", "V": "compound"}
 
@@ -65,10 +70,8 @@ def read_plane(path: Path, name: str, number: int = 0) -> tuple[AnyArray, dict[s
 
 
 @as_file_errors
-def count_frames(path: Path, name: str | None = None) -> tuple[int, ...]:
+def count_frames(path: Path, name: str) -> tuple[int, ...]:
     """Return the lengths of the axes before the last two of an array; none if it is one image."""
-    if name is None:
-        return ()
     with open_hdf5(path) as file:
         dataset, number = _find_array(path, file, name)
         axes = frame_axes(path, repr(name), dataset.shape)
@@ -76,34 +79,21 @@ def count_frames(path: Path, name: str | None = None) -> tuple[int, ...]:
 
 
 @as_file_errors
-def default_array(path: Path) -> str:
-    """Return the name of the array that NeXus shows by default, or of the only image."""
+def list_images(path: Path) -> tuple[list[str], list[ArrayEntry]]:
+    """Return the names of all images, or of the one that NeXus shows by default; and all arrays."""
+    check_regular(path, "an HDF5 file")
     if is_field_grid(path):
         raise FileFormatError(
             f"{path} holds fields on a grid, not an image: trace particles through them with "
             "shadowinv forward, or name one array of it"
         )
-    names = image_names(path)
-    if len(names) == 1:
-        return names[0]
-    count = f"{len(names)} images" if names else "no image"
     with open_hdf5(path) as file:
-        raise FileFormatError(
-            f"{path} is an HDF5 file with {count}: expected one, or the name of one, as "
-            f"{path.name}::/name; it holds {list_arrays(file)}"
-        )
-
-
-@as_file_errors
-def image_names(path: Path) -> list[str]:
-    """Return the name of the image that NeXus shows by default, or those of all images."""
-    check_regular(path, "an HDF5 file")
-    with open_hdf5(path) as file:
+        entries = list(_entries(file))
         default = _member_or_default(path, file, "/")
         if default is not None and not _reason(default):
-            return [str(default.name)]
-        names = [entry.name for entry in _objects(file) if not entry.reason]
-        return [name for name in names if not name.endswith("pixel_mask")]
+            return [str(default.name)], entries
+    names = [entry.name for entry in entries if not entry.reason]
+    return [name for name in names if not name.endswith("pixel_mask")], entries
 
 
 def _stored(path: Path, dataset: Any, number: int | None) -> AnyArray:
@@ -127,21 +117,15 @@ def _stored(path: Path, dataset: Any, number: int | None) -> AnyArray:
 
 def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
     """Return an array by its name, and the number of the frame that the name ends with."""
-    item = _member_or_default(path, file, name)
-    frame = FRAME_INDEX.fullmatch(name) if item is None else None
-    if frame is not None:
-        item = _member_or_default(path, file, frame["name"])
-    if item is None:
-        images = [each.name for each in _objects(file) if not each.reason]
-        similar = nearest(name.strip("/"), images)
-        hint = f"did you mean {similar!r}? " if similar else ""
-        raise InputError(f"{path} has no array {name!r}: {hint}it holds {list_arrays(file)}")
+    item, frame = find_array(
+        path, name, lambda text: _member_or_default(path, file, text), _entries(file)
+    )
     if item.dtype.kind not in "buif" or not item.shape:
         raise InputError(
             f"{path} holds {name!r} as {_KINDS.get(item.dtype.kind, 'one number')}: expected an "
-            f"array of real numbers; the file holds {list_arrays(file)}"
+            f"array of real numbers; the file holds {list_arrays(_entries(file))}"
         )
-    return item, None if frame is None else frame_number(path, frame, item.shape[:-2])
+    return item, frame_number(path, frame, item.shape[:-2])
 
 
 def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
@@ -167,64 +151,22 @@ def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:
     return all(chunk.byte_offset is not None for chunk in chunks)
 
 
-class _HDF5Object(NamedTuple):
-    """An array in a file, and the reason why it is no image; empty if it is one."""
-
-    name: str
-    size: str  # shape and type
-    reason: str
-
-    def __str__(self) -> str:
-        notes = ", ".join(filter(None, (self.size, self.reason)))
-        return f"{self.name!r} ({notes})"
-
-
 @as_file_errors
 def list_sizes(path: Path, *, most: int = 40) -> list[tuple[str, str]]:
     """Return the names of the first arrays, and their shapes and types."""
     with open_hdf5(path) as file:
-        return [(each.name, each.size) for each in itertools.islice(_objects(file), most)]
+        return [(each.name, each.size) for each in itertools.islice(_entries(file), most)]
 
 
-def list_arrays(file: Any, *, most: int = 8) -> str:
-    """Describe the first arrays of an open file, images first."""
-    entries = list(_objects(file))
-    entries.sort(key=lambda entry: (bool(entry.reason), entry.reason == _ONE_AXIS))
-    # Times and names are no choice where there are images.
-    count = sum(entry.reason != _ONE_AXIS for entry in entries) or len(entries)
-    names = [str(entry) for entry in entries[: min(count, most)]]
-    more = [f"and {count - most} more"] if count > most else []
-    return ", ".join([*names, *more]) or "no array"
-
-
-def _objects(file: Any, most_visits: int = 10_000) -> Iterator[_HDF5Object]:
-    """Yield the arrays of a file once each, from the top down; others' files are not followed."""
-    import h5py
-
-    groups, addresses, visited = deque([("", file)]), set(), 0
-    while groups:
-        prefix, group = groups.popleft()
-        for name in group:
-            if name.startswith("#"):  # MATLAB's own
-                continue
-            visited += 1
-            if visited > most_visits:
-                return
-            link = group.id.links.get_info(name.encode())
-            if link.type == h5py.h5l.TYPE_EXTERNAL:
-                target = group.id.links.get_val(name.encode())[0].decode(errors="replace")
-                yield _HDF5Object(f"{prefix}{name}", "", f"in another file, {target!r}")
-            if link.type != h5py.h5l.TYPE_HARD:
-                continue
-            item = group[name]
-            address = h5py.h5o.get_info(item.id).addr
-            if address in addresses:
-                continue
-            addresses.add(address)
-            if isinstance(item, h5py.Group):
-                groups.append((f"{prefix}{name}/", item))
-            elif isinstance(item, h5py.Dataset) and item.shape:
-                yield _HDF5Object(f"{prefix}{name}", _size_text(item), _reason(item))
+def _entries(file: Any, most_visits: int = 10_000) -> Iterator[ArrayEntry]:
+    """Yield the arrays of a file from the top down."""
+    for name, item in walk(file, most_visits):
+        if "#" in (part[:1] for part in name.split("/")):  # MATLAB's own
+            continue
+        if isinstance(item, str):
+            yield ArrayEntry(name, "", f"in another file, {item!r}")
+        elif getattr(item, "shape", ()):
+            yield ArrayEntry(name, _size_text(item), _reason(item))
 
 
 def _size_text(dataset: Any) -> str:
@@ -235,13 +177,13 @@ def _size_text(dataset: Any) -> str:
 def _reason(dataset: Any) -> str:
     """Say why an array is no image; empty if it is one."""
     if dataset.ndim < 2:
-        return _ONE_AXIS
+        return ONE_AXIS
     if dataset.dtype.kind in _KINDS:
         return _KINDS[dataset.dtype.kind]
     if 0 in dataset.shape or "MATLAB_empty" in dataset.attrs:
         return "empty"
     if is_of_matlab(dataset) and min(dataset.shape[-2:]) < 2:
-        return _ONE_AXIS
+        return ONE_AXIS
     is_triple = dataset.ndim == 3 and dataset.shape[0] == 3
     if is_of_matlab(dataset) and is_triple and dataset.dtype == np.uint8:
         return "a picture in colour"

@@ -1,7 +1,7 @@
 """MATLAB's own MAT-files, version 5 to 7, by scipy; those of 7.3 are HDF5, see `hdf5_arrays`.
 
-- the one image of a file, or the variable that the user names: `read_mat`; its frames: `count_mat`
-- the names of its images: `image_names`; MATLAB's own layout or HDF5: `is_matlab`
+- an image by its name: `read_mat`; its frames: `count_mat`; the names of all: `list_images`
+- MATLAB's own layout or HDF5: `is_matlab`
 
 References
 ----------
@@ -21,7 +21,13 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.io.arrays import FRAME_INDEX, frame_number
+from napari_shadowinv.io.arrays import (
+    ONE_AXIS,
+    ArrayEntry,
+    find_array,
+    frame_number,
+    list_arrays,
+)
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 
 _DTYPES = {"double": "f8", "single": "f4", "logical": "?"}
@@ -41,13 +47,16 @@ class _Variable(NamedTuple):
     type: str
 
     @property
-    def is_image(self) -> bool:
-        # Scalars and vectors beside the image do not count, nor do pictures in colour.
-        is_colour = self.type == "uint8" and self.shape[2:] == (3,)
-        return self.type in _DTYPES and min(self.shape[:2], default=0) >= 2 and not is_colour
-
-    def __str__(self) -> str:
-        return f"'{self.name}' ({'×'.join(map(str, self.shape))} {self.type})"
+    def entry(self) -> ArrayEntry:
+        """What it is; scalars, vectors and pictures in colour are no images."""
+        reason = ""
+        if self.type not in _DTYPES:
+            reason = "no numbers"
+        elif min(self.shape[:2], default=0) < 2:
+            reason = "empty" if 0 in self.shape else ONE_AXIS
+        elif self.type == "uint8" and self.shape[2:] == (3,):
+            reason = "a picture in colour"
+        return ArrayEntry(self.name, f"{'×'.join(map(str, self.shape))} {self.type}", reason)
 
 
 def is_matlab(path: Path) -> bool:
@@ -59,16 +68,11 @@ def is_matlab(path: Path) -> bool:
     return not is_73 and not h5py.is_hdf5(path)
 
 
-def read_mat(
-    path: Path, variable: str | None = None, number: int = 0
-) -> tuple[AnyArray, dict[str, Any]]:
-    """Read the only image of a MAT-file, or the named one.
-
-    Axes after the first two count frames; ``name[3]`` is one of them, and `number` counts over all.
-    """
+def read_mat(path: Path, name: str, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
+    """Read an image, or frame `number` over the axes after the first two."""
     from scipy.io import loadmat
 
-    chosen, frame_in_name = _choose_image(path, variable)
+    chosen, frame_in_name = _find_image(path, name)
     axes = chosen.shape[2:]
     number = number if frame_in_name is None else frame_in_name
     promised = 8 * math.prod(chosen.shape)
@@ -77,8 +81,8 @@ def read_mat(
     array = np.asarray(loadmat(path, variable_names=[chosen.name])[chosen.name])
     if array.dtype.kind not in "buif" or array.shape != chosen.shape:
         raise FileFormatError(
-            f"{path} holds {chosen} as {array.dtype} values of shape {array.shape}: expected a "
-            "plane of whole or real numbers; take its real part or modulus, and save that"
+            f"{path} holds {chosen.entry} as {array.dtype} values of shape {array.shape}: expected "
+            "a plane of whole or real numbers; take its real part or modulus, and save that"
         )
     place: Any = (slice(None), slice(None), *np.unravel_index(number, axes)) if axes else ...
     # Whole numbers are stored in as few bytes as they need.
@@ -87,16 +91,17 @@ def read_mat(
 
 
 @as_file_errors
-def count_mat(path: Path, variable: str | None = None) -> tuple[int, ...]:
+def count_mat(path: Path, name: str) -> tuple[int, ...]:
     """Return the lengths of the axes after the first two of an array; none for one frame of it."""
-    chosen, number = _choose_image(path, variable)
+    chosen, number = _find_image(path, name)
     return chosen.shape[2:] if number is None else ()
 
 
 @as_file_errors
-def image_names(path: Path) -> list[str]:
-    """Return the names of all images in a MAT-file."""
-    return [variable.name for variable in _variables(path) if variable.is_image]
+def list_images(path: Path) -> tuple[list[str], list[ArrayEntry]]:
+    """Return the names of all images, and all arrays."""
+    entries = [each.entry for each in _variables(path)]
+    return [each.name for each in entries if not each.reason], entries
 
 
 def _variables(path: Path) -> list[_Variable]:
@@ -106,26 +111,17 @@ def _variables(path: Path) -> list[_Variable]:
     return [_Variable(*each) for each in whosmat(path)]
 
 
-def _choose_image(path: Path, address: str | None) -> tuple[_Variable, int | None]:
-    """Return the only image or the named one, and the frame that the name ends with."""
-    match = FRAME_INDEX.fullmatch(address or "")
-    name = (match["name"] if match else address or "").lstrip("/")
-    variables = _variables(path)
-    content = ", ".join(map(str, variables)) or "nothing"
-    images = [each for each in variables if each.is_image and name in ("", each.name)]
-    if name and not images:
-        raise InputError(f"{path} has no numeric plane {name!r}: it holds {content}")
-    if not images:
-        raise FileFormatError(
-            f"{path} holds {content}: expected a numeric array (height, width); save the image as "
-            "a variable of its own"
-        )
-    if len(images) > 1:
+def _find_image(path: Path, name: str) -> tuple[_Variable, int | None]:
+    """Return an image by its name, and the number of the frame that the name ends with."""
+    variables = {each.name: each for each in _variables(path)}
+    entries = [each.entry for each in variables.values()]
+    chosen, frame = find_array(path, name, lambda text: variables.get(text.lstrip("/")), entries)
+    if chosen.entry.reason:
         raise InputError(
-            f"{path} holds {len(images)} images: expected one, or the name of one, as "
-            f"{path.name}::{images[0].name}; it holds {', '.join(map(str, images))}"
+            f"{path} holds {chosen.name!r} as {chosen.entry.reason}: expected an image of real "
+            f"numbers; the file holds {list_arrays(entries)}"
         )
-    return images[0], None if match is None else frame_number(path, match, images[0].shape[2:])
+    return chosen, frame_number(path, frame, chosen.shape[2:])
 
 
 def _check_elements(path: Path, preamble: int = 1024) -> None:
