@@ -1,8 +1,8 @@
 """Pictures, one plane each.
 
 - PNG, BMP and JPEG: `read_picture`
-- what every format of pictures has in common: `check_picture`, `without_pixels`, `geometry_of`,
-  `square_cautions`, `gamma_caution`
+- what every format of pictures has in common: `as_picture`, `geometry_of`, `square_cautions`,
+  `gamma_caution`
 - colour images: reduction to one plane (`to_grey`), signs of a film scan (`film_cautions`)
 - scans of film in colour: `read_scan`
 """
@@ -27,7 +27,6 @@ CHANNELS = ("red", "green", "blue", "mean")
 
 INCH_M = 0.0254
 _MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "I", "I;16", "I;16B", "F"}  # pillow's
-TURNED_NOTE = "turned upright as the file says"
 
 
 def to_grey(array: AnyArray, channel: str | int | None, where: str | Path) -> FloatArray:
@@ -86,15 +85,7 @@ class Scan(NamedTuple):
 
 @as_file_errors
 def read_scan(path: Path) -> Scan:
-    """Read a colour scan of film in its own dtype.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is missing or cannot be read.
-    InputError
-        If it has no colours.
-    """
+    """Read a colour scan of film in its own dtype; an `InputError` refuses one without colours."""
     file_format = format_of(path)
     content = file_format.read(path) if file_format.is_scan else None
     if not isinstance(content, tuple) or content[0].ndim != 3 or content[0].shape[-1] != 3:
@@ -103,32 +94,37 @@ def read_scan(path: Path) -> Scan:
     return Scan(pixels, metadata.get("stated_pixel_size"), sha256(path))
 
 
-def check_picture(path: Path, name: str, array: AnyArray) -> None:
-    """Refuse an array that is no picture."""
+def as_picture(
+    path: Path,
+    name: str,
+    array: AnyArray,
+    missing: BoolArray | None,
+    orientation: Any,
+    notes: tuple[str, ...] = (),
+) -> tuple[AnyArray, dict[str, Any]]:
+    """Return pixels as they are seen, NaN where they are missing; with their mask and notes.
+
+    The `orientation` is that of Exif and TIFF. Refuses an array that is no picture.
+    """
     is_picture = array.ndim == 2 or (array.ndim == 3 and array.shape[-1] in (2, 3, 4))
     if not is_picture or array.size == 0:
         raise FileFormatError(
             f"{path} holds a {name} array of shape {array.shape}: expected one picture, "
             "(height, width) or with 3 or 4 colour channels last; save one plane"
         )
-
-
-def without_pixels(array: AnyArray, missing: BoolArray | None) -> AnyArray:
-    """Return an array with NaN at missing pixels."""
-    if missing is None or not missing.any():
-        return array
-    values = array.astype(np.float64)
-    values[missing] = np.nan
-    return values
-
-
-def gaps_in(array: AnyArray) -> dict[str, Any]:
-    """Return the mask of a picture with pixels without a value, and a note on them."""
-    missing = np.isnan(array) if array.ndim == 2 else np.isnan(array).any(axis=-1)
-    if not missing.any():
-        return {}
-    note = f"{missing.sum()} pixels without a value in the file are left out"
-    return {"mask": ~missing, "notes": (note,)}
+    if missing is not None and missing.any():
+        array = array.astype(np.float64)
+        array[missing] = np.nan
+    if orientation in range(2, 9):
+        array = array.swapaxes(0, 1) if orientation >= 5 else array
+        down, right = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
+        array = array[:: -1 if down else 1, :: -1 if right else 1]
+        notes = (*notes, "turned upright as the file says")
+    gaps = np.isnan(array) if array.ndim == 2 else np.isnan(array).any(axis=-1)
+    if not gaps.any():
+        return array, {"notes": notes}
+    note = f"{gaps.sum()} pixels without a value in the file are left out"
+    return array, {"mask": ~gaps, "notes": (*notes, note)}
 
 
 def geometry_of(
@@ -140,10 +136,8 @@ def geometry_of(
 ) -> dict[str, Any]:
     """Return a file's size of a pixel (m) as metadata, and as geometry unless it may be a default.
 
-    Picture programs write resolutions up to 300 per inch, `least_printed`, without knowing it.
-
-    `is_length` says whether the file means a length and no resolution of printing. `is_drawn` is
-    true of this package's own images, whose pixels are those at the object.
+    Picture programs write resolutions up to 300 per inch, `least_printed`, without knowing it; not
+    so if the file means a length, or is drawn by this package, for pixels at the object.
     """
     if not sides or square_cautions(sides):
         return {}
@@ -194,7 +188,7 @@ def read_png(path: Path) -> tuple[AnyArray, dict[str, Any]]:
 
 def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Read a PNG, BMP or JPEG: upright, with NaN at transparent pixels."""
-    from PIL import ExifTags, Image, ImageOps
+    from PIL import ExifTags, Image
 
     # A file object, because pillow may believe the name.
     with path.open("rb") as file, Image.open(file) as picture:
@@ -207,19 +201,13 @@ def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
                 f"{path} holds pixels of the kind {picture.mode}, which are not proportional to "
                 "the light: expected grey or RGB; export it as 16-bit TIFF"
             )
-        is_turned = picture.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
-        array, missing = _pixels_and_gaps(ImageOps.exif_transpose(picture))
-        array = without_pixels(array, missing)
-        gaps, sides = gaps_in(array), _printed_sides(picture.info)
-        metadata = {
-            **gaps,
-            "notes": ((TURNED_NOTE,) * is_turned) + gaps.get("notes", ()),
-            "bits": 8 * max(1, array.dtype.itemsize),
-            "cautions": _light_cautions(picture.format, picture.info) + square_cautions(sides),
-            **geometry_of(sides, is_length=False),
-        }
-    check_picture(path, "picture's", array)
-    return array, metadata
+        orientation = picture.getexif().get(ExifTags.Base.Orientation, 1)
+        pixels, missing = _pixels_and_gaps(picture)
+        array, metadata = as_picture(path, "picture's", pixels, missing, orientation)
+        sides = _printed_sides(picture.info)
+        cautions = _light_cautions(picture.format, picture.info) + square_cautions(sides)
+    bits, size = 8 * max(1, array.dtype.itemsize), geometry_of(sides, is_length=False)
+    return array, {**metadata, "bits": bits, "cautions": cautions, **size}
 
 
 def _pixels_and_gaps(picture: Any) -> tuple[AnyArray, BoolArray | None]:

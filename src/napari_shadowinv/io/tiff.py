@@ -31,14 +31,11 @@ from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.files import DEFLATE_RATIO, check_promise
 from napari_shadowinv.io.images import (
     INCH_M,
-    TURNED_NOTE,
-    check_picture,
+    as_picture,
     gamma_caution,
-    gaps_in,
     geometry_of,
     is_linear_profile,
     square_cautions,
-    without_pixels,
 )
 
 _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
@@ -170,18 +167,15 @@ def read_tiff(path: Path, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
         if "S" in page.axes:
             array = np.moveaxis(array, page.axes.index("S"), -1)
         missing = _missing_pixels(page, array)
-        array, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
-        check_picture(path, "TIFF", array)
-        array, turned = _turn_upright(without_pixels(array, missing), _tag(tiff, page, 274))
-        (sides, is_length), gaps = _pixel_sides(tiff, page), gaps_in(array)
-        metadata = {
-            **gaps,
+        values, notes = _convert_values(path, tiff, page, _without_alpha(page, array))
+        array, metadata = as_picture(path, "TIFF", values, missing, _tag(tiff, page, 274), notes)
+        sides, is_length = _pixel_sides(tiff, page)
+        return array, {
+            **metadata,
             "bits": int(np.max(page.bitspersample)),
-            "notes": (*notes, *turned, *gaps.get("notes", ())),
             "cautions": _cautions(page, layout) + square_cautions(sides),
             **geometry_of(sides, is_length, is_drawn=page.software.startswith("shadowinv")),
         }
-    return array, metadata
 
 
 def _tag(tiff: Any, page: Any, number: int, default: Any = None, *, among: int = 1) -> Any:
@@ -294,15 +288,6 @@ def _calibrate(
     values = np.polynomial.polynomial.polyval(array.astype(np.float64), powers)
     text = " + ".join(f"{factor:g}·v^{power}" for power, factor in enumerate(powers) if factor)
     return values, (f"values calibrated by ImageJ: {text or 0}",)
-
-
-def _turn_upright(array: AnyArray, orientation: Any) -> tuple[AnyArray, tuple[str, ...]]:
-    """Return an array as it is seen, by the tag Orientation, and a note if it was stored else."""
-    if orientation not in range(2, 9):
-        return array, ()
-    turned = array.swapaxes(0, 1) if orientation >= 5 else array
-    down, right = orientation in (3, 4, 7, 8), orientation in (2, 3, 6, 7)
-    return turned[:: -1 if down else 1, :: -1 if right else 1], (TURNED_NOTE,)
 
 
 def _cautions(page: Any, layout: _Layout) -> tuple[Caution, ...]:
