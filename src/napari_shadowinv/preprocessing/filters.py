@@ -21,6 +21,7 @@ by exactly its gain.
 from __future__ import annotations
 
 from dataclasses import replace
+from numbers import Real
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -330,12 +331,10 @@ def remove_hot_pixels(
     ([[3, 5]], [[20, 0]])
     """
     values, _ = pixels.checked_pixels(image)
-    threshold = pixels.checked_number("threshold", threshold, above=0, unit="deviations")
-    size = pixels.checked_integer("size", size, least=3)
-    if size % 2 == 0:
-        raise InputError(
-            f"size is {size}, expected an odd number, so that the window is centred on a pixel"
-        )
+    if not (isinstance(threshold, Real) and 0 < threshold < np.inf):
+        raise InputError(f"threshold is {threshold!r}, expected a number of deviations above 0")
+    if size not in range(3, 100, 2):
+        raise InputError(f"size is {size!r}, expected an odd number from 3 to 99")
     local, bright, dark = _neighbours(values, size, Reporter(None, should_stop))
     difference = values - local
     limit = threshold * _noise(difference, local)

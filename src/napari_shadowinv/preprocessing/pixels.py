@@ -1,14 +1,11 @@
 """Images as numbers: checks of images and parameters, a robust polynomial fit, filled-in parts.
 
 - values and usable pixels of an image: `checked_pixels`; of a beam, which has flux: `beam_pixels`
-- one number or integer: `checked_number`, `checked_integer`
 - fit a polynomial: `fit_polynomial`
 - fill in, from the surroundings, the beam under an object: `with_filled_part`
 """
 
 from __future__ import annotations
-
-import operator
 
 import numpy as np
 import scipy
@@ -113,29 +110,6 @@ def checked_pixels(image: ArrayLike, mask: ArrayLike | None = None) -> tuple[Flo
     return values, usable
 
 
-def checked_number(name: str, value: float, *, above: float, unit: str) -> float:
-    """Return a finite number above a limit, or raise an `InputError`."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = np.nan
-    if not (np.isfinite(number) and number > above):
-        raise InputError(f"{name} is {value!r}, expected a number of {unit} above {above:g}")
-    return number
-
-
-def checked_integer(name: str, value: int, *, least: int, most: int | None = None) -> int:
-    """Return an integer within limits, or raise an `InputError`."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = least - 1
-    if number < least or (most is not None and number > most):
-        limits = f"at least {least}" if most is None else f"from {least} to {most}"
-        raise InputError(f"{name} is {value!r}, expected an integer {limits}")
-    return number
-
-
 def complete_blocks(mask: BoolArray, block: int, share: float = 0.999) -> BoolArray:
     """Return which blocks of pixels are usable, by a least share of their pixels."""
     return complete_block_means(mask, block) > share
@@ -203,7 +177,8 @@ def fit_polynomial(
         If image, mask or degree cannot be used, or usable pixels are fewer than coefficients.
     """
     values, usable = checked_pixels(image, mask)
-    degree = checked_integer("degree", degree, least=0, most=10)
+    if degree not in range(11):
+        raise InputError(f"degree is {degree!r}, expected a whole number from 0 to 10")
     terms = (degree + 1) * (degree + 2) // 2
     if usable.sum() < terms:
         raise InputError(
