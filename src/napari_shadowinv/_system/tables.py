@@ -45,16 +45,7 @@ class Table(NamedTuple):
 
 @as_file_errors
 def read_table(path: Path) -> Table:
-    """Read the column names and rows of a table.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read as a table.
-    InputError
-        If it has no rows, or one with more cells than there are columns; the message names the
-        line.
-    """
+    """Read a table; an `InputError` names the line with more cells than there are columns."""
     records = _records(path, small_text(path, _EXPECTED, "utf-8-sig"))
     _, names = next(records, (0, []))
     header = [name.lower() for name in _without_empty_end(names)]
@@ -80,24 +71,10 @@ def read_rows(
 ) -> dict[int, Model]:
     """Return the rows of a table as models, by their lines in the file.
 
-    Parameters
-    ----------
-    path : Path
-    model : type
-        Model of a row. Empty cells stand for its defaults, file names are relative to the folder
-        of the table.
-    columns : collection of str, optional
-        Names of the columns. Default: the model's fields.
-    shared : mapping, optional
-        Values of all rows where cells are empty.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read as a table.
-    InputError
-        If a column is unknown, missing or given twice, or a row is invalid; the message names the
-        line.
+    Empty cells stand for the values `shared` by all rows, or the model's defaults; file names are
+    relative to the folder of the table. Names of `columns` are by default those of the model's
+    fields. An `InputError` names an unknown, missing or repeated column, and the line of an invalid
+    row.
     """
     table = read_table(path)
     known = {name.lower(): name for name in columns or model.model_fields}

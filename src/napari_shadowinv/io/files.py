@@ -35,13 +35,7 @@ _CUT_SHORT = re.compile(r"\d+ requested and \d+ written")  # numpy's words where
 def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, str | None]:
     """Return the file of an image, and the name of the array that its path ends with.
 
-    Every path of an image that is opened, compared or checked goes through here, also one that is
-    written as ``file://localhost/data/run.h5``.
-
-    Examples
-    --------
-    >>> split_address("run.h5::/entry/data[3]")
-    (PosixPath('run.h5'), '/entry/data[3]')
+    Every path of an image goes through here, also one as ``file://localhost/data/run.h5``.
     """
     text = str(path)
     if not text:
@@ -101,15 +95,7 @@ def name_of(path: str | Path) -> str:
 
 
 def in_counting_order(paths: Iterable[Path]) -> list[Path]:
-    """Sort files folder by folder, with numbers in their names by value.
-
-    Case counts only between names that are otherwise equal.
-
-    Examples
-    --------
-    >>> [path.name for path in in_counting_order(map(Path, ["b2", "a10", "a9", "A1"]))]
-    ['A1', 'a9', 'a10', 'b2']
-    """
+    """Sort files folder by folder, with numbers in their names by value: A1, a9, a10, b2."""
     return sorted(paths, key=lambda path: ([_counting_key(part) for part in path.parts], path))
 
 

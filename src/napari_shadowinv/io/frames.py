@@ -120,30 +120,12 @@ def _files_in(folder: Path) -> list[Path]:
 def find_frames(
     path: str | Path, variable: str | None = None, *, numbered: bool = True
 ) -> list[FileFrame]:
-    """Return the frames of a TIFF, of an array of an HDF5 file, of a folder or of a pattern.
+    """Return the frames of a file, a folder of images, or a pattern such as ``shots/*.tif``.
 
-    Parameters
-    ----------
-    path : str or Path
-        A file, also as ``file.h5::/entry/data/data``, a folder of images, or a pattern such as
-        ``shots/*.tif``.
-    variable : str, optional
-        Name of the array in each HDF5 file, with its groups.
-    numbered : bool, optional
-        Whether frames can be read by their numbers. Otherwise each file is a frame.
-
-    Returns
-    -------
-    list of FileFrame
-        Without a number where a file holds one image. The files of a folder or pattern are opened
-        only to count the frames in their arrays.
-
-    Raises
-    ------
-    FileFormatError
-        If a file cannot be read, or a folder has no images.
-    InputError
-        If a file has no such array, or no file matches the pattern.
+    The `variable` is the array in each HDF5 file. Unless frames are `numbered`, each file is one;
+    one that holds a single image has no number. Files of a folder or pattern are opened only to
+    count the frames in their arrays. A `FileFormatError` says that a file cannot be read or a
+    folder has no image, an `InputError` that there is no such array, or no file.
     """
     file, variable = split_address(path, variable)
     if os.path.isdir(file):
@@ -192,19 +174,10 @@ def _frames_of_file(path: Path, variable: str | None = None) -> list[FileFrame]:
 
 
 def lazy_frames(frames: Sequence[FileFrame], read: Callable[[FileFrame], Shot]) -> xarray.Dataset:
-    """Describe frames as a dataset whose images dask reads on demand.
+    """Return ``image`` (shot, y, x), a chunk for each frame, whose frames dask reads on demand.
 
-    Parameters
-    ----------
-    frames : sequence of FileFrame
-    read : callable
-        Returns a frame. The first is read now.
-
-    Returns
-    -------
-    xarray.Dataset
-        ``image`` (shot, y, x), a chunk for each frame, and the coordinate ``name``; ``mask``
-        (y, x) if the first has one.
+    The first is read now; its ``mask`` is kept if it has one. The coordinate ``name`` is that of
+    the shot.
     """
     import xarray as xr
 

@@ -19,26 +19,11 @@ rcf/HDV2.tif. The burner's first file is the reference beam, the others are fram
 
 
 def fetch_public_file(name: str, *, cache: Path | None = None, timeout: float = 10.0) -> Path:
-    """Download a public file, unless it is in the cache already.
+    """Download one of the `PUBLIC_FILES`, unless the cache has it; return its path there.
 
-    Parameters
-    ----------
-    name : str
-        A name of `PUBLIC_FILES`.
-    cache : Path, optional
-        Folder in which the files are kept. Default: the user's cache folder.
-
-    Returns
-    -------
-    Path
-        The file in the cache.
-
-    Raises
-    ------
-    InputError
-        If the package pooch is missing.
-    OSError
-        If the file cannot be downloaded, or its checksum differs; nothing is kept then.
+    The cache is the user's by default. An `OSError` says why a file cannot be downloaded, or that
+    its checksum differs; nothing is kept then. An `InputError` says that the package pooch is
+    missing.
     """
     try:
         import pooch

@@ -104,19 +104,9 @@ def read_attributes(path: Path) -> dict[str, Any]:
 class StackStore:
     """Store of a run: the status and the report of each shot, and damage to files.
 
-    Parameters
-    ----------
-    path : Path
-    every_byte : bool, optional
-        Read all files to find damage. Otherwise damage within a field is noticed when the field is
-        read.
-
-    Attributes
-    ----------
-    field : str or None
-        The fitted field; None where shots were inverted.
-    columns : tuple of ShotColumn
-        The quantities that it lists of each shot.
+    With `every_byte`, all files are read to find damage; otherwise damage within a field is noticed
+    when the field is read. `field` is the fitted field, None where shots were inverted, and
+    `columns` are the quantities that it lists of each shot.
     """
 
     def __init__(self, path: Path, *, every_byte: bool = False) -> None:

@@ -19,26 +19,10 @@ if TYPE_CHECKING:
 
 
 def open_shots(path: Path, shots: str | None = None) -> xarray.Dataset:
-    """Open a store and select shots from it; only finished ones.
+    """Open a store as `read_stack` does, with only its finished shots among those chosen.
 
-    Parameters
-    ----------
-    path : Path
-        ``name.shadowinv.zarr``.
-    shots : str, optional
-        As of `parse_shots`. Default: all.
-
-    Returns
-    -------
-    xarray.Dataset
-        As of `read_stack`, with the number of each shot as the coordinate ``index``.
-
-    Raises
-    ------
-    InputError
-        If the text is wrong, or no shot of the selection is finished.
-    FileFormatError
-        If it is no store, or a shot of the selection is damaged.
+    The coordinate ``index`` is the number of each. An `InputError` refuses a selection without a
+    finished shot, a `FileFormatError` one with a damaged shot.
     """
     dataset = read_stack(path)
     count = dataset.sizes["shot"]
@@ -62,13 +46,7 @@ def open_shots(path: Path, shots: str | None = None) -> xarray.Dataset:
 
 
 def parse_shots(text: str, count: int) -> list[int]:
-    """Convert 3, 3:20, :10, ::5 or a list of these to numbers of `count` shots.
-
-    Raises
-    ------
-    InputError
-        If the text is none of these, or a number is too large.
-    """
+    """Convert 3, 3:20, :10, ::5 or a list of these to numbers of `count` shots."""
     selection: list[int] = []
     for part in text.split(","):
         try:

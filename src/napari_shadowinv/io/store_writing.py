@@ -136,15 +136,8 @@ def create_store(
 ) -> StackStore:
     """Create a store with all its shots pending; it appears completely or not at all.
 
-    The run must hold the store's lock.
-
-    Parameters
-    ----------
-    path : Path
-    empty : xarray.Dataset
-        The store without shots.
-    shots : mapping of str to ndarray
-        Coordinates of the shots, `OF_SHOTS`.
+    It holds the dataset `empty`, without shots, and the coordinates of the `shots`, `OF_SHOTS`. The
+    run must hold the store's lock.
     """
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")

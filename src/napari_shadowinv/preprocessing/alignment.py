@@ -97,18 +97,11 @@ class Shift:
 
 
 class RegisteredSource(NamedTuple):
-    """A source in register with an image.
+    """A source in register with an image, interpolated with cubic splines.
 
-    Attributes
-    ----------
-    source : ndarray, shape (H, W)
-        Interpolated with cubic splines.
-    error : float
-        Standard deviation of the shift that is left, px.
-    caution : Caution or None
-        If the source was moved further than was expected.
-    is_assumed : bool
-        Whether the error is the usual one, as nobody stated it and nothing shows the shift.
+    `error` is the standard deviation of the shift that is left, px, and assumed (`is_assumed`) if
+    nobody stated it and nothing shows the shift. The caution says that the source was moved further
+    than was expected.
     """
 
     source: FloatArray

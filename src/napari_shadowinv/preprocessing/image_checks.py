@@ -595,19 +595,9 @@ def _neighbour_covariance(first: FloatArray, second: FloatArray, usable: BoolArr
 def dark_level(planes: Sequence[CheckedImage], check: DarkLevelCheck = DarkLevelCheck()) -> float:
     """Estimate an offset that was left in an image, as a share of its mean, from its noise.
 
-    Parameters
-    ----------
-    planes : sequence of CheckedImage
-        The image, and the recorded beam, if any, in the same unit. It has an offset of its own, or
-        shares the image's.
-    check : DarkLevelCheck
-        Limits.
-
-    Returns
-    -------
-    float
-        0 unless the noise cannot be explained without an offset, by any sum of a constant
-        variance, one in proportion to the signal, and one to its square.
+    The recorded beam, if it is given, has an offset of its own, or shares the image's. It is 0
+    unless the noise cannot be explained without an offset, by any sum of a constant variance, one
+    in proportion to the signal, and one to its square.
     """
     if not all(plane.shows_noise for plane in planes):
         return 0.0
