@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from functools import partialmethod
 
 import dask
 import numpy as np
@@ -36,15 +35,6 @@ def test_the_setting_of_dask_is_the_default(night, out):
     assert len(names) == 7  # at the start, and after each shot
 
 
-def test_shots_are_told_one_by_one_in_whatever_portions_they_are_given(night, out, monkeypatch):
-    from napari_shadowinv.stack._run import StoreRun
-
-    monkeypatch.setattr(StoreRun, "run", partialmethod(StoreRun.run, portion=4))
-    ended = []
-    night.run(out, on_progress=lambda news: news.outcome and ended.append(news.outcome.index))
-    assert sorted(ended) == list(range(6))
-
-
 def test_a_killed_worker_process_ends_the_run_with_a_sentence(night, out, expected):
     np.save(night.path(3), night.images[3])
     with pytest.raises(RunInterruptedError, match="use fewer workers, then run again to resume"):
@@ -60,18 +50,16 @@ def children() -> set[int]:
 
 @pytest.mark.parametrize("scheduler", ["threads", "processes"])
 def test_a_run_that_is_stopped_ends_its_shots_and_workers(night, out, scheduler):
+    """Threads ask in the middle of a shot, processes are asked after each."""
     before = children()
     (night.folder / "hang.txt").write_text("shot_2")
+    (night.folder / "release").touch()
     hanging = night.folder / "hanging"
-
-    def should_stop() -> bool:
-        if hanging.exists():
-            (night.folder / "release").touch()
-        return hanging.exists()
-
     with pytest.raises(InversionCancelled, match="run again to resume"):
-        night.run(out, reader=hang_once, scheduler=scheduler, should_stop=should_stop, workers=1)
-    assert list(read(out).status.values[2:]) == [0] * 4
+        night.run(
+            out, reader=hang_once, scheduler=scheduler, should_stop=hanging.exists, workers=1
+        )
+    assert list(read(out).status.values[3:]) == [0] * 3
     assert not children() - before
     assert "shot" not in {thread.name.partition("_")[0] for thread in threading.enumerate()}
 

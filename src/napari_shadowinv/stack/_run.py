@@ -11,9 +11,8 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from itertools import islice
 from pathlib import Path
 from textwrap import shorten
 from typing import TYPE_CHECKING, Any
@@ -361,22 +360,20 @@ class StoreRun:
         should_stop: ShouldStop | None = None,
         *,
         keeps_results: bool = False,
-        portion: int = 1000,
     ) -> None:
         """Run shots by their numbers; `on_end` takes each outcome, and its result if asked for."""
         results: dict[int, Any] | None = {} if keeps_results else None
         workers = scheduler.workers and max(1, min(len(shots), scheduler.workers))
-        context = TaskContext(self.writer, task, workers, results)
         began = time.monotonic() - self._seconds
-        for first in range(0, len(shots), portion):
-            some = dict(islice(shots.items(), first, first + portion))
-            # Closed at once, if a report raises an error.
-            with closing(scheduler.outcomes(some, context, should_stop)) as outcomes:
-                for outcome in outcomes:
-                    self._ended += 1
-                    self._seconds = time.monotonic() - began
-                    self._note(outcome.index, outcome.status, outcome.reason, outcome.cautions)
-                    on_end(outcome, None if results is None else results.pop(outcome.index))
+
+        def end(outcome: ShotOutcome) -> None:
+            self._ended += 1
+            self._seconds = time.monotonic() - began
+            self._note(outcome.index, outcome.status, outcome.reason, outcome.cautions)
+            on_end(outcome, None if results is None else results.pop(outcome.index))
+
+        context = TaskContext(self.writer, task, workers, results)
+        scheduler.run(shots, context, end, should_stop or (lambda: False))
 
 
 def create(path: Path, stack: Stack, *, overwrite: bool) -> StackStore:

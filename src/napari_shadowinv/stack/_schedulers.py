@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-import queue
 import signal
 import sys
 import threading
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
@@ -40,7 +39,6 @@ from napari_shadowinv.stack._worker import (
 )
 
 _CONNECT_TIMEOUT_S = 10.0
-_POLL_S = 0.25  # between two looks at `should_stop`
 _STOPPED = "stopped on request; run again to resume"
 
 
@@ -59,53 +57,51 @@ class Scheduler:
         self._get, self._pool = get, pool
         self._stop = threading.Event() if stop is None else stop
 
-    def outcomes(
+    def run(
         self,
         shots: Mapping[int, Exposure],
         context: TaskContext,
-        should_stop: ShouldStop | None,
-    ) -> Generator[ShotOutcome, None, None]:
-        """Run shots by their numbers, and yield the outcome of each as it ends."""
+        on_end: Callable[[ShotOutcome], None],
+        should_stop: ShouldStop,
+    ) -> None:
+        """Run shots by their numbers; `on_end` takes the outcome of each as it ends."""
 
         def is_stopped() -> bool:
-            return self._stop.is_set() or (should_stop is not None and should_stop())
+            return self._stop.is_set() or should_stop()
 
         def note(key: Any, value: Any, *_: Any) -> None:
-            ended.put(value)
-            if self._stop.is_set():
-                raise InversionCancelled(_STOPPED)
+            if isinstance(value, ShotOutcome):  # and not a value that tasks share
+                pending.discard(value.index)
+                on_end(value)
+                _check(should_stop)
 
-        ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
         # Tasks elsewhere cannot ask here.
         ways = {"threads": is_stopped, "synchronous": is_stopped, "processes": _is_worker_stopped}
-        tasks = _tasks(shots, context, ways.get(self._get))
-        dask: Any = import_module("dask")
+        base: Any = import_module("dask.base")
+        get = base.get_scheduler(scheduler=self._get)
+        graph, keys = _graph(shots, context, ways.get(self._get))
         pending = set(shots)
-        with ThreadPoolExecutor(1, "dask", _block_interrupts) as caller:
-            run = caller.submit(
-                dask.compute,
-                *tasks,
-                scheduler=self._get,
+        try:
+            outcomes = get(
+                graph,
+                keys,
                 pool=self._pool,
                 chunksize=1,
                 callbacks=[(None, None, None, note, None)],
             )
-            run.add_done_callback(ended.put)
-            try:
-                while (outcome := _next_of(ended, should_stop)) is not run:
-                    if isinstance(outcome, ShotOutcome):  # and not a value that tasks share
-                        pending.discard(outcome.index)
-                        yield outcome
-                # A scheduler of the user's may know no callbacks.
-                yield from (outcome for outcome in run.result() if outcome.index in pending)
-            except BaseException as error:
-                self._stop.set()
-                if not isinstance(error, BrokenProcessPool):
-                    raise
+            for outcome in outcomes:  # a scheduler of the user's may know no callbacks
+                if outcome.index in pending:
+                    on_end(outcome)
+        except BaseException as error:
+            self._stop.set()
+            if isinstance(error, BrokenProcessPool):
                 raise RunInterruptedError(
                     "a worker process ended before its shot was done; it may have had too little "
                     "memory: use fewer workers, then run again to resume"
                 ) from None
+            if isinstance(error, InversionCancelled):  # by a task
+                raise InversionCancelled(_STOPPED) from None
+            raise
 
 
 class _Cluster(Scheduler):
@@ -121,24 +117,24 @@ class _Cluster(Scheduler):
         super().__init__(f"the scheduler at {address}", None, most)
         self._client = client
 
-    def outcomes(
+    def run(
         self,
         shots: Mapping[int, Exposure],
         context: TaskContext,
-        should_stop: ShouldStop | None,
-    ) -> Generator[ShotOutcome, None, None]:
-        ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        on_end: Callable[[ShotOutcome], None],
+        should_stop: ShouldStop,
+    ) -> None:
+        from distributed import as_completed
+
         with self._as_interruption(), warnings.catch_warnings():
             # What shots share has to be sent, however large it is.
             warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
-            tasks = _tasks(shots, context, blocks=True)
-            running = dict(zip(self._client.compute(tasks), shots, strict=True))
-        for future in running:
-            future.add_done_callback(ended.put)
+            graph, keys = _graph(shots, context, blocks=True)
+            running = dict(zip(self._client.get(graph, keys, sync=False), shots, strict=True))
         try:
-            while running:
-                future = _next_of(ended, should_stop, self._check)
-                yield self._outcome(future, running.pop(future), context)
+            for future in as_completed(list(running), loop=self._client.loop):
+                on_end(self._outcome(future, running.pop(future), context))
+                _check(should_stop)
         finally:
             for future in running:
                 future.cancel()
@@ -161,15 +157,6 @@ class _Cluster(Scheduler):
             reason = failure_text(error)
         return write_failure(context.writer, index, reason)
 
-    def _check(self) -> None:
-        if self._client.status != "running":
-            raise self._lost()
-
-    def _lost(self) -> RunInterruptedError:
-        return RunInterruptedError(
-            f"lost the connection to {self.name}: restart it, then run again to resume"
-        )
-
     @contextmanager
     def _as_interruption(self) -> Iterator[None]:
         """Convert all of dask's errors of a lost scheduler."""
@@ -179,48 +166,41 @@ class _Cluster(Scheduler):
         try:
             yield
         except (Cancelled, CancelledError, CommClosedError, TimeoutError) as error:
-            raise self._lost() from error
+            raise RunInterruptedError(
+                f"lost the connection to {self.name}: restart it, then run again to resume"
+            ) from error
 
 
-def _tasks(
+def _graph(
     shots: Mapping[int, Exposure],
     context: TaskContext,
     should_stop: ShouldStop | None = None,
     *,
     blocks: bool = False,
-) -> list[Any]:
-    """Return a task for each shot; blocks of a dask array are tasks of their own if asked for."""
-    from dask.delayed import delayed
+) -> tuple[dict[Any, Any], list[str]]:
+    """Return a graph with a task for each shot, and their keys.
 
+    Blocks of a dask array are tasks of their own if asked for.
+    """
     # New in each run: dask would reuse the earlier values.
     name = f"{context.writer.store_id}-{time.time_ns()}"
-    # Each worker gets it once.
-    shared = delayed(context, name=f"context-{name}", traverse=False)
-    tasks = []
+    shared, keys = f"context-{name}", list[str]()
+    graph: dict[Any, Any] = {shared: context}  # each worker gets it once
     for index, shot in shots.items():
-        block = []
+        parts = []
         if blocks and isinstance(shot, ArrayExposure) and shot.is_lazy:
-            block = [shot.block.to_delayed().ravel()[0]]
+            block = shot.block
+            graph |= block.dask
+            parts = [(block.name, 0, 0, 0)]
             shot = Exposure(shot.name, source=shot.source)
-        key = f"{2 * 10**9 - index}-{name}"  # of ten digits each: dask begins with the last
-        run = partial(run_shot, shot, index, should_stop)
-        task = delayed(run, name=f"run-{key}", traverse=False)
-        tasks.append(task(shared, *block, dask_key_name=f"shot-{key}"))
-    return tasks
+        keys.append(f"shot-{2 * 10**9 - index}-{name}")  # of ten digits each: the last is first
+        graph[keys[-1]] = (partial(run_shot, shot, index, should_stop), shared, *parts)
+    return graph, keys
 
 
-def _next_of(
-    ended: queue.SimpleQueue[Any],
-    should_stop: ShouldStop | None,
-    check: Callable[[], None] = lambda: None,
-) -> Any:
-    """Wait for the next entry; look regularly whether to stop."""
-    while True:
-        if should_stop is not None and should_stop():
-            raise InversionCancelled(_STOPPED)
-        with suppress(queue.Empty):
-            return ended.get(timeout=_POLL_S)
-        check()
+def _check(should_stop: ShouldStop) -> None:
+    if should_stop():
+        raise InversionCancelled(_STOPPED)
 
 
 @contextmanager
@@ -279,6 +259,9 @@ def _local(scheduler: Any, count: int) -> Iterator[Scheduler]:
         spawn = multiprocessing.get_context("spawn")
         stop = spawn.Event()
         with ProcessPoolExecutor(count, spawn, _begin_worker, (stop,)) as pool:
+            with _blocked_interrupts():
+                for _ in range(count):
+                    pool.submit(int)
             yield Scheduler(name, scheduler, count, pool, stop)
     else:
         raise InputError(
@@ -290,10 +273,17 @@ def _local(scheduler: Any, count: int) -> Iterator[Scheduler]:
 _stop_of_worker: Any = None  # of a worker process: the event that ends its shot
 
 
-def _block_interrupts() -> None:
-    """Keep Ctrl-C, which a terminal sends to all, from processes that this thread starts."""
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+@contextmanager
+def _blocked_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C, which a terminal sends to all, from processes that start in this block."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _begin_worker(stop: Any) -> None:
