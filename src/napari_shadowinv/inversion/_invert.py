@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import check_mask, unpack_array, unpack_shot
+from napari_shadowinv._system.arrays import unpack_array, unpack_shot
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._system.progress import (
     OnProgress,
@@ -21,18 +21,23 @@ from napari_shadowinv._system.progress import (
     ShouldStop,
     measure_time,
 )
-from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import to_figures
-from napari_shadowinv.inversion import normalise
 from napari_shadowinv.inversion.budget import Budget
 from napari_shadowinv.inversion.error_budget import ErrorBudget
 from napari_shadowinv.inversion.machine_code import loading_kernels
 from napari_shadowinv.inversion.noise import ImageNoise
-from napari_shadowinv.inversion.normalise import Prepared, margin_around, mask_unlit, prepare
+from napari_shadowinv.inversion.normalise import (
+    Prepared,
+    margin_around,
+    mask_unlit,
+    number_of_sites,
+    prepare,
+)
+from napari_shadowinv.inversion.plans import SpreadBeam, plan_over
 from napari_shadowinv.inversion.readout import read_out
 from napari_shadowinv.inversion.result import Cells, Inversion, Report
 from napari_shadowinv.inversion.solution_checks import (
@@ -46,7 +51,7 @@ from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_ima
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.alignment import RegisteredSource, register_source
 from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_cautions
-from napari_shadowinv.transport.sites import RATIO, Levels, Margin, SitePlan, edge_flux, plan_levels
+from napari_shadowinv.transport.sites import RATIO, Levels, SitePlan, edge_flux
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
 # Steps of the read-out: up to the first number the potential, then the re-projection.
@@ -99,55 +104,12 @@ def plan_sites(
     """
     options = as_model(InversionOptions, options, "options")
     source, _, mask = unpack_shot(source, None, mask)
-    plan = _plan(source, options, mask, measured)
+    plan = plan_over(source, options, mask, measured)
     plan = replace(plan, source=plan.source.copy())  # the caller's may change
     if options.is_adaptive:
         return plan
     levels = plan.levels.with_reporter(Reporter(on_progress, should_stop))
     return replace(plan, levels=levels.compute_all(options.threads))
-
-
-def _plan(
-    source: ArrayLike, options: InversionOptions, mask: ArrayLike | None, measured: bool
-) -> SitePlan:
-    """Plan sites without computing any level."""
-    domain = _site_domain(source, options, mask)
-    levels = plan_levels(
-        domain.beam,
-        domain.n_sites,
-        lloyd_iterations=options.lloyd_iterations,
-        lloyd_tolerance=options.lloyd_tolerance,
-        seed=options.seed,
-        threads=options.threads,
-    ).levels
-    return SitePlan(domain.source, levels, domain.mask, domain.margin, domain.unit, measured)
-
-
-class _SiteDomain(NamedTuple):
-    """Source, beam in units of a power of two that sites are spread over, and their number."""
-
-    source: FloatArray
-    beam: FloatArray
-    unit: float
-    mask: BoolArray | None
-    margin: Margin | None
-    n_sites: int
-
-
-def _site_domain(
-    source: ArrayLike, options: InversionOptions, mask: ArrayLike | None
-) -> _SiteDomain:
-    usable = None if mask is None else check_mask(mask, np.shape(source))
-    check_memory(np.shape(source), normalise.bytes_per_pixel(options), "an inversion")
-    checked = normalise.masked_source(normalise.check_source(source, usable), usable, options)
-    n_sites = normalise.number_of_sites(checked.shape, options)
-    unit = normalise.power_of_two(checked)
-    beam = checked / unit
-    if options.boundary != "free":
-        return _SiteDomain(checked, beam, unit, usable, None, n_sites)
-    margin = Margin.around(beam, margin_around(beam.shape, options), usable)
-    n_sites = round(n_sites * margin.beam.sum() / beam.sum())
-    return _SiteDomain(checked, margin.beam, unit, usable, margin, n_sites)
 
 
 @loading_kernels()
@@ -277,7 +239,7 @@ def _prepare(
     mask, unlit = mask_unlit(image, recorded, mask)
     is_dark = _dark_in_source(recorded, mask)
     if unlit and plan is not None:
-        plan, start = _plan(plan.source, options, mask, plan.measured), None
+        plan, start = plan_over(plan.source, options, mask, plan.measured), None
     prepared = prepare(image, source, options, mask)
     registered = RegisteredSource(prepared.source, 0.0)
     if measured:
@@ -347,7 +309,8 @@ def _pose(
 ) -> _Problem:
     """Place the sites, and begin to estimate the noise, which does not depend on the transport."""
     with measure_time("sites", seconds):
-        plan = inputs.plan or _plan(inputs.prepared.source, options, inputs.mask, inputs.measured)
+        source = inputs.prepared.source
+        plan = inputs.plan or plan_over(source, options, inputs.mask, inputs.measured)
         levels = plan.levels.with_reporter(report)
     with measure_time("transport", seconds):
         prepared = _with_fitted_flux(inputs, plan, levels, options, report)
@@ -375,7 +338,8 @@ def _levels_to_solve(
     plan: SitePlan, levels: Levels, start: Inversion | None, options: InversionOptions
 ) -> Levels:
     if not options.is_adaptive and not levels.is_complete:
-        levels = levels.up_to(_site_domain(plan.source, options, plan.mask).n_sites)
+        beam = SpreadBeam.of(plan.source, plan.mask, options)
+        levels = levels.up_to(beam.count_of(number_of_sites(plan.source.shape, options)))
     if start is None:
         return levels
     may_differ = options.is_adaptive and not levels.is_complete

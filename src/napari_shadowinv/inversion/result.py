@@ -462,7 +462,8 @@ class Inversion(Summarised):
         >>> bool(low < high)
         True
         """
-        from napari_shadowinv.inversion import resampling, samples  # here, as they load the solver
+        # Here, as they load the solver.
+        from napari_shadowinv.inversion import plans, resampling, samples
 
         resampling.check_choices(n, method)
         errors, options, measured = self.errors, self.options, self.report.measured
@@ -478,7 +479,7 @@ class Inversion(Summarised):
         if not noise_only:
             draws = resampling.instrument_draws(shot, self.instrument, errors, measured=measured)
         sites, weights = self.cells.sites, self.cells.weights
-        plan = samples.plan_of(sites, self.source, self.mask, options, measured=measured)
+        plan = plans.plan_of(sites, self.source, self.mask, options, measured=measured)
         fitted = scale if options.flux == "fit" else None
         images = samples.FullResampling(plan, weights, shot.image, draw, options, draws, fitted)
         fields = np.stack([self.potential, *self.displacement])

@@ -30,20 +30,15 @@ from napari_shadowinv.geometry.compiler import njit
 from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.power_diagram import PowerDiagram, pixel_shares
-from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.instrument.effects import InstrumentDraws
 from napari_shadowinv.inversion.error_bars import Linearity
-from napari_shadowinv.inversion.normalise import (
-    flooring_for,
-    margin_around,
-    masked_source,
-    power_of_two,
-)
+from napari_shadowinv.inversion.normalise import flooring_for
+from napari_shadowinv.inversion.plans import SpreadBeam, plan_on
 from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
-from napari_shadowinv.transport.sites import Levels, Margin, SiteLevel, SitePlan
+from napari_shadowinv.transport.sites import SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target, solve
 
 Draw = Callable[[np.random.Generator], FloatArray]
@@ -180,7 +175,7 @@ class FullResampling:
             return self.plan, self.image(seed), 1.0
         noisy, numbers = self.random(seed)
         shot = self.instrument.shot(numbers)
-        plan = _plan_on(
+        plan = plan_on(
             self.plan.levels[-1].triangulation,
             shot.source,
             self.plan.mask,
@@ -222,51 +217,6 @@ class FullResampling:
     def flooring(self, source: FloatArray) -> Callable[[FloatArray], FloatArray]:
         """Return that function for another source."""
         return flooring_for(source, self.options, self.plan.mask, self.flux_scale)
-
-
-def plan_of(
-    sites: FloatArray,
-    source: FloatArray,
-    mask: BoolArray,
-    options: InversionOptions,
-    *,
-    measured: bool,
-) -> SitePlan:
-    """Return the plan of one level with sites, (n, 2), px of a source that was recorded or not."""
-    width = margin_around(source.shape, options) if options.boundary == "free" else 0
-    region = [(-0.5, -0.5), tuple(side + 2 * width - 0.5 for side in source.shape)]
-    triangulation = RegularTriangulation(sites + width, region=region)
-    return _plan_on(triangulation, source, mask, options, measured=measured)
-
-
-def _plan_on(
-    triangulation: RegularTriangulation,
-    source: FloatArray,
-    mask: BoolArray | None,
-    options: InversionOptions,
-    *,
-    measured: bool,
-) -> SitePlan:
-    beam, unit, margin = _spread_beam(source, mask, options)
-    density = Density.from_image(beam, threads=options.threads)
-    diagram = PowerDiagram(triangulation, density, with_moments=True, threads=options.threads)
-    sites, shape = triangulation.sites, beam.shape
-    level = SiteLevel(sites, diagram.masses, diagram.centroids, triangulation, shape, 0)
-    levels = Levels((len(sites),), lambda count, report: level)
-    return SitePlan(source, levels, mask, margin, unit, measured)
-
-
-def _spread_beam(
-    source: FloatArray, mask: BoolArray | None, options: InversionOptions
-) -> tuple[FloatArray, float, Margin | None]:
-    """Return a source as sites are spread over it, in its power of two, and its margin."""
-    beam = masked_source(source, mask, options)
-    unit = power_of_two(beam)
-    beam = beam / unit
-    if options.boundary != "free":
-        return beam, unit, None
-    margin = Margin.around(beam, margin_around(beam.shape, options), mask)
-    return margin.beam, unit, margin
 
 
 @dataclass(frozen=True)
@@ -490,14 +440,14 @@ class LinearResampling:
         samples, plan, level = self._samples, self._samples.plan, self._samples.plan.levels[-1]
         assert samples.instrument is not None
         options, recorded = samples.options, samples.instrument.recorded
-        beam, _, _ = _spread_beam(plan.source, plan.mask, options)
+        beam = SpreadBeam.of(plan.source, plan.mask, options).values
         density = Density.from_image(beam, threads=threads)
         diagram = PowerDiagram(level.triangulation, density, threads=threads)
         shares_of_source = pixel_shares(diagram, level.shape, threads=threads)
         gains = np.zeros((len(level.sites), samples.instrument.count))
         for place, step, shot in samples.instrument.steps():
             source = shot.source * (plan.source.sum() / shot.source.sum())
-            changed_beam, unit, _ = _spread_beam(source, plan.mask, options)
+            changed_beam, unit, _ = SpreadBeam.of(source, plan.mask, options)
             of_source = changed_beam * (unit / plan.unit) - beam
             of_image = of_source.copy()  # in a margin
             inner = plan.within(of_image)

@@ -1,0 +1,109 @@
+"""Plans of the sites over a source.
+
+- sites as many as options ask for, on all levels: `plan_over`
+- one level of sites that are placed already: `plan_of`, `plan_on`
+- the beam that sites are spread over: `SpreadBeam`
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from napari_shadowinv._system.arrays import check_mask
+from napari_shadowinv._system.safety import check_memory
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.geometry.density import Density
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.inversion.normalise import (
+    bytes_per_pixel,
+    check_source,
+    margin_around,
+    masked_source,
+    number_of_sites,
+    power_of_two,
+)
+from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.transport.sites import Levels, Margin, SiteLevel, SitePlan, plan_levels
+
+
+class SpreadBeam(NamedTuple):
+    """A source as sites are spread over it, with its margin where the boundary is free."""
+
+    values: FloatArray  # in units of a power of two
+    unit: float
+    margin: Margin | None
+
+    @classmethod
+    def of(cls, source: FloatArray, mask: BoolArray | None, options: InversionOptions) -> Self:
+        """Return the beam of a source, of which a mask may be known."""
+        beam = masked_source(source, mask, options)
+        unit = power_of_two(beam)
+        beam = beam / unit
+        if options.boundary != "free":
+            return cls(beam, unit, None)
+        margin = Margin.around(beam, margin_around(beam.shape, options), mask)
+        return cls(margin.beam, unit, margin)
+
+    def count_of(self, n_sites: int) -> int:
+        """Return the number of sites with those of the margin, for `n_sites` in the image."""
+        if self.margin is None:
+            return n_sites
+        inner = np.ascontiguousarray(self.margin.within(self.values))
+        return round(n_sites * float(self.values.sum()) / float(inner.sum()))
+
+
+def plan_over(
+    source: ArrayLike, options: InversionOptions, mask: ArrayLike | None, measured: bool
+) -> SitePlan:
+    """Plan sites over a source without computing any level."""
+    usable = None if mask is None else check_mask(mask, np.shape(source))
+    check_memory(np.shape(source), bytes_per_pixel(options), "an inversion")
+    checked = masked_source(check_source(source, usable), usable, options)
+    n_sites = number_of_sites(checked.shape, options)
+    beam = SpreadBeam.of(checked, usable, options)
+    levels = plan_levels(
+        beam.values,
+        beam.count_of(n_sites),
+        lloyd_iterations=options.lloyd_iterations,
+        lloyd_tolerance=options.lloyd_tolerance,
+        seed=options.seed,
+        threads=options.threads,
+    ).levels
+    return SitePlan(checked, levels, usable, beam.margin, beam.unit, measured)
+
+
+def plan_of(
+    sites: FloatArray,
+    source: FloatArray,
+    mask: BoolArray,
+    options: InversionOptions,
+    *,
+    measured: bool,
+) -> SitePlan:
+    """Return the plan of one level with sites, (n, 2), px of a source that was recorded or not."""
+    width = margin_around(source.shape, options) if options.boundary == "free" else 0
+    region = [(-0.5, -0.5), tuple(side + 2 * width - 0.5 for side in source.shape)]
+    triangulation = RegularTriangulation(sites + width, region=region)
+    return plan_on(triangulation, source, mask, options, measured=measured)
+
+
+def plan_on(
+    triangulation: RegularTriangulation,
+    source: FloatArray,
+    mask: BoolArray | None,
+    options: InversionOptions,
+    *,
+    measured: bool,
+) -> SitePlan:
+    """Return the plan of the one level of a triangulation's sites over a source."""
+    beam = SpreadBeam.of(source, mask, options)
+    density = Density.from_image(beam.values, threads=options.threads)
+    diagram = PowerDiagram(triangulation, density, with_moments=True, threads=options.threads)
+    sites, shape = triangulation.sites, density.shape
+    level = SiteLevel(sites, diagram.masses, diagram.centroids, triangulation, shape, 0)
+    levels = Levels((len(sites),), lambda count, report: level)
+    return SitePlan(source, levels, mask, beam.margin, beam.unit, measured)
