@@ -85,10 +85,6 @@ def fit(
         Receives a `Progress` after each step, with its objective; ends the work
         when it returns true.
 
-    Returns
-    -------
-    Fit
-
     Raises
     ------
     InputError

@@ -104,10 +104,6 @@ def trace_particles(
     start : array_like, shape (2, N), optional
         Points of the source in m from its middle, axis order (y, x). Default: its middle.
 
-    Returns
-    -------
-    TracedParticles
-
     Raises
     ------
     InputError

@@ -236,10 +236,6 @@ def trace(
     on_progress, should_stop : callable, optional
         Receives a `Progress`; ends the work when it returns true.
 
-    Returns
-    -------
-    TracedImage
-
     Raises
     ------
     InputError
