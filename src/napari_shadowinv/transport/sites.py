@@ -45,6 +45,7 @@ from napari_shadowinv.geometry.interpolation import with_mirror_images
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation, hilbert_order
+from napari_shadowinv.physics.edge import SIDES
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def edge_flux(
 
     def by_side(flux: FloatArray) -> dict[str, float]:
         shares = np.bincount(nearest.ravel(), flux.ravel(), minlength=4) / total
-        return dict(zip(("top", "bottom", "left", "right"), shares.tolist(), strict=True))
+        return dict(zip(SIDES, shares.tolist(), strict=True))
 
     return by_side(np.where(margin.beyond, left_behind, 0)), by_side(
         np.where(margin.beyond, 0, arrived)
