@@ -14,10 +14,16 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import PLANE
+from napari_shadowinv._system.arrays import PLANE, VECTOR
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.physics.units import FLUX_DENSITY, PIXEL, PIXEL_AREA, label, place_coordinates
+from napari_shadowinv.physics.units import (
+    FLUX_DENSITY,
+    PIXEL,
+    PIXEL_AREA,
+    label,
+    vector_coordinates,
+)
 
 if TYPE_CHECKING:
     import xarray
@@ -27,13 +33,12 @@ if TYPE_CHECKING:
 
 _FLUX = "1"
 
-_VECTORS = ("component", "y", "x")
 _SITE_VECTORS = ("site", "component")
 
 # Of an inversion: dimensions, units, long name.
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "potential": (PLANE, PIXEL_AREA, "Normalised deflection potential"),
-    "displacement": (_VECTORS, PIXEL, "Displacement of the ray through each pixel"),
+    "displacement": (VECTOR, PIXEL, "Displacement of the ray through each pixel"),
     "sites": (_SITE_VECTORS, PIXEL, "Positions of the sites"),
     "weights": (("site",), PIXEL_AREA, "Weights of the power diagram"),
     "site_mass": (("site",), _FLUX, "Source flux in each site's cell"),
@@ -48,7 +53,7 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
 }
 
 DISPLACEMENT_STD = (
-    _VECTORS,
+    VECTOR,
     PIXEL,
     f"{VARIABLES['displacement'][2]}, standard deviation of noisy samples",
 )
@@ -57,7 +62,7 @@ DISPLACEMENT_STD = (
 _DEVIATION = "Standard deviation of the displacement"
 _CHANGES = "Random changes of the potential as large as its error"
 FIT_VARIABLES = {
-    "displacement_uncertainty": (_VECTORS, PIXEL, _DEVIATION),
+    "displacement_uncertainty": (VECTOR, PIXEL, _DEVIATION),
     "potential_samples": (("sample", "y", "x"), PIXEL_AREA, _CHANGES),
 }
 """Variables of a fitted field in addition to potential and displacement."""
@@ -74,7 +79,7 @@ def dataset_from_field(
     import xarray as xr
 
     variables: dict[str, Any] = {
-        "displacement": (_VECTORS, displacement, label(*VARIABLES["displacement"][1:]))
+        "displacement": (VECTOR, displacement, label(*VARIABLES["displacement"][1:]))
     }
     if potential is not None:
         variables["potential"] = (PLANE, potential, label(*VARIABLES["potential"][1:]))
@@ -85,13 +90,14 @@ def dataset_from_field(
     }
     if setup is not None:
         for field in _vectors_first(setup):
-            dims, values = (_VECTORS, displacement) if field.is_vector else (PLANE, potential)
+            dims, values = (VECTOR, displacement) if field.is_vector else (PLANE, potential)
             if values is not None:
                 converted = setup.field_in_si(field.name, values)
                 variables[field.name] = dims, converted, label(field.unit, field.long_name)
         attrs["setup"] = setup.model_dump_json()
-    height, width = displacement.shape[1:]
-    return xr.Dataset(variables, coords=_coordinates(height, width, setup), attrs=attrs)
+    size = None if setup is None else setup.object_pixel_size
+    coordinates = vector_coordinates(displacement.shape[1:], size)
+    return xr.Dataset(variables, coords=coordinates, attrs=attrs)
 
 
 Labels = dict[str, tuple[tuple[str, ...], dict[str, str]]]
@@ -104,7 +110,7 @@ def variable_labels(setup: Setup | None = None) -> Labels:
         name: (dims, label(unit, long_name)) for name, (dims, unit, long_name) in VARIABLES.items()
     }
     for field in () if setup is None else _vectors_first(setup):
-        dims = _VECTORS if field.is_vector else PLANE
+        dims = VECTOR if field.is_vector else PLANE
         labels[field.name] = dims, label(field.unit, field.long_name)
     return labels
 
@@ -149,9 +155,3 @@ SETUPS_LABEL = {"units": "1", "long_name": "Setup of the shot (JSON)"}
 
 def _vectors_first(setup: Setup) -> list[SIField]:
     return sorted(setup.si_fields, key=lambda field: not field.is_vector)
-
-
-def _coordinates(height: int, width: int, setup: Setup | None) -> dict[str, Any]:
-    components = ("component", ["y", "x"], label("1", "Component of a vector"))
-    size = None if setup is None else setup.object_pixel_size
-    return {"component": components, **place_coordinates((height, width), size)}

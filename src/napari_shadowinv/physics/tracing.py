@@ -23,6 +23,7 @@ from scipy.ndimage import distance_transform_edt
 from napari_shadowinv import __version__
 from napari_shadowinv._system.arrays import (
     PLANE,
+    VECTOR,
     as_numbers,
     block_sums,
     check_finite,
@@ -49,7 +50,7 @@ from napari_shadowinv.physics.particle_flight import (
 )
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.physics.trace_options import TraceOptions
-from napari_shadowinv.physics.units import label, place_coordinates
+from napari_shadowinv.physics.units import label, vector_coordinates
 
 if TYPE_CHECKING:
     import xarray
@@ -58,7 +59,6 @@ Profile = ArrayLike | Callable[[FloatArray, FloatArray], ArrayLike]
 
 _MAX_THIN_ERROR = 0.05  # beyond it, the line integral is no good description
 _MAX_EDGE_SHARE = 0.1
-_VECTORS = ("component", *PLANE)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -186,12 +186,8 @@ class TracedImage(Summarised):
             "path_integrated_e": ("V", "True path-integrated electric field"),
         }
         for name, (units, long_name) in vectors.items():
-            variables[name] = _VECTORS, getattr(self, name), label(units, long_name)
-        shape = (self.image.shape[0], self.image.shape[1])
-        coords = {
-            "component": ("component", ["y", "x"], label("1", "Component of a vector")),
-            **place_coordinates(shape, size),
-        }
+            variables[name] = VECTOR, getattr(self, name), label(units, long_name)
+        coords = vector_coordinates(self.image.shape, size)
         attrs = {
             "package_version": __version__,
             "setup": self.setup.model_dump_json(),

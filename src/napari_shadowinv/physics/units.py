@@ -6,7 +6,7 @@
 - the error of a largest value: `PeakError`
 - the prefix for a number: `prefix_for`; whether a unit takes one: `takes_prefix`
 - attributes of a variable of a dataset: `label`; of places: `place_label`; the places:
-  `place_coordinates`; units as figures print them: `display_unit`
+  `place_coordinates`, `vector_coordinates`; units as figures print them: `display_unit`
 - a variable as an array: `numbers_of`; a dataset that lacks one: `refuse_missing`
 
 Units of datasets are spelled as pint parses them, because napari passes the units of an xarray's
@@ -299,7 +299,7 @@ def place_label(name: str) -> dict[str, str]:
 
 
 def place_coordinates(
-    shape: tuple[int, int], pixel_size: float | None, plane: str = "object plane"
+    shape: tuple[int, ...], pixel_size: float | None, plane: str = "object plane"
 ) -> dict[str, Any]:
     """Return y and x of the pixels in metres, or their indices if their size is unknown.
 
@@ -310,6 +310,12 @@ def place_coordinates(
         name: (name, size * np.arange(count), label(unit, f"{name} in the {plane}"))
         for name, count in zip(PLANE, shape, strict=True)
     }
+
+
+def vector_coordinates(shape: tuple[int, ...], pixel_size: float | None) -> dict[str, Any]:
+    """Return the components of vectors, with the `place_coordinates` of the object plane."""
+    components = "component", ["y", "x"], label("1", "Component of a vector")
+    return {"component": components, **place_coordinates(shape, pixel_size)}
 
 
 def display_unit(units: str) -> str:
