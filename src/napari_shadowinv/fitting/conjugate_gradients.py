@@ -176,7 +176,7 @@ def solve(
     """Solve a positive definite system by conjugate gradients, from zero.
 
     `times` multiplies the matrix by a vector. The steps end at a residual of `tolerance` times the
-    `right` side, (n,). The modes are those of nearly the same matrix; modes of this solution are
+    `right` side, (n,). The modes come from nearly the same matrix; modes of this solution are
     added.
     """
     modes = SoftModes() if modes is None else modes

@@ -37,7 +37,7 @@ class Part(NamedTuple):
     places: slice
 
     def of(self, common: FloatArray, separate: FloatArray) -> FloatArray:
-        """Return a view of its numbers among the common ones and those of one image, or of each."""
+        """Return a view of its numbers among common ones and the ones of an image, or of each."""
         return (common if self.is_common else separate)[..., self.places]
 
 

@@ -59,7 +59,7 @@ def match_noise(
 
     All have shape (L, H, W): `excess` is images less beams, `brightness` the images. `width` is the
     standard deviation of the blur that correlates the noise, px, if it is stated. A variance is too
-    large beyond `too_large` times that of the calm parts. The deviations of noise that
+    large beyond `too_large` times the variance of the calm parts. The deviations of noise that
     `is_estimated` are from differences between neighbouring pixels.
     """
     factors, expected = np.ones((2, len(excess)))

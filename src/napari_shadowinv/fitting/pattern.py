@@ -78,7 +78,7 @@ def correlation_length(
     Differences of pixels are compared over two distances `apart`, px. Medians are taken, so that
     bright lines that the model misses do not count. 0 if the noise is white: the ratio of the
     variances is at `most` 0.85 for other noise. White noise has 1 ± 0.03 on 64 × 64 px, noise
-    blurred by 0.4 px 0.84. Residual and used pixels, (H, W), are those of `pattern_strength`.
+    blurred by 0.4 px 0.84. For residual and used pixels, (H, W), see `pattern_strength`.
     """
     near, far = (_squared_difference(residual, used, distance) for distance in apart)
     if not far > 0 or near / far > most:

@@ -563,7 +563,7 @@ def sampled_potentials(
     They are in px², in single precision, with a mean over the border of 0, one for each of n
     samples of the posterior. Changes by unfitted numbers are random combinations, by the seed, of
     `shifts`: independent changes of one standard deviation each. The scene is in recorded pixels;
-    `size` is that of the images.
+    images have the `size`.
     """
     changes = [potentials_of(scene, sample.change, size) for sample in samples]
     if shifts:

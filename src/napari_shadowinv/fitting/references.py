@@ -32,7 +32,7 @@ def smooth_references(
     fall by `least_gain`. An error of less than `least_certain` of the variance, times the root of
     the number of pixels, is chance.
 
-    All have shape (L, H, W); the deviations are about those of the images' noise. Returns the
+    All have shape (L, H, W); the deviations are about as large as the images' noise. Returns the
     blurred beams, and the standard deviation of their errors beyond differences of neighbouring
     pixels of image and blurred beam, (L,), in units of the deviations; 0 where a beam was not
     blurred.

@@ -90,7 +90,7 @@ def log_shrinkage(scene: Scene, unknowns: Unknowns) -> float:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Log evidence of rivals over that of the fit, by the quantities that they free."""
+    """Log evidence of rivals less the fit's, by the quantities that they free."""
 
     gains: dict[tuple[str, ...], float]
 

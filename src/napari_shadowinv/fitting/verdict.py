@@ -33,10 +33,10 @@ def hidden_contrast(
 ) -> float:
     """Return the contrast around the holes of a mask, as a share of the strongest; 0 without holes.
 
-    The contrast (L, H, W) is that of model images to their beams, the largest of all images counts.
-    A hole is where no image has a pixel that was fitted; holes of a smaller `radius` in px are
-    bridged by their surroundings. `rim_width` is that of a hole's rim, `smoothing` the standard
-    deviation of a blur of the contrast, px.
+    The contrast (L, H, W) is between model images and their beams, the largest of all images
+    counts. A hole is where no image has a pixel that was fitted; holes of a smaller `radius` in px
+    are bridged by their surroundings. A rim of `rim_width` px around a hole is looked at;
+    `smoothing` is the standard deviation of a blur of the contrast, px.
     """
     used_anywhere = used.any(axis=0)
     # Holes begin where pixels are missing inside the image, not at its edge.

@@ -49,7 +49,7 @@ class SpreadBeam(NamedTuple):
         return cls(margin.beam, unit, margin)
 
     def count_of(self, n_sites: int) -> int:
-        """Return the number of sites with those of the margin, for `n_sites` in the image."""
+        """Return the number of sites in image and margin, for `n_sites` in the image."""
         if self.margin is None:
             return n_sites
         inner = np.ascontiguousarray(self.margin.within(self.values))

@@ -242,7 +242,7 @@ class Inversion(Summarised):
 
     @property
     def lit(self) -> BoolArray:
-        """Used pixels from which rays start, (H, W): the field is that of these."""
+        """Used pixels from which rays start, (H, W), where the field counts."""
         return lit_pixels(self.source, self.mask, self.options)
 
     @property
