@@ -39,21 +39,9 @@ def frame_bytes(number: int, frame: Frame, pitch: float = 1.0) -> bytes:
 def save(
     path: Path, shape: tuple[int, int], frames: Iterable[Frame], pitch: float = 1.0, **header: Any
 ) -> Path:
-    fields = {
-        "version": -104,
-        "columns": shape[0],
-        "rows": shape[1],
-        "bins": 0,
-        "pixel": PIXEL,
-        "per_bin": 0.5,
-        "border": 85,
-        "contrast": 75,
-        "eccentricity": 40,
-        "moments": 2,
-        "width": WIDTH,
-        "height": HEIGHT,
-        **header,
-    }
+    fields = {"version": -104, "columns": shape[0], "rows": shape[1], "bins": 0, "pixel": PIXEL,
+              "per_bin": 0.5, "border": 85, "contrast": 75, "eccentricity": 40, "moments": 2,
+              "width": WIDTH, "height": HEIGHT, **header}  # fmt: skip
     content = b"".join(frame_bytes(n, frame, pitch) for n, frame in enumerate(frames, 1))
     trailer = struct.pack("<i", -1) + b"Scan of shot 17\n\xb5m"
     path.write_bytes(struct.pack("<4i2f6i", *fields.values()) + content + trailer)
@@ -154,21 +142,14 @@ def test_gaps_between_frames_are_reported(tmp_path: Path) -> None:
     assert "overlap or leave gaps" in str(read_shot(path).cautions)
 
 
-@pytest.mark.parametrize(
-    "header",
-    [
-        {"version": 104},
-        {"columns": 0},
-        {"rows": -1},
-        {"columns": 2**31 - 1, "rows": 2**31 - 1},
-        {"columns": 500, "rows": 1000},
-        {"columns": 7},
-        {"pixel": float("nan")},
-        {"pixel": -1.0},
-        {"width": 0},
-        {"columns": 9, "rows": 4},
-    ],
-)
+WRONG_HEADERS: list[dict[str, float]] = [
+    {"version": 104}, {"columns": 0}, {"rows": -1}, {"columns": 2**31 - 1, "rows": 2**31 - 1},
+    {"columns": 500, "rows": 1000}, {"columns": 7}, {"pixel": float("nan")}, {"pixel": -1.0},
+    {"width": 0}, {"columns": 9, "rows": 4},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("header", WRONG_HEADERS)
 def test_headers_that_cannot_be_are_refused(tmp_path: Path, header: Any) -> None:
     path = save(tmp_path / "a.cpsa", (6, 6), snake(6, 6, lambda c, r: [ROUND]), **header)
     tracemalloc.start()

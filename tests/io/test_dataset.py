@@ -21,57 +21,37 @@ from napari_shadowinv.preprocessing import Crop, LowPassFilter, MeasuredSource, 
 from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.shot import Shot
 
-
-def assert_same(first: Inversion, second: Inversion) -> None:
-    for name in VARIABLES:
-        before, after = first.variable(name), second.variable(name)
-        assert after.dtype == before.dtype, name
-        np.testing.assert_array_equal(after, before, err_msg=name)
-    for name in ("report", "options", "instrument", "errors", "provenance"):
-        assert getattr(first, name) == getattr(second, name), name
-
-
-@pytest.mark.parametrize("kind", ["none", "proton", "optical", "collimated"])
-def test_file_gives_back_every_bit(
-    tmp_path: Path,
-    inversion: Inversion,
-    proton_setup: ProtonSetup,
-    optical_setup: OpticalSetup,
-    kind: str,
-) -> None:
-    setups = {
-        "none": None,
-        "proton": proton_setup,
-        "optical": optical_setup,
-        "collimated": ProtonSetup(
-            energy=1 / 3,
-            source_object_distance=np.inf,
-            object_image_distance=0.1,
-            detector_pixel_size=1e-5 / 3,
-            species="alpha",
-        ),
-    }
-    path = tmp_path / "shot.shadowinv"
-    write(path, inversion, setup=setups[kind])
-    dataset = read(path)
-    assert isinstance(dataset, xr.Dataset)
-    assert_same(inversion, Inversion.from_dataset(dataset))
-    assert setup_from_dataset(dataset) == setups[kind]
-    xr.testing.assert_identical(
-        dataset.drop_attrs(deep=False),
-        inversion.in_units(setups[kind]).to_dataset().drop_attrs(deep=False),
-    )
+SETUPS = {
+    "none": None,
+    "proton": ProtonSetup.example(),
+    "optical": OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=1e-5 / 3),
+    "collimated": ProtonSetup(
+        energy=1 / 3,
+        source_object_distance=np.inf,
+        object_image_distance=0.1,
+        detector_pixel_size=1e-5 / 3,
+        species="alpha",
+    ),
+}
 
 
-def test_not_a_number_and_infinity_survive(tmp_path: Path, inversion: Inversion) -> None:
-    report = dataclasses.replace(inversion.report, residual=np.inf)
+@pytest.mark.parametrize("kind", SETUPS)
+def test_file_gives_back_every_bit(tmp_path: Path, inversion: Inversion, kind: str) -> None:
     potential = inversion.potential.copy()
     potential[3, 4] = np.nan
+    report = dataclasses.replace(inversion.report, residual=np.inf)
     changed = dataclasses.replace(inversion, potential=potential, report=report)
-    write(tmp_path / "shot.shadowinv", changed)
-    dataset = read(tmp_path / "shot.shadowinv")
+    before = changed.in_units(SETUPS[kind]).to_dataset()
+    dataset = read(write(tmp_path / "shot.shadowinv", changed, setup=SETUPS[kind]))
     assert isinstance(dataset, xr.Dataset)
-    assert_same(changed, Inversion.from_dataset(dataset))
+    again = Inversion.from_dataset(dataset)
+    for name in VARIABLES:
+        assert again.variable(name).dtype == changed.variable(name).dtype, name
+        np.testing.assert_array_equal(again.variable(name), changed.variable(name), err_msg=name)
+    for name in ("report", "options", "instrument", "errors", "provenance"):
+        assert getattr(again, name) == getattr(changed, name), name
+    assert setup_from_dataset(dataset) == SETUPS[kind]
+    xr.testing.assert_identical(dataset.drop_attrs(deep=False), before.drop_attrs(deep=False))
 
 
 def test_a_result_is_read_as_xarray_reads_it(tmp_path: Path, inversion: Inversion) -> None:
@@ -185,14 +165,6 @@ def test_a_damaged_report_is_refused_by_its_entry(
         Inversion.from_dataset(dataset)
 
 
-def test_damaged_result_is_named(tmp_path: Path, inversion: Inversion) -> None:
-    path = tmp_path / "shot.shadowinv"
-    write(path, inversion)
-    path.write_bytes(path.read_bytes()[:-2000])
-    with pytest.raises(FileFormatError, match=r"shot\.shadowinv .*damaged"):
-        read(path)
-
-
 def test_every_dataset_of_a_result_has_fletcher32(tmp_path, inversion, proton_setup):
     path = write(tmp_path / "a.shadowinv", inversion, setup=proton_setup)
     with h5py.File(path) as file:
@@ -218,13 +190,10 @@ def test_flipped_bits_of_a_result_are_refused(tmp_path, inversion, proton_setup)
 
 def test_result_changed_by_another_program_is_read(tmp_path, inversion):
     path = write(tmp_path / "a.shadowinv", inversion)
+    before = read(path)
+    path.write_bytes(path.read_bytes()[:-81])  # without its checksum
+    assert read(path).identical(before)
+    write(path, inversion, overwrite=True)
     with h5py.File(path, "r+") as file:
         file.attrs["note"] = "mine"
     assert read(path).attrs["note"] == "mine"
-
-
-def test_result_without_checksum_is_read(tmp_path, inversion):
-    path = write(tmp_path / "a.shadowinv", inversion)
-    before = read(path)
-    path.write_bytes(path.read_bytes()[:-81])
-    assert read(path).identical(before)

@@ -17,24 +17,6 @@ def test_checksum_is_sha256_of_content(tmp_path: Path) -> None:
     assert sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
 
 
-@pytest.mark.parametrize(
-    ("content", "found"),
-    [
-        (b"", "empty"),
-        (b"energy = 14.7\n", "a text file"),
-        ("größe µm".encode(), "a text file"),
-        (bytes(range(128, 200)), "not in a recognised image format"),
-    ],
-)
-def test_other_content_is_named(tmp_path: Path, content: bytes, found: str) -> None:
-    path = tmp_path / "shot.tif"
-    path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=found) as error:
-        kind_of(path)
-    assert str(path) in str(error.value)
-    assert "TIFF" in str(error.value)
-
-
 def test_folder_and_missing_file_are_named(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="is a folder"):
         kind_of(tmp_path)
@@ -45,15 +27,16 @@ def test_folder_and_missing_file_are_named(tmp_path: Path) -> None:
 def test_outputs_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
     existing = tmp_path / "there.npy"
     existing.write_text("old")
-    with pytest.raises(FileFormatError, match="exists"):
-        check_output(existing)
     assert check_output(existing, overwrite=True) == existing
-    with pytest.raises(FileFormatError, match=r"folder .*nowhere does not exist"):
-        check_output(tmp_path / "nowhere" / "a.npy")
-    with pytest.raises(FileFormatError, match="is a folder"):
-        check_output(tmp_path, overwrite=True)
-    with pytest.raises(FileFormatError, match=r"its ending is '\.doc', expected one of \.npy"):
-        check_output(tmp_path / "a.doc", suffixes=(".npy",))
+    for path, overwrite, words in (
+        (existing, False, "exists"),
+        (tmp_path / "nowhere" / "a.npy", False, r"folder .*nowhere does not exist"),
+        (tmp_path, True, "is a folder"),
+        (tmp_path / "a.doc", False, r"its ending is '\.doc', expected one of \.npy"),
+        (tmp_path / ("n" * 227 + ".npy"), False, "its name has 231 bytes, expected at most 230"),
+    ):
+        with pytest.raises(FileFormatError, match=words):
+            check_output(path, overwrite, suffixes=() if path == tmp_path else (".npy",))
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])

@@ -72,24 +72,6 @@ def test_messages_and_help_list_every_format(tmp_path: Path) -> None:
     assert all(each.title in words for each in listed if "image" in each.holds)
 
 
-FOREIGN = {
-    "shot.asc": (b"Andor Technology Multi-Channel File\n65538 1\n", "is no table of numbers"),
-    "shot.edf": (b"{\nHeaderID = EH:000001:000000:000000 ;\nDim_1 = 9 ;\n", "a text file"),
-    "shot.mrc": (bytes(208) + b"MAP DD\0\0", "not in a recognised image format"),
-    "photo.nef": (b"MM\0\x2a\0\0\0\x08", "raw file of a photographic camera"),
-    "photo.CR2": (b"II\x2a\0\x10\0\0\0CR\2\0", "raw file of a photographic camera"),
-}
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_file_of_another_program_is_refused(tmp_path: Path, name: str) -> None:
-    content, title = FOREIGN[name]
-    path = tmp_path / name
-    path.write_bytes(content)
-    with pytest.raises(FileFormatError, match=title):
-        read(path)
-
-
 def test_zarr_store_of_another_program_is_named(tmp_path: Path) -> None:
     (tmp_path / "zarr.json").write_text("{}")
     with pytest.raises(FileFormatError, match="is a Zarr store of another program"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import h5py
@@ -11,6 +10,7 @@ import pytest
 import tifffile
 from scipy.io import savemat
 
+from helpers.image_files import save_spe
 from napari_shadowinv import FileFormatError, InputError, read
 from napari_shadowinv.io import hdf5, read_shot
 from napari_shadowinv.io.frames import FileFrame, find_frames, images_in, left_out_of
@@ -75,13 +75,6 @@ def test_leading_axes_of_length_one_are_one_image(nexus):
     assert read(f"{nexus}::/entry/single").image.shape == (5, 7)
 
 
-def test_default_that_leads_to_itself_is_no_array(nexus):
-    with h5py.File(nexus, "r+") as file:
-        file["entry"].attrs["default"] = "/entry"
-    with pytest.raises(InputError, match=r"has no array '/': it holds .*'entry/data/data'"):
-        read(f"{nexus}::/")
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [
@@ -99,9 +92,13 @@ def test_wrong_name_or_index_is_refused(nexus, name, words):
         read(f"{nexus}::{name}")
 
 
-def test_many_images_are_no_radiograph(nexus):
+def test_many_images_and_a_default_in_a_circle_are_refused(nexus):
     with pytest.raises(FileFormatError, match=r"6 frames: .* such as 'entry/data/data\[0,0\]'"):
         read_shot(nexus, variable="entry/data/data")
+    with h5py.File(nexus, "r+") as file:
+        file["entry"].attrs["default"] = "/entry"
+    with pytest.raises(InputError, match=r"has no array '/': it holds .*'entry/data/data'"):
+        read(f"{nexus}::/")
 
 
 def test_frame_that_is_not_written_yet_is_refused(tmp_path):
@@ -166,27 +163,15 @@ def test_unreadable_file_among_many_is_a_frame(tmp_path, nexus):
     assert names[-1] == "run_13.nxs"
 
 
-def write_spe(path: Path, frames: np.ndarray) -> None:
-    """Write the frames as SPE 3, each followed by eight bytes of times."""
-    count, height, width = frames.shape
-    header = bytearray(4100)
-    for code, offset, value in (
-        *(("<H", 42, width), ("<H", 656, height), ("<h", 108, 3), ("<i", 1446, count)),
-        *(("<f", 1992, 3.0), ("<I", 2996, 0x01234567), ("<H", 4098, 0x5555)),
-    ):
-        struct.pack_into(code, header, offset, value)
-    body = b"".join(frame.astype("<u2").tobytes() + b"\xff" * 8 for frame in frames)
-    struct.pack_into("<Q", header, 678, 4100 + len(body))
-    size = 2 * height * width
-    footer = f'<DataBlock type="Frame" count="{count}" size="{size}" stride="{size + 8}">'
-    path.write_bytes(bytes(header) + body + footer.encode())
-
-
 @pytest.mark.parametrize("name", ["a.spe", "a.npy", "a.mat", "a.h5", "a.nc", "a.tif"])
 def test_burst_in_one_file_is_a_stack(tmp_path, name):
     path, planes = tmp_path / name, CUBE.reshape(6, 5, 7)
     if path.suffix == ".spe":
-        write_spe(path, planes)
+        # Eight bytes of times follow each frame.
+        body = np.pad(planes.reshape(6, -1).view(np.uint8), ((0, 0), (0, 8)))
+        footer = b'<DataBlock type="Frame" count="6" size="70" stride="78">'
+        shape = {"frames": 6, "height": 5, "width": 7}
+        save_spe(path, body, footer=footer, **shape)
     elif path.suffix == ".npy":
         np.save(path, planes)
     elif path.suffix == ".tif":

@@ -11,7 +11,6 @@ import pytest
 from PIL import Image, PngImagePlugin
 
 from napari_shadowinv import Recipe, run
-from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io import read, read_shot
 from napari_shadowinv.io.images import read_scan
 from napari_shadowinv.pipeline.inversion_run import picture_mask
@@ -24,10 +23,6 @@ def turned(orientation: int) -> Image.Exif:
     exif = Image.Exif()
     exif[274] = orientation
     return exif
-
-
-def codes(path: Path) -> list[str]:
-    return [caution.code for caution in read_shot(path).cautions]
 
 
 @pytest.mark.parametrize(
@@ -52,41 +47,27 @@ def test_scan_in_colour_is_turned(tmp_path: Path) -> None:
     assert scan.pixel_size == pytest.approx(25.4e-3 / 300, rel=1e-4)
 
 
-def write_grey(path: Path, **options: Any) -> np.ndarray[Any, Any]:
-    Image.fromarray(SHOT).save(path, transparency=int(SHOT[3, 4]), **options)
-    return np.not_equal(SHOT, SHOT[3, 4])
-
-
-def write_sixteen_bits(path: Path) -> np.ndarray[Any, Any]:
-    Image.fromarray(SHOT.astype(np.uint16)).save(path, transparency=int(SHOT[3, 4]))
-    return np.not_equal(SHOT, SHOT[3, 4])
-
-
-def write_alpha(path: Path) -> np.ndarray[Any, Any]:
-    alpha = np.where(SHOT > 100, 255, 0).astype(np.uint8)
-    Image.fromarray(np.stack([SHOT] * 3 + [alpha], axis=-1)).save(path)
-    return alpha > 0
-
-
-def write_grey_and_alpha(path: Path) -> np.ndarray[Any, Any]:
-    alpha = np.where(SHOT > 100, 255, 0).astype(np.uint8)
-    Image.fromarray(np.stack([SHOT, alpha], axis=-1)).save(path)
-    return alpha > 0
-
-
-def write_table(path: Path) -> np.ndarray[Any, Any]:
+def table_of_greys(greys: Any) -> Image.Image:
     picture = Image.fromarray(SHOT).convert("P")
-    picture.putpalette(np.repeat(np.arange(256), 3).astype(np.uint8).tobytes())
-    picture.save(path, transparency=int(SHOT[3, 4]))
-    return np.not_equal(SHOT, SHOT[3, 4])
+    picture.putpalette(np.repeat(greys, 3).astype(np.uint8).tobytes())
+    return picture
 
 
-@pytest.mark.parametrize(
-    "write", [write_grey, write_sixteen_bits, write_alpha, write_grey_and_alpha, write_table]
-)
-def test_transparent_pixels_are_not_light(tmp_path: Path, write: Any) -> None:
-    path = tmp_path / "shot.png"
-    opaque = write(path)
+ALPHA = np.where(SHOT > 100, 255, 0).astype(np.uint8)
+CLEAR = {"transparency": int(SHOT[3, 4])}
+TRANSPARENT: dict[str, tuple[Image.Image, dict[str, int], Any]] = {
+    "grey": (Image.fromarray(SHOT), CLEAR, SHOT[3, 4] != SHOT),
+    "16 bits": (Image.fromarray(SHOT.astype(np.uint16)), CLEAR, SHOT[3, 4] != SHOT),
+    "table": (table_of_greys(np.arange(256)), CLEAR, SHOT[3, 4] != SHOT),
+    "colours": (Image.fromarray(np.stack([SHOT] * 3 + [ALPHA], axis=-1)), {}, ALPHA > 0),
+    "grey and alpha": (Image.fromarray(np.stack([SHOT, ALPHA], axis=-1)), {}, ALPHA > 0),
+}
+
+
+@pytest.mark.parametrize("name", TRANSPARENT)
+def test_transparent_pixels_are_not_light(tmp_path: Path, name: str) -> None:
+    path, (picture, options, opaque) = tmp_path / "shot.png", TRANSPARENT[name]
+    picture.save(path, **options)
     shot = read(path)
     np.testing.assert_array_equal(shot.usable, opaque)
     np.testing.assert_array_equal(shot.image[opaque], SHOT[opaque])
@@ -98,63 +79,42 @@ def test_one_bit_and_a_dark_table_of_greys(tmp_path: Path) -> None:
         path = tmp_path / f"shot{suffix}"
         Image.fromarray(SHOT > 100).save(path)
         np.testing.assert_array_equal(read(path).image > 0, SHOT > 100)
-        negative = Image.fromarray(SHOT).convert("P")
-        negative.putpalette(np.repeat(np.arange(255, -1, -1), 3).astype(np.uint8).tobytes())
-        negative.save(path)
+        table_of_greys(np.arange(255, -1, -1)).save(path)
         np.testing.assert_array_equal(read(path).image, 255 - SHOT)
 
 
-def test_pixels_of_ink_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "shot.jpg"
-    Image.fromarray(np.stack([SHOT] * 4, axis=-1), "CMYK").save(path)
-    with pytest.raises(FileFormatError, match="kind CMYK"):
-        read(path)
-
-
-def write_png(path: Path, name: bytes, data: bytes) -> None:
+def png_info(name: bytes, data: bytes) -> dict[str, PngImagePlugin.PngInfo]:
     info = PngImagePlugin.PngInfo()
     info.add(name, data)
-    Image.fromarray(SHOT).save(path, pnginfo=info)
+    return {"pnginfo": info}
 
 
 @pytest.mark.parametrize(
-    ("name", "data", "expected"),
+    ("suffix", "options", "expected"),
     [
-        (b"gAMA", struct.pack(">I", 45455), ["gamma"]),
-        (b"gAMA", struct.pack(">I", 100_000), []),
-        (b"sRGB", b"\0", ["gamma"]),
-        (b"tIME", bytes(7), []),
+        (".png", png_info(b"gAMA", struct.pack(">I", 45455)), ["gamma"]),
+        (".png", png_info(b"gAMA", struct.pack(">I", 100_000)), []),
+        (".png", png_info(b"sRGB", b"\0"), ["gamma"]),
+        (".png", png_info(b"tIME", bytes(7)), []),
+        (".png", {"icc_profile": b"desc sRGB IEC61966"}, ["gamma"]),
+        (".png", {"icc_profile": b"desc Linear grey"}, []),
+        (".png", {}, []),
+        (".bmp", {}, []),
+        (".jpg", {}, ["gamma"]),
     ],
 )
-def test_png_for_screens_gets_a_caution(
-    tmp_path: Path, name: bytes, data: bytes, expected: list[str]
+def test_pixels_that_are_not_proportional_to_light_get_a_caution(
+    tmp_path: Path, suffix: str, options: dict[str, Any], expected: list[str]
 ) -> None:
-    path = tmp_path / "shot.png"
-    write_png(path, name, data)
-    assert codes(path) == expected
-
-
-def test_png_with_a_colour_profile_gets_a_caution_unless_it_is_linear(tmp_path: Path) -> None:
-    path = tmp_path / "shot.png"
-    for profile, expected in ((b"desc sRGB IEC61966", ["gamma"]), (b"desc Linear grey", [])):
-        Image.fromarray(SHOT).save(path, icc_profile=profile)
-        assert codes(path) == expected
-
-
-def test_jpeg_gets_a_caution_and_bmp_none(tmp_path: Path) -> None:
-    for suffix, expected in ((".jpg", ["gamma"]), (".bmp", []), (".png", [])):
-        path = tmp_path / f"shot{suffix}"
-        Image.fromarray(SHOT).save(path)
-        assert codes(path) == expected
+    Image.fromarray(SHOT).save(tmp_path / f"shot{suffix}", **options)
+    assert [each.code for each in read_shot(tmp_path / f"shot{suffix}").cautions] == expected
 
 
 def test_mask_for_screens_gives_no_caution_and_its_gaps_are_unusable(tmp_path: Path) -> None:
     mask = np.full(SHOT.shape, 255, np.uint8)
     mask[:4] = 0
     mask[4:6] = 9
-    info = PngImagePlugin.PngInfo()
-    info.add(b"sRGB", b"\0")
-    Image.fromarray(mask).save(tmp_path / "mask.png", pnginfo=info, transparency=9)
+    Image.fromarray(mask).save(tmp_path / "mask.png", **png_info(b"sRGB", b"\0"), transparency=9)
     recipe = Recipe(mask=tmp_path / "mask.png", options={"n_sites": 60})
     result = run(recipe, 200.0 + SHOT)
     assert "gamma" not in {caution.code for caution in result.report.cautions}

@@ -5,9 +5,8 @@ import pytest
 
 from helpers.public_data import public_file
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.errors import FileFormatError, InputError
+from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io import read, read_shot
-from napari_shadowinv.io.formats import kind_of
 from napari_shadowinv.physics.setup import ProtonSetup
 
 VALUES = np.random.default_rng(3).normal(0, 1e3, (5, 7))
@@ -84,18 +83,6 @@ def test_comments_in_prose_tell_nothing(tmp_path: Path) -> None:
     assert read_shot(path).metadata["geometry"] == {}
 
 
-def test_pradreader_stacks_image_and_reference(tmp_path: Path) -> None:
-    path = tmp_path / "input.txt"
-    with path.open("w") as file:
-        file.write("# flux2D (5, 7)\n# flux2D_ref (5, 7)\n# x-mask 0 % - 100 %\n")
-        np.savetxt(file, VALUES, delimiter=",", fmt="%.17g")
-        np.savetxt(file, VALUES + 1, delimiter=",", fmt="%.17g")
-    radiograph = read_shot(path)
-    np.testing.assert_array_equal(radiograph.image, VALUES)
-    assert radiograph.source is not None
-    np.testing.assert_array_equal(radiograph.source, VALUES + 1)
-
-
 def pradreader(path: Path, *header: str, blocks: int = 3) -> Path:
     """Write shot, reference and a mask that leaves the last two columns out."""
     mask = np.zeros(VALUES.shape)
@@ -112,15 +99,23 @@ SELECTED = ("x-mask 0.0 % - 100.0 %", "y-mask 0.0 % - 100.0 %")
 
 
 @pytest.mark.parametrize(
-    "header", [ALL, (*ALL[:2], *SELECTED), ("flux2D (5, 7)", "flux2D_ref", "mask")]
+    ("header", "blocks"),
+    [
+        (ALL, 3),
+        ((*ALL[:2], *SELECTED), 3),
+        (("flux2D (5, 7)", "flux2D_ref", "mask"), 3),
+        ((*ALL[:2], SELECTED[0]), 2),
+    ],
 )
-def test_pradreader_stacks_a_mask_too(tmp_path: Path, header: tuple[str, ...]) -> None:
-    radiograph = read_shot(pradreader(tmp_path / "input.txt", *header))
+def test_pradreader_stacks_image_reference_and_mask(
+    tmp_path: Path, header: tuple[str, ...], blocks: int
+) -> None:
+    radiograph = read_shot(pradreader(tmp_path / "input.txt", *header, blocks=blocks))
     np.testing.assert_array_equal(radiograph.image, VALUES)
     assert radiograph.source is not None
     np.testing.assert_array_equal(radiograph.source, VALUES + 1)
-    assert radiograph.mask is not None
-    np.testing.assert_array_equal(radiograph.mask, np.arange(7) < np.full((5, 1), 5))
+    expected = np.arange(7) < np.full((5, 1), 5 if blocks == 3 else 7)
+    np.testing.assert_array_equal(radiograph.usable, expected)
 
 
 def test_pradreader_selects_rows_and_columns_by_their_share(tmp_path: Path) -> None:
@@ -148,54 +143,6 @@ def test_blocks_unlike_the_header_are_refused(
 ) -> None:
     with pytest.raises(FileFormatError, match=r"rows of 7 numbers, but its header gives flux2D"):
         read_shot(pradreader(tmp_path / "input.txt", *header, blocks=blocks))
-
-
-def test_a_mask_with_other_numbers_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "input.txt"
-    with path.open("w") as file:
-        file.write("# flux2D (5, 7)\n# mask (5, 7)\n")
-        np.savetxt(file, np.vstack([VALUES, VALUES]))
-    with pytest.raises(FileFormatError, match="numbers other than 0"):
-        read_shot(path)
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        (("# a", "1 2 3", "", "4 5"), r"number of columns changed from 3 to 2"),
-        (("1 2", "3 four"), r"could not convert string 'four'"),
-        (("1,2", "3,"), r"number of columns changed from 2 to 1"),
-        (("1,2", ",3"), r"could not convert string ''"),
-        (("1,5 2,5", "3,5 4,5"), r"string '5 2' .*: expected .* numbers with a decimal point"),
-        (("x,y,z", "1,2,3"), r"could not convert string 'x'"),
-        (("1 2 3",), r"holds 1 row of numbers: expected at least two"),
-        (("# nothing", ""), r"holds 0 rows of numbers"),
-        (("# energy = 14.7 cm", "1 2"), r"line 1 has '14.7 cm' for energy: .* converted to MeV"),
-        (("# pixel size: 3 apples", "1 2"), r"line 1 has '3 apples' for pixel_size"),
-    ],
-)
-def test_mistakes_are_named(tmp_path: Path, rows: tuple[str, ...], message: str) -> None:
-    with pytest.raises(FileFormatError, match=message):
-        read_shot(lines(tmp_path / "shot.csv", *rows))
-
-
-def test_impossible_setup_is_named(tmp_path: Path) -> None:
-    path = lines(
-        tmp_path / "shot.txt",
-        "# source_object_distance = 0.01",
-        "# object_image_distance = 0.2",
-        "# pixel_size = 1e-5",
-        "# energy = 0",
-        "1 2",
-        "3 4",
-    )
-    with pytest.raises(InputError, match=r"shot\.txt: 'energy' is 0"):
-        read_shot(path)
-
-
-def test_text_with_the_ending_of_a_picture_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match="is a text file"):
-        kind_of(lines(tmp_path / "shot.tif", "1 2", "3 4"))
 
 
 def test_published_example() -> None:
@@ -228,19 +175,18 @@ def test_column_and_row_of_coordinates_are_refused(
             read(path)
 
 
-def test_coordinates_of_uneven_steps_are_refused(tmp_path: Path) -> None:
+def test_lists_of_coordinates_and_uneven_steps_are_refused(tmp_path: Path) -> None:
+    path, (y, x) = tmp_path / "export.csv", np.indices(NOISE.shape)
     wavelengths = 500 + 0.3 * np.arange(12) - 0.002 * np.arange(12) ** 2
-    np.savetxt(tmp_path / "export.txt", np.column_stack([wavelengths, NOISE]))
-    with pytest.raises(FileFormatError, match="in its first column"):
-        read(tmp_path / "export.txt")
-
-
-def test_list_of_coordinates_and_values_is_refused(tmp_path: Path) -> None:
-    y, x = np.indices(NOISE.shape)
-    for columns in ((x, y, NOISE), (y, x, NOISE)):
-        np.savetxt(tmp_path / "export.csv", np.column_stack([c.ravel() for c in columns]))
-        with pytest.raises(FileFormatError, match=r"values of 1[25] × 1[25] pixels in columns"):
-            read(tmp_path / "export.csv")
+    listed = r"values of 1[25] × 1[25] pixels in columns"
+    for columns, sentence in (
+        ([c.ravel() for c in (x, y, NOISE)], listed),
+        ([c.ravel() for c in (y, x, NOISE)], listed),
+        ([wavelengths, NOISE], "in its first column"),
+    ):
+        np.savetxt(path, np.column_stack(columns))
+        with pytest.raises(FileFormatError, match=sentence):
+            read(path)
 
 
 @pytest.mark.parametrize(

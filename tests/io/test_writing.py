@@ -66,23 +66,6 @@ def test_unknown_ending_and_existing_file_are_refused(tmp_path: Path, inversion:
     assert (tmp_path / "a.shadowinv").read_text() == "old"
 
 
-def test_error_while_writing_leaves_the_old_result(
-    tmp_path: Path, inversion: Inversion, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = write(tmp_path / "a.shadowinv", inversion)
-    before = path.read_bytes()
-
-    def fail(temporary: Path, dataset: object) -> None:
-        temporary.write_text("half")
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr("napari_shadowinv.io.read_write.write_result", fail)
-    with pytest.raises(OSError, match="no space left"):
-        write(path, inversion, overwrite=True)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.parametrize("name", ["a.shadowinv", "a.h5", "a.csv", "a.tif", "a.npy", "a.png"])
 def test_a_full_disk_is_reported_and_keeps_the_old_file(
     name: str, small_disk: Disk, inversion: Inversion, proton_setup: ProtonSetup

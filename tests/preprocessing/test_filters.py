@@ -9,7 +9,11 @@ from napari_shadowinv.preprocessing import (
     ButterworthFilter,
     HighPassFilter,
     HotPixelFilter,
+    InterpolatedEstimate,
+    LowPassEstimate,
     LowPassFilter,
+    PolynomialEstimate,
+    TotalVariationEstimate,
     fit_polynomial,
     remove_hot_pixels,
 )
@@ -26,6 +30,9 @@ FILTERS = {
 
 def random_image(seed=0, shape=SHAPE):
     return np.random.default_rng(seed).uniform(1, 5, shape)
+
+
+ANY = random_image()
 
 
 def wave(n_y, n_x, shape=SHAPE):
@@ -258,40 +265,42 @@ def test_arrays_that_are_no_images_are_refused(name, image, words):
         FILTERS[name](image)
 
 
+WRONG_VALUES = [
+    (LowPassFilter, {"width": 0}), (HighPassFilter, {"width": np.nan}),
+    (ButterworthFilter, {"cutoff": -3}), (ButterworthFilter, {"cutoff": 2}),
+    (ButterworthFilter, {"order": 0}), (ButterworthFilter, {"order": 21}),
+    (ButterworthFilter, {"kind": "band"}), (BackgroundFilter, {"degree": 2.5}),
+    (BackgroundFilter, {"degree": 11}), (BackgroundFilter, {"kind": "add"}),
+    (PolynomialEstimate, {"degree": -1}), (LowPassEstimate, {"width": 0}),
+    (TotalVariationEstimate, {"weight": -1}), (TotalVariationEstimate, {"iterations": 0}),
+    (InterpolatedEstimate, {"width": np.inf}), (InterpolatedEstimate, {"kind": "cubic"}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("choice", "values"), WRONG_VALUES)
+def test_values_out_of_range_are_refused(choice, values):
+    ((name, value),) = values.items()
+    with pytest.raises(InputError, match=f"'{name}' is {value!r}"):
+        choice(**values)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda image: LowPassFilter(width=0).filter_image(image), "'width' is 0"),
-        (lambda image: HighPassFilter(width=np.nan).filter_image(image), "'width' is nan"),
-        (lambda image: ButterworthFilter(cutoff=-3).filter_image(image), "'cutoff' is -3"),
-        (lambda image: ButterworthFilter(cutoff=2).filter_image(image), "'cutoff' is 2"),
-        (lambda image: ButterworthFilter(cutoff=3, order=0).filter_image(image), "'order' is 0"),
-        (lambda image: ButterworthFilter(cutoff=3, order=21).filter_image(image), "'order' is 21"),
+        (lambda: BackgroundFilter().filter_image(ANY, np.ones(SHAPE)), "float64, expected bool"),
+        (lambda: BackgroundFilter().filter_image(ANY, np.ones((3, 3), bool)), r"shape \(3, 3\)"),
         (
-            lambda image: ButterworthFilter(cutoff=3, kind="band").filter_image(image),
-            "'kind' is 'band'",
-        ),
-        (lambda image: BackgroundFilter(degree=2.5).filter_image(image), "'degree' is 2.5"),
-        (lambda image: BackgroundFilter(degree=11).filter_image(image), "at most 10"),
-        (lambda image: BackgroundFilter(kind="add").filter_image(image), "'kind' is 'add'"),
-        (
-            lambda image: BackgroundFilter().filter_image(image, np.ones(SHAPE)),
-            "float64, expected bool",
-        ),
-        (
-            lambda image: BackgroundFilter().filter_image(image, np.ones((3, 3), bool)),
-            r"shape \(3, 3\)",
-        ),
-        (
-            lambda image: BackgroundFilter().filter_image(image, np.zeros(SHAPE, bool)),
+            lambda: BackgroundFilter().filter_image(ANY, np.zeros(SHAPE, bool)),
             "mask leaves 0 of .* pixels usable",
         ),
-        (lambda image: fit_polynomial(image[:2, :2], 2), "6 coefficients"),
-        (lambda image: remove_hot_pixels(image, threshold=0), "threshold is 0"),
-        (lambda image: remove_hot_pixels(image, size=4), "odd"),
-        (lambda image: remove_hot_pixels(image, size=1), "at least 3"),
+        (lambda: fit_polynomial(ANY[:2, :2], 2), "6 coefficients"),
+        (lambda: fit_polynomial(ANY, 11), "degree is 11, expected a whole number from 0 to 10"),
+        (lambda: remove_hot_pixels(ANY, threshold=0), "threshold is 0"),
+        (lambda: remove_hot_pixels(ANY, threshold="6"), "threshold is '6'"),
+        (lambda: remove_hot_pixels(ANY, size=4), "size is 4, expected an odd number from 3"),
+        (lambda: remove_hot_pixels(ANY, size=1), "size is 1, expected an odd number from 3"),
     ],
 )
-def test_options_that_make_no_sense_are_refused(call, words):
+def test_masks_and_numbers_that_make_no_sense_are_refused(call, words):
     with pytest.raises(InputError, match=words):
-        call(random_image())
+        call()

@@ -33,6 +33,21 @@ def predict(image, bare):
     return source, kriged_prior(image, bare)
 
 
+def error_ratios(source, true, prior, bare=BARE):
+    """Return errors of a beam behind an object in units of their deviation, in the blocks."""
+    middles = np.s_[prior.components.block // 2 :: prior.components.block]
+    behind = ~bare[middles, middles]
+    height, width = behind.shape
+    deviations = np.sqrt((prior.components.patterns**2).sum(axis=0))[:height, :width]
+    return (log_error(source, true, bare)[middles, middles] / deviations)[behind]
+
+
+def log_error(source, true, bare=BARE):
+    """Return the error of the logarithm of a beam, without that of its brightness."""
+    error = np.log(source / true)
+    return error - error[bare].mean()
+
+
 def hidden(image):
     """Return an image whose object has no likeness to the beam."""
     return np.where(BARE, image, 1e4)
@@ -46,10 +61,7 @@ def test_the_beam_behind_an_object_is_within_the_conditional_variance(length):
         rng = np.random.default_rng(seed)
         true = beam(length, rng)
         source, prior = predict(hidden(rng.poisson(300 * true)), BARE)
-        middles = np.s_[prior.components.block // 2 :: prior.components.block]
-        errors = np.log(source / true)[middles, middles] - np.log(source / true)[BARE].mean()
-        deviations = np.sqrt((prior.components.patterns**2).sum(axis=0))
-        ratios.append((errors / deviations)[~BARE[middles, middles]])
+        ratios.append(error_ratios(source, true, prior))
         lengths.append(prior.length)
     ratio = np.abs(np.concatenate(ratios))
     assert 0.55 < (ratio < 1).mean() < 0.85
@@ -132,14 +144,8 @@ def test_random_waves_behind_a_traced_object_are_predicted_within_their_error():
             "kriged": source,
         }
         for name, estimate in sources.items():
-            error = np.log(estimate / true)
-            error -= error[bare].mean()
-            errors[name].append(np.sqrt((error[~bare] ** 2).mean()))
-        places = np.s_[prior.components.block // 2 :: prior.components.block]
-        deviations = np.sqrt((prior.components.patterns**2).sum(axis=0))
-        hidden = ~bare[places, places]
-        deviations = deviations[: hidden.shape[0], : hidden.shape[1]]
-        ratios.append(error[places, places][hidden] / deviations[hidden])  # of kriged, the last
+            errors[name].append(np.sqrt((log_error(estimate, true, bare)[~bare] ** 2).mean()))
+        ratios.append(error_ratios(source, true, prior, bare))
         lengths.append(prior.length)
     rms = {name: np.sqrt(np.mean(np.square(each))) for name, each in errors.items()}
     assert rms["kriged"] < 0.3 * rms["polynomial"] < 0.3 * rms["uniform"]
@@ -166,9 +172,7 @@ def test_a_smooth_profile_is_continued_under_the_mask(profile, noise):
     image = true * (1 + noise * np.random.default_rng(0).normal(size=true.shape))
     cautions = []
     source = KrigedEstimate().source(hidden(image), BARE, on_caution=cautions.append)
-    error = np.log(source / true)
-    error -= error[BARE].mean()
-    assert np.abs(error[~BARE]).max() < 3e-3
+    assert np.abs(log_error(source, true)[~BARE]).max() < 3e-3
     assert not cautions
 
 
@@ -180,12 +184,8 @@ def test_waves_on_a_spot_are_predicted_as_those_on_an_even_beam():
         for name, profile in (("spot", np.exp(-4 * (Y**2 + X**2))), ("even", 1.0)):
             true = profile * waves
             source, prior = predict(hidden(rng.poisson(1000 * true)), BARE)
-            error = np.log(source / true)
-            error -= error[BARE].mean()
-            errors[name].append((error[~BARE] ** 2).mean())
-            places = np.s_[prior.components.block // 2 :: prior.components.block]
-            deviations = np.sqrt((prior.components.patterns**2).sum(axis=0))
-            ratios.append((error[places, places] / deviations)[~BARE[places, places]])
+            errors[name].append((log_error(source, true)[~BARE] ** 2).mean())
+            ratios.append(error_ratios(source, true, prior))
     assert np.mean(errors["spot"]) < 2 * np.mean(errors["even"])
     assert np.square(np.concatenate(ratios)).mean() == pytest.approx(1, abs=0.35)
 
@@ -198,13 +198,7 @@ def test_the_error_of_a_prediction_has_its_size_at_any_length(length):
         rng = np.random.default_rng(seed)
         true = random_waves(rng, length, 0.03)(*np.indices((SIDE, SIDE)))
         source, prior = predict(hidden(rng.poisson(1000 * true)), BARE)
-        error = np.log(source / true)
-        error -= error[BARE].mean()
-        places = np.s_[prior.components.block // 2 :: prior.components.block]
-        behind = ~BARE[places, places]
-        deviations = np.sqrt((prior.components.patterns**2).sum(axis=0))
-        deviations = deviations[: behind.shape[0], : behind.shape[1]]
-        ratios.append(error[places, places][behind] / deviations[behind])
+        ratios.append(error_ratios(source, true, prior))
     rms = np.sqrt(np.square(np.concatenate(ratios)).mean())
     assert 0.85 < rms < 1.3
 

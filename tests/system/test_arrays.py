@@ -220,48 +220,39 @@ def test_unnamed_dimensions_are_taken_in_order() -> None:
 
 
 def _placed(spacing_y: float, spacing_x: float, unit: str) -> xr.DataArray:
-    height, width = SHOT.shape
-    return xr.DataArray(
-        SHOT,
-        dims=("y", "x"),
-        coords={
-            "y": ("y", spacing_y * np.arange(height), {"units": unit}),
-            "x": ("x", spacing_x * np.arange(width), {"units": unit}),
-        },
-    )
+    places = {
+        name: (name, spacing * np.arange(side), {"units": unit})
+        for name, spacing, side in zip("yx", (spacing_y, spacing_x), SHOT.shape, strict=True)
+    }
+    return xr.DataArray(SHOT, dims=("y", "x"), coords=places)
 
 
 @pytest.mark.parametrize(
-    ("image", "passes"),
+    ("spacing_y", "spacing_x", "unit", "passes"),
     [
-        (_placed(0.01, 0.01, "mm"), True),
-        (_placed(10.0, 10.0, "µm"), True),
-        (_placed(1.0, 1.0, "px"), True),
-        (_placed(1.0, 1.0, ""), True),
-        (_placed(0.2, 0.2, "mm"), False),
-        (_placed(0.01, 0.02, "mm"), False),
+        *((0.01, 0.01, "mm", True), (10, 10, "µm", True), (1, 1, "px", True), (1, 1, "", True)),
+        *((0.2, 0.2, "mm", False), (0.01, 0.02, "mm", False)),
     ],
-    ids=["mm", "um", "pixels", "bare", "contradicting", "oblong"],
 )
-def test_coordinates_must_agree_with_the_setup(image: xr.DataArray, passes: bool) -> None:
-    recipe = Recipe(setup=SETUP, options=OPTIONS)
+def test_coordinates_must_agree_with_the_setup(
+    spacing_y: float, spacing_x: float, unit: str, passes: bool
+) -> None:
+    image, recipe = _placed(spacing_y, spacing_x, unit), Recipe(setup=SETUP, options=OPTIONS)
     stack = xr.concat([image, image], "shot")
     if passes:
         assert run(recipe, image).setup == SETUP
-        assert invert_stack(stack, Recipe(setup=SETUP, options=OPTIONS)).sizes["shot"] == 2
+        assert invert_stack(stack, recipe).sizes["shot"] == 2
         return
     with pytest.raises(InputError, match=r"pixels of .* m"):
         run(recipe, image)
     with pytest.raises(InputError, match=r"pixels of .* m"):
-        invert_stack(stack, Recipe(setup=SETUP, options=OPTIONS))
+        invert_stack(stack, recipe)
 
 
 def test_uneven_coordinates_are_refused() -> None:
     image = _placed(1.0, 1.0, "mm")
-    image = image.assign_coords(y=image.y**2)
-
     with pytest.raises(InputError, match="not evenly spaced"):
-        invert(image, options=OPTIONS)
+        invert(image.assign_coords(y=image.y**2), options=OPTIONS)
 
 
 @pytest.mark.parametrize("scale", [1e-290, 1.0, 1e290])
@@ -269,10 +260,7 @@ def test_order_by_value_sorts_at_any_scale(scale: float) -> None:
     values = scale * np.random.default_rng(3).integers(-5, 50, 3000)
     order = order_by_value(values)
     assert np.array_equal(order, np.argsort(values, kind="stable"))
-
-
-def test_order_by_value_keeps_equal_values_in_sequence() -> None:
-    assert np.array_equal(order_by_value(np.full(7, 2.0)), np.arange(7))
+    assert np.array_equal(order_by_value(np.full(7, scale)), np.arange(7))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from helpers.signals import start
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.files import check_output, replacing
+from napari_shadowinv.io.files import replacing
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 
@@ -175,12 +175,3 @@ def test_lock_is_removed_whenever_a_signal_comes(
     assert names_in(tmp_path) == []
     with locked(tmp_path / "a.shadowinv.zarr"):
         pass
-
-
-def test_long_name_is_written_and_one_too_long_refused(tmp_path: Path) -> None:
-    path = tmp_path / ("n" * 226 + ".txt")
-    with replacing(path) as draft:
-        draft.write_text("all")
-    assert path.read_text() == "all"
-    with pytest.raises(FileFormatError, match="its name has 231 bytes, expected at most 230"):
-        check_output(tmp_path / ("n" * 227 + ".txt"))

@@ -16,21 +16,17 @@ def test_ctrl_c_waits_for_the_end_of_the_block() -> None:
     before = signal.getsignal(signal.SIGINT)
     done = []
 
-    def work() -> None:
+    def work(number: int | None) -> None:
         with defer_interrupts():
-            signal.raise_signal(signal.SIGINT)
-            done.append("all of it")
+            assert signal.getsignal(signal.SIGINT) is not before
+            if number is not None:
+                signal.raise_signal(number)
+            done.append(number)
 
+    work(None)
     with pytest.raises(KeyboardInterrupt):
-        work()
-    assert done
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_without_ctrl_c_nothing_is_raised() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    with defer_interrupts():
-        assert signal.getsignal(signal.SIGINT) is not before
+        work(signal.SIGINT)
+    assert done == [None, signal.SIGINT]
     assert signal.getsignal(signal.SIGINT) is before
 
 

@@ -10,19 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import h5py
-import numpy as np
 import pytest
 import tifffile
-from scipy.io import savemat
 
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import LIMIT_VARIABLE, as_file_errors, size_limit
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 from napari_shadowinv.film import Calibration
 from napari_shadowinv.io import read, read_toml
-from napari_shadowinv.io.read_write import read_shot
-
-IMAGE = np.random.default_rng(0).poisson(300, (40, 50)).astype(np.uint16)
 
 
 @pytest.mark.parametrize("reader", [read, read_toml, Calibration.from_csv])
@@ -93,45 +88,6 @@ def test_a_mistake_in_the_program_is_not_blamed_on_the_file(tmp_path: Path) -> N
         lacks_a_module(tmp_path / "a.tif")
     with pytest.raises(NameError, match="'nowhere' is not defined"):
         lacks_a_name(tmp_path / "a.tif")
-
-
-def write_hdf5(path: Path) -> None:
-    with h5py.File(path, "w") as file:
-        file.create_dataset("image", data=IMAGE, compression="gzip")
-        file.attrs["object_type"] = "radiograph"
-
-
-LARGE: dict[str, Callable[[Path], object]] = {
-    "shot.tif": lambda path: tifffile.imwrite(path, IMAGE, compression="zlib"),
-    "shot.png": lambda path: write_picture(path),
-    "shot.bmp": lambda path: write_picture(path),
-    "shot.npy": lambda path: np.save(path, IMAGE),
-    "shot.txt": lambda path: np.savetxt(path, IMAGE, fmt="%d"),
-    "five.mat": lambda path: savemat(path, {"shot": IMAGE}),
-    "packed.mat": lambda path: savemat(path, {"shot": IMAGE}, do_compression=True),
-    "shot.h5": write_hdf5,
-}
-
-
-def write_picture(path: Path) -> None:
-    import imageio.v3 as iio
-
-    iio.imwrite(path, (IMAGE // 4).astype(np.uint8))
-
-
-@pytest.mark.parametrize("name", LARGE)
-def test_oversized_content_is_refused_with_a_way_to_allow_it(
-    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = tmp_path / name
-    LARGE[name](path)
-    monkeypatch.setenv(LIMIT_VARIABLE, "1e-5")  # 10 kB, and the image takes 16 in memory
-    # Of text, the most numbers that its bytes can hold
-    size = "3.2e-05" if name == "shot.txt" else "1.6e-05"
-    with pytest.raises(FileFormatError, match=f"expands to {size} GB .* {LIMIT_VARIABLE}"):
-        read(path)
-    monkeypatch.setenv(LIMIT_VARIABLE, "1")
-    assert read_shot(path).image.shape == IMAGE.shape
 
 
 def test_a_chunk_larger_than_its_array_counts(tmp_path: Path) -> None:
