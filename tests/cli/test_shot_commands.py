@@ -843,13 +843,13 @@ def test_ctrl_c_converted_by_a_library_still_cancels(folder: Path, shot: Path) -
 def test_ctrl_c_while_writing_keeps_the_old_result(folder: Path, shot: Path) -> None:
     (folder / "shot.shadowinv").write_text("old")
     slow_disk = """
-        from napari_shadowinv.io import read_write
+        from pathlib import Path
 
-        def write_slowly(path, dataset):
+        def write_slowly(path, content):
             path.write_text("half")
             stall()
 
-        read_write.write_result = write_slowly
+        Path.write_bytes = write_slowly
     """
     before = content(folder)
     code, errors = interrupted(folder, slow_disk, ["invert", "shot.npy", "--overwrite"])
@@ -899,7 +899,8 @@ def test_a_figure_that_fails_does_not_cost_the_result(
 def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Path) -> None:
     impatient = """
         import signal
-        from napari_shadowinv.io import read_write, files
+        from pathlib import Path
+        from napari_shadowinv.io import files
 
         class Room:
             def __enter__(self):
@@ -908,12 +909,12 @@ def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Pat
             def __exit__(self, *error):
                 pass
 
-        def write_slowly(path, dataset):
+        def write_slowly(path, content):
             path.write_text("half")
             files.defer_interrupts = Room
             stall()
 
-        read_write.write_result = write_slowly
+        Path.write_bytes = write_slowly
     """
     code, errors = interrupted(folder, impatient, ["invert", "shot.npy"])
     assert (code, errors.strip()) == (130, "Cancelled")

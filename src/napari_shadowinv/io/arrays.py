@@ -139,9 +139,6 @@ def read_npy_plane(path: Path, number: int = 0) -> tuple[AnyArray, dict[str, Any
     return read_npy(path, number), {}
 
 
-def write_npy(path: Path, array: AnyArray, pixel_size: float | None = None) -> None:
+def write_npy(content: BytesIO, array: AnyArray, pixel_size: float | None = None) -> None:
     """Write an array as it is; the format does not keep the size of a pixel."""
-    content = BytesIO()
     np.save(content, array, allow_pickle=False)
-    # numpy gives no reason when it cannot write to a file.
-    path.write_bytes(content.getvalue())

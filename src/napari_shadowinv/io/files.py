@@ -29,7 +29,6 @@ _ADDRESS = "::"  # between a file and the name of an array in it
 _LOCATION = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+-]+):/+(?P<place>.+)")
 _LOCAL = re.compile(r"file:/+(?:localhost(?=/))?", re.IGNORECASE)
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_CUT_SHORT = re.compile(r"\d+ requested and \d+ written")  # numpy's words where there is no room
 
 
 def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, str | None]:
@@ -214,12 +213,11 @@ def replacing(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
                     os.fsync(file.fileno())
                 os.replace(temporary, path)
         except OSError as error:
-            if error.errno not in _NO_ROOM and not _CUT_SHORT.fullmatch(str(error)):
+            if error.errno not in _NO_ROOM:
                 raise
-            reason = error.strerror or "No space left on device"
             raise FileFormatError(
-                f"{path} cannot be written ({reason}): free some disk space, or choose another "
-                "folder"
+                f"{path} cannot be written ({error.strerror}): free some disk space, or choose "
+                "another folder"
             ) from error
         finally:
             # A second Ctrl-C must not leave the half of it behind.

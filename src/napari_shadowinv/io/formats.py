@@ -42,8 +42,8 @@ class Format:
     # The readers then take the number of a frame, by default that of the first.
     counter: str = ""
     lister: str = ""  # of a path: the names of the images in it, and all arrays
-    image_writer: str = ""  # of a path, an image and its pixel size (m) or None
-    result_writer: str = ""  # of a path and a dataset
+    image_writer: str = ""  # of a file in memory, an image and its pixel size (m) or None
+    result_writer: str = ""  # of a file in memory and a dataset
     results: tuple[ResultKind, ...] = ()  # kinds of the results that it writes
     is_scan: bool = False  # may it be a scan of film, whose grey levels fall with dose
 

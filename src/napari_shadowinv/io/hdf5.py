@@ -3,7 +3,7 @@
 - `open_hdf5`; an item, `member`, or all of a file, `walk`; its values, `load_dataset`, and an
   attribute, `plain_value`
 - refuse a file whose arrays are elsewhere or too large: `check_arrays`
-- write one: `hdf5_in_memory`; compare its checksum: `check_hdf5_seal`
+- add a checksum, `seal_hdf5`, and compare it, `check_hdf5_seal`
 
 An HDF5 file can point to others: by external links, external storage and virtual arrays. No
 reader follows them, because the content of another file would pass for the file's own pixels.
@@ -16,7 +16,7 @@ import math
 import os
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
@@ -175,24 +175,18 @@ def check_arrays(path: Path) -> None:
                     _check_promise(path, item)
 
 
-@contextmanager
-def hdf5_in_memory(path: Path, *, seal: bool = False) -> Iterator[BytesIO]:
-    """Make an HDF5 file in memory, and write it to the disk in one go when the block ends well.
+def seal_hdf5(content: BytesIO) -> None:
+    """Add the checksum of all bytes of a file behind its end, where the HDF5 library never looks.
 
-    With `seal`, the checksum of all its bytes follows its end, where the HDF5 library never looks:
-    the checksums of the format leave out texts of variable length, such as attributes.
+    The checksums of the format leave out texts of variable length, such as attributes.
     """
-    content = BytesIO()  # on a full disk, the HDF5 library would end the process
-    yield content
-    if seal:
-        checksum = hashlib.sha256(content.getvalue()).hexdigest()
-        content.seek(0, os.SEEK_END)
-        content.write(_SEAL + checksum.encode())
-    path.write_bytes(content.getvalue())
+    checksum = hashlib.sha256(content.getvalue()).hexdigest()
+    content.seek(0, os.SEEK_END)
+    content.write(_SEAL + checksum.encode())
 
 
 def check_hdf5_seal(path: Path) -> None:
-    """Refuse a file that has changed since `hdf5_in_memory` sealed it; others pass.
+    """Refuse a file that has changed since `seal_hdf5`; others pass.
 
     A program that changes the file by the HDF5 library removes the seal.
     """

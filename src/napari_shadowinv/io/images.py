@@ -245,13 +245,10 @@ def _printed_sides(info: dict[Any, Any]) -> tuple[float, ...]:
     return tuple(INCH_M / each for each in dots) if min(dots) > 1 else ()
 
 
-def write_png(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
+def write_png(content: BytesIO, plane: AnyArray, pixel_size: float | None = None) -> None:
     """Write a plane with 16 bits, its largest value white, negative ones black."""
     from PIL import Image
 
     level = max(float(np.max(plane)), 0.0) / 65535 or 1.0
     grey = np.clip(np.rint(np.asarray(plane) / level), 0, 65535).astype(np.uint16)
-    content = BytesIO()
     Image.fromarray(grey).save(content, "PNG")
-    # Only when all of it is there: a full disk then gives one plain error.
-    path.write_bytes(content.getvalue())

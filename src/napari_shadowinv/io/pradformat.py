@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
-from napari_shadowinv.io.hdf5 import hdf5_in_memory, load_dataset, member, open_hdf5, plain_value
+from napari_shadowinv.io.hdf5 import load_dataset, member, open_hdf5, plain_value
 from napari_shadowinv.physics.beam import displacement_from_potential
 from napari_shadowinv.physics.setup import Setup, Species, setup_from_dict
 from napari_shadowinv.physics.units import refuse_missing
@@ -157,7 +158,7 @@ def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
     return provenance.with_pixels(masks).added_to(dataset)
 
 
-def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
+def write_pradformat(content: BytesIO, dataset: xarray.Dataset) -> None:
     """Write a result's potential and deflection angles as a pradformat "simple inversion".
 
     Of a fit's other parts, only the verdict is kept, in the description.
@@ -195,7 +196,7 @@ def write_pradformat(path: Path, dataset: xarray.Dataset) -> None:
         attributes["provenance"] = provenance.to_json()
         if provenance.images and provenance.image.file:
             attributes["radiograph_filename"] = provenance.image.file
-    with hdf5_in_memory(path) as content, h5py.File(content, "w") as file:
+    with h5py.File(content, "w") as file:
         for name, values in datasets.items():
             file.create_dataset(name, data=values, compression="gzip", compression_opts=4)
         file.attrs.update(attributes)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 import tomllib
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,11 +32,7 @@ from napari_shadowinv.io.formats import (
     suffixes_for,
 )
 from napari_shadowinv.io.frames import FileFrame, find_frames, lazy_frames
-from napari_shadowinv.io.hdf5 import (
-    check_arrays,
-    check_hdf5_seal,
-    hdf5_in_memory,
-)
+from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, seal_hdf5
 from napari_shadowinv.io.images import film_cautions, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.physics.units import refuse_missing
@@ -236,7 +233,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 _SITE_COLUMNS = "y_px,x_px,weight_px2,mass,flux,displacement_y_px,displacement_x_px"
 
 
-def write_result(path: Path, dataset: xarray.Dataset) -> None:
+def write_result(content: BytesIO, dataset: xarray.Dataset) -> None:
     """Write a dataset as NetCDF4, moderately compressed and with checksums."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
@@ -253,11 +250,9 @@ def write_result(path: Path, dataset: xarray.Dataset) -> None:
     # A field that was read from a file of another format still says so.
     marked = dataset.assign_attrs(format=ResultKind.of(dataset.attrs).value)
     # From this version of the format on, the file's own structures have checksums.
-    with (
-        hdf5_in_memory(path, seal=True) as content,
-        h5netcdf.File(content, "w", libver=("v110", "v110")) as file,
-    ):
+    with h5netcdf.File(content, "w", libver=("v110", "v110")) as file:
         marked.dump_to_store(H5NetCDFStore(file), encoding=encoding)
+    seal_hdf5(content)
 
 
 def read_result(path: Path) -> xarray.Dataset:
@@ -270,12 +265,12 @@ def read_result(path: Path) -> xarray.Dataset:
     return xr.load_dataset(path, engine="h5netcdf", decode_times=False)
 
 
-def write_sites(path: Path, dataset: xarray.Dataset) -> None:
+def write_sites(content: BytesIO, dataset: xarray.Dataset) -> None:
     """Write the sites of a result as comma-separated values, one in each row."""
     names = ("sites", "weights", "site_mass", "site_flux", "site_displacement")
     refuse_missing(dataset, "result of an inversion", names)
     columns = np.column_stack([dataset[name].values for name in names])
-    np.savetxt(path, columns, delimiter=",", header=_SITE_COLUMNS, comments="", fmt="%.17g")
+    np.savetxt(content, columns, delimiter=",", header=_SITE_COLUMNS, comments="", fmt="%.17g")
 
 
 def write(
@@ -325,16 +320,22 @@ def write(
         if result.ndim != 2 or result.size == 0:
             raise InputError(f"image has shape {result.shape}: expected (height, width)")
         pixel_size = None if setup is None else setup.object_pixel_size
-        with replacing(path, overwrite) as temporary:
-            function(IMAGE_WRITERS[temporary.suffix.lower()])(temporary, result, pixel_size)
-        return Path(path)
+        writer = IMAGE_WRITERS[Path(path).suffix.lower()]
+        return _write_whole(path, overwrite, writer, result, pixel_size)
     dataset = _as_dataset(result, setup)
     kind = ResultKind.of(dataset.attrs)
     check_output(path, overwrite, suffixes=suffixes_for(kind))
+    suffix = Path(path).suffix.lower()
+    (file_format,) = (each for each in formats_for(kind) if suffix in each.suffixes)
+    return _write_whole(path, overwrite, file_format.result_writer, dataset)
+
+
+def _write_whole(path: str | Path, overwrite: bool, writer: str, *content: Any) -> Path:
+    """Make a file in memory, and write it in one go: on a full disk, HDF5 would end the process."""
     with replacing(path, overwrite) as temporary:
-        suffix = temporary.suffix.lower()
-        (file_format,) = (each for each in formats_for(kind) if suffix in each.suffixes)
-        function(file_format.result_writer)(temporary, dataset)
+        file = BytesIO()
+        function(writer)(file, *content)
+        temporary.write_bytes(file.getvalue())
     return Path(path)
 
 

@@ -15,6 +15,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
@@ -332,11 +333,11 @@ def _pixel_sides(tiff: Any, page: Any) -> tuple[tuple[float, ...], bool]:
     return metres, max(lengths) <= 1e-3
 
 
-def write_tiff(path: Path, plane: AnyArray, pixel_size: float | None = None) -> None:
+def write_tiff(content: BytesIO, plane: AnyArray, pixel_size: float | None = None) -> None:
     """Write a plane as float32 TIFF, the width of a pixel (m) as its resolution."""
     options: dict[str, Any] = {}
     if pixel_size is not None:
         per_centimetre = 0.01 / pixel_size
         options = {"resolution": (per_centimetre, per_centimetre), "resolutionunit": "CENTIMETER"}
     values = np.asarray(plane, dtype=np.float32)
-    tifffile.imwrite(path, values, photometric="minisblack", software="shadowinv", **options)
+    tifffile.imwrite(content, values, photometric="minisblack", software="shadowinv", **options)
