@@ -548,10 +548,11 @@ def _solution_facts(fit: Fit) -> Iterator[Fact]:
     yield from masked_fact(fit.mask)
     if fit.folded:
         yield Fact("crossed_rays", "Crossed rays", f"{percent(fit.folded)} of the pixels")
+    steps = f"{fit.report.iterations} iteration{'s' * (fit.report.iterations != 1)}"
     if fit.report.converged:
-        yield Fact("converged", "Converged", f"in {fit.report.iterations} iterations")
+        yield Fact("converged", "Converged", f"in {steps}")
     else:
-        text = f"NO, not in {fit.report.iterations} iterations: allow more"
+        text = f"NO, not in {steps}: allow more"
         yield Fact("converged", "Converged", text, Level.FAILED, short="NOT converged")
 
 
