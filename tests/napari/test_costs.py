@@ -7,7 +7,7 @@ from typing import Any
 from napari_shadowinv import InversionOptions, fit
 from napari_shadowinv._napari.costs import FitProgress, fit_cost, inversion_cost
 from napari_shadowinv._system.progress import Progress
-from napari_shadowinv.options import FitChoices, FitOptions
+from napari_shadowinv.options import FitChoices, FitOptions, Instrument
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.shot import shots_of
@@ -66,11 +66,20 @@ def test_a_forecast_grows_with_what_is_asked_for() -> None:
     assert seconds(200, 2, options=FitOptions(samples=0)) < seconds(200, 2)
 
 
+def test_a_forecast_knows_that_samples_of_beams_between_energies_are_fitted() -> None:
+    instrument, choices = Instrument(beam_between=0.05), FitChoices()
+    costs = [fit_cost((200, 200), 2, choices, each).seconds for each in (Instrument(), instrument)]
+    assert 2 < costs[1] / costs[0] < 3
+    assert fit_cost((200, 200), 1, choices, instrument) == fit_cost((200, 200), 1, choices)
+    quick = FitChoices(options=FitOptions(samples=0))
+    assert fit_cost((200, 200), 2, quick, instrument) == fit_cost((200, 200), 2, quick)
+
+
 def test_the_next_forecast_follows_the_last_fit() -> None:
     shape, choices = (1000, 1000), FitChoices(fields=("B", "E"))
     text = fit_cost(shape, 3, choices).text
     assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 80 s, up to 5 min")
-    assert "about 4 min, based on the last fit" in fit_cost(shape, 3, choices, 3.0).text
+    assert "about 4 min, based on the last fit" in fit_cost(shape, 3, choices, pace=3.0).text
     single = fit_cost((200, 200), 1, FitChoices(beam="unknown"))
     assert single.text.startswith("one image of 200 × 200 px, unknown beam: about ")
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import Progress
-from napari_shadowinv.options import MAX_DEFAULT_SITES, FitChoices, InversionOptions
+from napari_shadowinv.options import MAX_DEFAULT_SITES, FitChoices, Instrument, InversionOptions
 
 # Twice what two fast cores take for two to four images of 64² to 400² px without crossing rays.
 # Crossing rays, or a search for the cause of a misfit, multiply the time by 1.9 to 4.
@@ -20,6 +20,9 @@ _CROSSING_RAYS_FACTOR = 4.0
 _TWO_FIELDS_FACTOR, _UNKNOWN_BEAM_FACTOR = 1.5, 1.2
 # Time of an error bar's sample relative to the fit.
 _TIME_PER_SAMPLE, _TIME_PER_BEAM_SAMPLE = 0.008, 0.012
+# Where the beam changes between energies, samples are fitted, and are this many at least; up to
+# twice as long for images of less than 100² px.
+_TIME_PER_FITTED_SAMPLE, _LEAST_FITTED_SAMPLES = 0.1, 16
 _EVIDENCE_IN_SAMPLES = 20
 # Of an inversion; measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites,
 # including the layers of the result.
@@ -63,16 +66,24 @@ def inversion_cost(
 
 
 def fit_cost(
-    shape: Sequence[int], images: int, choices: FitChoices, pace: float | None = None
+    shape: Sequence[int],
+    images: int,
+    choices: FitChoices,
+    instrument: Instrument | None = None,
+    pace: float | None = None,
 ) -> Cost:
     """Estimate a fit without crossing rays, by the pace of the last one if it is known."""
     fields, is_unknown = len(choices.fields or ("B",)), choices.beam == "unknown"
     seconds = _TIME_S + _TIME_PER_PIXEL_S * images * shape[0] * shape[1]
     seconds *= _TWO_FIELDS_FACTOR if fields > 1 else 1
     seconds *= _UNKNOWN_BEAM_FACTOR if is_unknown else 1
+    per_sample = _TIME_PER_BEAM_SAMPLE if is_unknown else _TIME_PER_SAMPLE
     samples = choices.options.samples if choices.options.samples > 1 else 0
-    samples += _EVIDENCE_IN_SAMPLES if choices.options.evidence else 0
-    seconds *= 1 + samples * (_TIME_PER_BEAM_SAMPLE if is_unknown else _TIME_PER_SAMPLE)
+    of_samples = samples * per_sample
+    if samples and images > 1 and instrument is not None and instrument.beam_between:
+        of_samples = max(samples, _LEAST_FITTED_SAMPLES) * _TIME_PER_FITTED_SAMPLE
+    of_evidence = _EVIDENCE_IN_SAMPLES * per_sample if choices.options.evidence else 0
+    seconds *= 1 + of_samples + of_evidence
     seconds *= pace or 1
     count = "one image" if images == 1 else f"{images} images"
     more = f", {fields} fields" if fields > 1 else ""

@@ -194,7 +194,8 @@ class FitJob(ImageJob):
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         fit = self.compute(lambda state: on_progress(self.progress.update(state)), should_stop)
-        cost = fit_cost(self.recipe.shape_after(self.shots[0].shape), len(self.shots), self.choices)
+        shape, instrument = self.recipe.shape_after(self.shots[0].shape), self.recipe.instrument
+        cost = fit_cost(shape, len(self.shots), self.choices, instrument)
         FitJob.pace = sum(fit.report.seconds.values()) / cost.seconds
         return fit
 

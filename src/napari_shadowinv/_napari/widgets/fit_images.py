@@ -249,7 +249,7 @@ class FitImages(inputs.ImagePanel):
             images, recipe = self._images(), self.recipe()
             shape = recipe.shape_after(images[0].data.shape)
             assert recipe.fit is not None
-            cost = fit_cost(shape, len(images), recipe.fit, FitJob.pace)
+            cost = fit_cost(shape, len(images), recipe.fit, recipe.instrument, FitJob.pace)
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return
