@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,27 +47,27 @@ def export_shots(
     dataset = open_shots(store, shots)
     if form == "tiff":
         _check_images(dataset, variables)
-    jobs: list[tuple[Path, Callable[[Path], object]]] = []
+    contents: dict[Path, tuple[Any, Any]] = {}  # of the files, with their setups
     for position in range(dataset.sizes["shot"]):
         shot = dataset.isel(shot=position)
         setup = setup_from_dataset(shot)
         if form == "tiff":
             for name, plane in _planes(shot, variables):
-                job = partial(_write_plane, plane=plane, setup=setup, overwrite=overwrite)
-                jobs.append((out / f"{_stem(shot)}_{name}{TIFF.suffix}", job))
-        else:
-            check_pradformat_setup(setup)
-            # A shot may have its own provenance.
-            if (provenance := provenance_of(shot)) is not None:
-                shot = shot.assign_attrs(provenance=provenance.to_json())
-            job = partial(_write_field, shot=shot, setup=setup, overwrite=overwrite)
-            jobs.append((out / f"{_stem(shot)}{PRADFORMAT.suffix}", job))
+                contents[out / f"{_stem(shot)}_{name}{TIFF.suffix}"] = plane.astype(float), setup
+            continue
+        check_pradformat_setup(setup)
+        # A shot may have its own provenance.
+        if (provenance := provenance_of(shot)) is not None:
+            shot = shot.assign_attrs(provenance=provenance.to_json())
+        contents[out / f"{_stem(shot)}{PRADFORMAT.suffix}"] = shot, setup
     make_folder(out)
-    for path, _ in jobs:
+    for path in contents:
         check_output(path, overwrite)
-    for path, write_shot in jobs:
-        write_shot(path)
-    return [path for path, _ in jobs]
+    for path, (content, setup) in contents.items():
+        computed = content.compute()
+        plain = computed.values if form == "tiff" else computed
+        write(path, plain, setup=setup, overwrite=overwrite)
+    return [*contents]
 
 
 def _stem(shot: xarray.Dataset) -> str:
@@ -97,14 +96,6 @@ def _planes(shot: xarray.Dataset, variables: list[str]) -> Iterator[tuple[str, x
                 yield f"{variable}_{component}", shot[variable].sel(component=component)
         else:
             yield variable, shot[variable]
-
-
-def _write_plane(path: Path, plane: xarray.DataArray, setup: Any, overwrite: bool) -> None:
-    write(path, np.asarray(plane, dtype=float), setup=setup, overwrite=overwrite)
-
-
-def _write_field(path: Path, shot: xarray.Dataset, setup: Any, overwrite: bool) -> None:
-    write(path, shot.compute(), setup=setup, overwrite=overwrite)
 
 
 def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
