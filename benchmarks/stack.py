@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +28,12 @@ import psutil  # dask needs it, too
 from distributed import Client, LocalCluster
 
 from napari_shadowinv import InversionOptions, Recipe, Shot, run, run_stack, synthetic_image
+from napari_shadowinv.io import read_shot
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import Cache, RunOptions
 from napari_shadowinv.preprocessing import Bin
-from napari_shadowinv.stack import ShotOutcome, read_pixels
+from napari_shadowinv.stack import ShotOutcome
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 
@@ -65,7 +65,7 @@ class Night:
 
     shots: list[Path]
     source: Path
-    reader: Callable[[Path], np.ndarray]
+    channel: str | None
     recipe: Recipe
     name: str
 
@@ -75,15 +75,14 @@ def night(folder: Path, count: int, shape: tuple[int, int], sites: int | None) -
     options = InversionOptions(n_sites=sites, threads=1)
     reference, shots = BURNER / "Image_00000.bmp", sorted(BURNER.glob("Image_2*.bmp"))[:count]
     if len(shots) == count and shape == (464, 576):
-        grey = partial(read_pixels, channel="mean")
         recipe = Recipe(steps=(Bin(factor=2),), options=options)
-        return Night(shots, reference, grey, recipe, "burner, binned by 2")
+        return Night(shots, reference, "mean", recipe, "burner, binned by 2")
     shots = [folder / f"shot_{number}.npy" for number in range(count)]
     for number, path in enumerate(shots):
         np.save(path, plume(shape, number))
     np.save(folder / "reference.npy", np.full(shape, 1000.0))
     recipe = Recipe(options=options)
-    return Night(shots, folder / "reference.npy", read_pixels, recipe, "simulated plumes")
+    return Night(shots, folder / "reference.npy", None, recipe, "simulated plumes")
 
 
 def warm_up(shots: int, folder: Path, scheduler: Any) -> None:
@@ -117,9 +116,13 @@ def plainly(night: Night, shots: list[Path], folder: Path, start: Any, ended: An
     warm_up(3, folder, "synchronous")
     start.wait()
     began = time.perf_counter()
-    source, cache = night.reader(night.source), Cache()
+    source, cache = read_shot(night.source, channel=night.channel).image, Cache()
     for path in shots:
-        run(night.recipe, Shot(night.reader(path), source=source), cache=cache)
+        run(
+            night.recipe,
+            Shot(read_shot(path, channel=night.channel).image, source=source),
+            cache=cache,
+        )
     ended.put(time.perf_counter() - began)
 
 
@@ -140,7 +143,7 @@ def in_processes(count: int, night: Night, folder: Path) -> float:
 
 def speedup(arguments: argparse.Namespace, folder: Path) -> None:
     shots = night(folder, arguments.shots, tuple(arguments.side), arguments.sites)
-    height, width = shots.recipe.shape_after(shots.reader(shots.source).shape)
+    height, width = shots.recipe.shape_after(read_shot(shots.source, channel=shots.channel).shape)
     sites = shots.recipe.options.n_sites or height * width
     size = f"{width} × {height} px, {sites:,} sites"
     print(f"\n{arguments.shots} shots ({shots.name}), {size}\n")
@@ -151,7 +154,7 @@ def speedup(arguments: argparse.Namespace, folder: Path) -> None:
             Shot(shots.shots, source=shots.source),
             folder / "night.shadowinv.zarr",
             shots.recipe,
-            reader=shots.reader,
+            channel=shots.channel,
             scheduler=client,
             on_progress=lambda told: told.outcome and ended.append(told.outcome),
             run=RunOptions(overwrite=True),

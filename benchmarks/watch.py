@@ -26,7 +26,6 @@ import os
 import tempfile
 import threading
 import time
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -41,7 +40,7 @@ from napari_shadowinv import InversionOptions, Recipe, Shot, run_stack
 from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.pipeline import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Bin
-from napari_shadowinv.stack import RunStatus, read_pixels, watch_stack
+from napari_shadowinv.stack import RunStatus, watch_stack
 from stack import local_client, plume, warm_up
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
@@ -95,7 +94,6 @@ def kept_up(folder: Path, recipe: Recipe, count: int, rate: float) -> str:
         Shot(live, source=iio.imread(BURNER / "Image_00000.bmp").astype(float)),
         folder / f"live_{rate:g}.shadowinv.zarr",
         recipe,
-        reader=partial(read_pixels, channel=None),
         on_progress=note,
         watch=WatchOptions(max_shots=count),
     )

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from helpers.forked import forking
 from helpers.night import OPTIONS, grouped, make_shots
 from helpers.store_content import content
-from napari_shadowinv import invert, run_stack
+from napari_shadowinv import invert, invert_stack, run_stack
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.stack import _arrivals
 
@@ -33,6 +36,12 @@ class Night:
         shots, arguments = grouped(choices.pop("shots"), choices)
         return run_stack(shots, out, **arguments)
 
+    def lazy(self, **changes):
+        """Describe the inversion of its images; choices of `invert_stack` may differ."""
+        choices = {"shots": self.images, "source": self.source, "options": OPTIONS, **changes}
+        shots, arguments = grouped(choices.pop("shots"), choices, None)
+        return invert_stack(shots, **arguments)
+
     def path(self, index: int) -> Path:
         return self.folder / f"shot_{index}.npy"
 
@@ -49,6 +58,13 @@ def compiled() -> None:
     plan = plan_sites(source, OPTIONS)
     first = invert(images[0], plan=plan, options=OPTIONS)
     invert(images[0], plan=plan, options=OPTIONS, start=first)
+
+
+@pytest.fixture(scope="session")
+def forked() -> Iterator[Any]:
+    """The context of processes that have all modules when they begin."""
+    with forking() as context:
+        yield context
 
 
 def written_night(count: int, folder: Path) -> Night:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
 import socket
-import subprocess
-import sys
-import textwrap
 import threading
 import time
 from collections import Counter
@@ -20,6 +16,7 @@ import numpy as np
 import pytest
 from distributed import Client, LocalCluster
 
+from helpers.forked import run_files, serve
 from helpers.slow_reading import die, hang_once
 from helpers.store_content import content, whole_content
 from napari_shadowinv import FileFormatError, InversionOptions, Recipe, Shot, invert_stack, read
@@ -31,8 +28,6 @@ from napari_shadowinv.stack._worker import threads_here
 
 OPTIONS = InversionOptions(n_sites=100)
 PATIENCE = 90.0
-TESTS = Path(__file__).parents[1]
-SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
 
 
 def wait_for(condition, what: str):
@@ -44,7 +39,7 @@ def wait_for(condition, what: str):
 
 
 @pytest.fixture(scope="module")
-def cluster(compiled):
+def cluster(compiled, forked):
     with LocalCluster(
         n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0"
     ) as made:
@@ -71,10 +66,6 @@ class InThread(threading.Thread):
         return self.error
 
 
-def environment() -> dict[str, str]:
-    return {**os.environ, "PYTHONPATH": os.pathsep.join([str(SOURCES), str(TESTS)])}
-
-
 def test_a_worker_killed_in_the_middle_of_a_shot(night, out, expected, cluster):
     (night.folder / "hang.txt").write_text("shot_2")
     run = InThread(night, out, reader=hang_once, scheduler=cluster.scheduler_address)
@@ -93,38 +84,14 @@ def read_text(path: Path) -> str:
     return path.read_text() if path.exists() else ""
 
 
-DRIVER = """
-    import sys
-    import numpy as np
-    from napari_shadowinv import InversionOptions, Recipe, Shot, run_stack
-    from helpers.slow_reading import hang_once
-
-    folder, out, address = sys.argv[1:]
-    run_stack(
-        Shot(f"{folder}/shot_*.npy", source=np.load(f"{folder}/source.npy")),
-        out,
-        recipe=Recipe(options=InversionOptions(n_sites=100)),
-        reader=hang_once,
-        scheduler=address,
-    )
-"""
-
-
-def test_killed_client_resumes_and_a_second_one_is_refused(night, out, expected, cluster):
+def test_killed_client_resumes_and_a_second_one_is_refused(night, out, expected, cluster, forked):
     np.save(night.folder / "source.npy", night.source)
     (night.folder / "hang.txt").write_text("shot_3")
     arguments = {"reader": hang_once, "scheduler": cluster.scheduler_address}
-    client = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            textwrap.dedent(DRIVER),
-            str(night.folder),
-            str(out),
-            cluster.scheduler_address,
-        ],
-        env=environment(),
+    client = forked.Process(
+        target=run_files, args=(night.folder, out, cluster.scheduler_address), daemon=True
     )
+    client.start()
     try:
         wait_for(lambda: read_text(night.folder / "hanging"), "a shot to begin")
         wait_for(lambda: (StackStore(out).statuses() == DONE).sum() == 5, "the other shots")
@@ -132,7 +99,7 @@ def test_killed_client_resumes_and_a_second_one_is_refused(night, out, expected,
             night.run(out, **arguments)
     finally:
         client.kill()
-        client.wait()
+        client.join()
     assert list(np.flatnonzero(read(out).status == PENDING)) == [3]
     reads = Counter(night.reads)
     # The lock of the dead is none; the worker that is still at the shot may go on.
@@ -145,59 +112,20 @@ def test_killed_client_resumes_and_a_second_one_is_refused(night, out, expected,
     assert not {"shot_4", "shot_5"} & set(again)
 
 
-KILLED = """
-    import importlib, json, os, signal, sys
-    import numpy as np
-    from helpers.night import OPTIONS, make_shots
-    from napari_shadowinv import Recipe, Shot, invert, run_stack
-
-    folder, out, *changes = sys.argv[1:]
-    count, kill_at = 0, None
-
-    def kill_before(event, arguments):
-        global count
-        is_writing = event == "open" and arguments[2] & (os.O_WRONLY | os.O_RDWR)
-        is_writing |= event in ("os.rename", "os.mkdir", "os.remove", "os.rmdir")
-        if is_writing and ".shadowinv.zarr" in str(arguments[0]):
-            count += 1
-            if count == kill_at:
-                os.kill(os.getpid(), signal.SIGKILL)
-
-    # What a forked process needs; a store would start threads, which are not forked.
-    images, source = make_shots(1)
-    invert(images[0], source=source, options=OPTIONS)
-    importlib.import_module("dask.array")
-    importlib.import_module("xarray").backends.list_engines()
-    codes = []
-    for change in [*map(int, changes), None]:
-        if not (pid := os.fork()):
-            kill_at = change
-            sys.addaudithook(kill_before)
-            try:
-                source = np.load(f"{folder}/source.npy")
-                shots = Shot(f"{folder}/shot_*.npy", source=source)
-                run_stack(shots, out, Recipe(options=OPTIONS), scheduler="synchronous")
-                os._exit(0)
-            finally:
-                os._exit(1)
-        codes.append(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]))
-    print(json.dumps(codes))
-"""
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="the runs are forked")
-def test_a_run_killed_at_any_change_of_a_file_is_resumed_bit_by_bit(night, out, tmp_path):
+@pytest.mark.skipif(os.name != "posix", reason="processes are killed by a signal")
+def test_a_run_killed_at_any_change_of_a_file_is_resumed_bit_by_bit(night, out, tmp_path, forked):
     undisturbed = tmp_path / "undisturbed.shadowinv.zarr"
-    night.run(undisturbed)
+    night.run(undisturbed, reader=hang_once)
     np.save(night.folder / "source.npy", night.source)
+    codes = []
     # While it creates the store, and writes its shots.
-    changes = [30, 60, 85, 100, 20, 30, 5, 35, 25, 12, 18, 22, 10, 20, 15]
-    code, paths = textwrap.dedent(KILLED), [str(night.folder), str(out)]
-    command = [sys.executable, "-c", code, *paths, *map(str, changes)]
-    output = subprocess.run(command, env=environment(), capture_output=True, check=True).stdout
-    *codes, last = json.loads(output)
+    for change in (30, 60, 85, 100, 20, 30, 5, 35, 25, 12, 18, 22, 10, 20, 15, 0):
+        run = forked.Process(target=run_files, args=(night.folder, out, "synchronous", change))
+        run.start()
+        run.join()
+        codes.append(run.exitcode)
     assert codes.count(-signal.SIGKILL) > 10
-    assert last == 0
+    assert codes[-1] == 0
     assert whole_content(out) == whole_content(undisturbed)
     assert {path.name for path in tmp_path.iterdir()} == {"shots", out.name, undisturbed.name}
     assert not [path for path in out.rglob("*") if re.search(r"^\.|\.partial$", path.name)]
@@ -268,55 +196,32 @@ def test_a_shot_whose_worker_always_dies_fails_with_this_reason(make_night, out,
     assert "the worker crashed on every attempt" in StackStore(out).report(0)["reason"]
 
 
-class Dask:
-    """A scheduler and a worker, each a process of its own."""
-
-    def __init__(self) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            self.port = free.getsockname()[1]
-        self.address = f"tcp://127.0.0.1:{self.port}"
-        self.processes: list[subprocess.Popen] = []
-
-    def start(self) -> None:
-        ours = ["--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0"]
-        scheduler = ["distributed.cli.dask_scheduler", *ours, "--port", str(self.port)]
-        worker = ["distributed.cli.dask_worker", self.address, *ours, "--nthreads", "1"]
-        self.processes = [
-            subprocess.Popen(
-                [sys.executable, "-m", *command],
-                env=environment(),
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-            for command in (scheduler, [*worker, "--no-nanny"])
-        ]
-
-    def kill(self) -> None:
-        for process in self.processes:
-            process.kill()
-            process.wait()
-
-
-def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected):
+def test_the_scheduler_restarted_and_the_run_resumed(night, out, expected, forked):
     (night.folder / "hang.txt").write_text("shot_3")
-    dask = Dask()
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address = f"tcp://127.0.0.1:{port}"
+    servers = [forked.Process(target=serve, args=(port,), daemon=True) for _ in range(2)]
     try:
-        dask.start()
-        run = InThread(night, out, reader=hang_once, scheduler=dask.address)
+        servers[0].start()
+        run = InThread(night, out, reader=hang_once, scheduler=address)
         run.start()
         wait_for(lambda: read_text(night.folder / "hanging"), "a shot to begin")
-        dask.kill()
+        servers[0].kill()
         error = run.ended()
         assert isinstance(error, OSError)
         assert "run again to resume" in str(error)
         before = read(out)
         assert (before.status == PENDING).any()
         assert not (before.status == FAILED).any()
-        dask.start()
-        written = night.run(out, reader=hang_once, scheduler=dask.address)
+        servers[1].start()
+        written = night.run(out, reader=hang_once, scheduler=address)
     finally:
-        dask.kill()
+        for server in servers:
+            if server.pid is not None:
+                server.kill()
+                server.join()
     assert (written.status == DONE).all()
     assert content(out) == expected
 

@@ -14,7 +14,6 @@ from napari_shadowinv import (
     FileFormatError,
     InputError,
     InversionOptions,
-    Recipe,
     Shot,
     invert,
     invert_stack,
@@ -47,9 +46,7 @@ def plans_made(monkeypatch):
 @pytest.mark.parametrize("boundary", ["closed", "free"])
 def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup, boundary):
     options = OPTIONS.model_copy(update={"boundary": boundary})
-    stack = invert_stack(
-        Shot(night.images, source=night.source), Recipe(options=options, setup=optical_setup)
-    )
+    stack = night.lazy(options=options, setup=optical_setup)
     computed = stack.compute()
     assert computed.sizes == stack.sizes
     for index, image in enumerate(night.images):
@@ -69,7 +66,7 @@ def test_each_shot_has_the_variables_of_its_own_inversion(night, optical_setup, 
 
 
 def test_lazy_stack_without_source_has_a_uniform_beam(night):
-    stack = invert_stack(night.images, Recipe(options=OPTIONS))
+    stack = night.lazy(source=None)
     alone = invert(night.images[2], options=OPTIONS)
     shot = stack.isel(shot=2).compute()
     np.testing.assert_allclose(shot.potential, alone.potential, atol=1e-9)
@@ -81,11 +78,11 @@ def test_masked_pixels_do_not_count(night):
     mask = np.ones(night.source.shape, bool)
     mask[3:6, 4:9] = False
     spoilt = np.where(mask, night.images, np.nan)
-    stack = invert_stack(Shot(spoilt, source=night.source, mask=mask), Recipe(options=OPTIONS))
+    stack = night.lazy(shots=spoilt, mask=mask)
     alone = invert(night.images[1], source=night.source, mask=mask, options=OPTIONS)
     np.testing.assert_array_equal(stack.potential[1], alone.potential)
     np.testing.assert_array_equal(stack["mask"], len(spoilt) * [mask])
-    uniform = invert_stack(Shot(spoilt, mask=mask), Recipe(options=OPTIONS))
+    uniform = night.lazy(shots=spoilt, source=None, mask=mask)
     alone = invert(night.images[1], mask=mask, options=OPTIONS)
     np.testing.assert_allclose(uniform.potential[1], alone.potential, atol=1e-9)
 
@@ -93,9 +90,7 @@ def test_masked_pixels_do_not_count(night):
 def test_lazy_stack_reads_only_computed_shots(night):
     from helpers.slow_reading import log_and_read
 
-    stack = invert_stack(
-        Shot(night.glob, source=night.source), Recipe(options=OPTIONS), reader=log_and_read
-    )
+    stack = night.lazy(shots=night.glob, reader=log_and_read)
     assert night.reads == []
     stack.potential.isel(shot=slice(3, 5)).compute()
     assert sorted(night.reads) == ["shot_3", "shot_4"]
@@ -104,16 +99,14 @@ def test_lazy_stack_reads_only_computed_shots(night):
 def test_all_variables_of_a_shot_come_from_one_inversion(night):
     from helpers.slow_reading import log_and_read
 
-    stack = invert_stack(
-        Shot(night.glob, source=night.source), Recipe(options=OPTIONS), reader=log_and_read
-    )
+    stack = night.lazy(shots=night.glob, reader=log_and_read)
     dask.compute(stack.potential, stack.displacement, stack.weights, stack.converged)
     assert sorted(night.reads) == [f"shot_{i}" for i in range(6)]
 
 
 @pytest.mark.parametrize("scheduler", ["synchronous", "threads"])
 def test_sites_are_made_once_for_shots_with_one_source(night, plans_made, scheduler):
-    stack = invert_stack(Shot(night.images, source=night.source), Recipe(options=OPTIONS))
+    stack = night.lazy()
     stack[["potential", "sites"]].compute(scheduler=scheduler, num_workers=4)
     assert len(plans_made) == 1
 
@@ -150,7 +143,7 @@ def test_plans_depend_on_source_mask_and_options(night, plans_made):
 
 def test_the_result_does_not_depend_on_scheduler_chunks_or_order(night):
     def potential(shots: object) -> xr.DataArray:
-        return invert_stack(Shot(shots, source=night.source), Recipe(options=OPTIONS)).potential
+        return night.lazy(shots=shots).potential
 
     expected = potential(night.images).compute(scheduler="synchronous").values
     chunked = da.from_array(night.images, chunks=(4, 10, 28))
@@ -162,7 +155,7 @@ def test_the_result_does_not_depend_on_scheduler_chunks_or_order(night):
 
 
 def test_the_graph_holds_the_source_once(night):
-    stack = invert_stack(Shot(night.images, source=night.source), Recipe(options=OPTIONS))
+    stack = night.lazy()
     graph = dict(stack.potential.data.__dask_graph__())
     tasks = [key for key in graph if str(key).startswith("task-")]
     assert len(tasks) == 1
@@ -172,7 +165,7 @@ def test_the_graph_holds_the_source_once(night):
 
 def test_a_source_for_each_shot(night, plans_made):
     sources = np.stack([night.source * (1 + 0.1 * (i // 3) * np.eye(24, 28)) for i in range(6)])
-    stack = invert_stack(Shot(night.images, source=sources), Recipe(options=OPTIONS))
+    stack = night.lazy(source=sources)
     assert stack.sites.dims == ("shot", "site", "component")
     shots = stack[["potential", "sites", "source"]].compute(scheduler="synchronous")
     assert len(plans_made) == 2  # equal sources share their sites
@@ -181,40 +174,32 @@ def test_a_source_for_each_shot(night, plans_made):
         np.testing.assert_array_equal(shots.potential[index], alone.potential)
         np.testing.assert_array_equal(shots.sites[index], alone.cells.sites)
     free = OPTIONS.model_copy(update={"boundary": "free"})
-    ragged = invert_stack(Shot(night.images, source=sources), Recipe(options=free))
+    ragged = night.lazy(source=sources, options=free)
     assert "site" not in ragged.dims
     alone = invert(night.images[4], source=sources[4], options=free)
     np.testing.assert_array_equal(ragged.potential[4], alone.potential)
     with pytest.raises(InputError, match=r"'site_flux' \(shots may differ"):
-        invert_stack(
-            Shot(night.images, source=sources), Recipe(options=free), variables=["site_flux"]
-        )
+        night.lazy(source=sources, options=free, variables=["site_flux"])
     with pytest.raises(InputError, match="got 2 sources for 6 shots"):
-        invert_stack(Shot(night.images, source=sources[:2]), Recipe(options=OPTIONS))
+        night.lazy(source=sources[:2])
 
 
 class TestInputs:
-    def potential(self, shots, **more) -> np.ndarray:
-        return invert_stack(Shot(shots, **more), Recipe(options=OPTIONS)).potential.compute().values
-
-    @pytest.fixture
-    def expected(self, night) -> np.ndarray:
-        return self.potential(night.images, source=night.source)
-
     def test_a_glob_is_sorted_by_number(self, make_night):
         night = make_night(12)
-        stack = invert_stack(night.glob, Recipe(options=OPTIONS))
+        stack = night.lazy(shots=night.glob, source=None)
         assert list(stack.name.values) == [f"shot_{i}.npy" for i in range(12)]
 
-    def test_xarray_keeps_its_coordinate(self, night, expected):
+    def test_xarray_keeps_its_coordinate(self, night):
+        expected = night.lazy().potential[2].compute()
         shots = xr.DataArray(
             np.moveaxis(night.images, 0, -1),
             dims=("y", "x", "shot"),
             coords={"shot": [3, 1, 4, 9, 5, 2]},
         )
         for labelled in (shots, shots.to_dataset(name="image").assign(other=shots)):
-            stack = invert_stack(Shot(labelled, source=night.source), Recipe(options=OPTIONS))
-            np.testing.assert_array_equal(stack.potential.sel(shot=4), expected[2])
+            stack = night.lazy(shots=labelled)
+            np.testing.assert_array_equal(stack.potential.sel(shot=4), expected)
 
     @pytest.mark.parametrize(
         ("shots", "words"),
@@ -240,22 +225,22 @@ class TestInputs:
 
     def test_lazy_stack_refuses_inputs_that_do_not_match(self, night):
         with pytest.raises(InputError, match=r"source has shape \(5, 6\), shots \(24, 28\)"):
-            invert_stack(Shot(night.images, source=np.ones((5, 6))))
+            night.lazy(source=np.ones((5, 6)))
         with pytest.raises(InputError, match="choose an estimate in the recipe"):
             invert_stack(Shot(night.images, source=UniformEstimate()))
         with pytest.raises(InputError, match="has strength, brightness, expected its source"):
             invert_stack(Shot(night.images, strength=0.5, brightness=2))
         with pytest.raises(InputError, match="mask has shape"):
-            invert_stack(Shot(night.images, mask=np.ones((5, 6), bool)))
+            night.lazy(source=None, mask=np.ones((5, 6), bool))
         with pytest.raises(InputError, match="no variable 'potental'"):
-            invert_stack(night.images, variables=["potental"])
+            night.lazy(variables=["potental"])
         with pytest.raises(InputError, match="needs a setup"):
-            invert_stack(night.images, variables=["potential_si"])
+            night.lazy(variables=["potential_si"])
 
 
 def test_a_bad_shot_is_named_when_it_is_computed(night):
     night.images[3] = 0
-    stack = invert_stack(Shot(night.images, source=night.source), Recipe(options=OPTIONS))
+    stack = night.lazy()
     stack.potential.isel(shot=2).compute()
     with pytest.raises(InputError, match="shot 3: image has no positive pixel"):
         stack.potential.compute()
@@ -263,9 +248,7 @@ def test_a_bad_shot_is_named_when_it_is_computed(night):
 
 def test_lazy_stack_computes_only_requested_variables(night):
     setup = OpticalSetup(wavelength=5e-7, object_image_distance=0.3, pixel_size=1e-5)
-    stack = invert_stack(
-        night.images, Recipe(setup=setup, options=OPTIONS), variables=["potential_si"]
-    )
+    stack = night.lazy(source=None, setup=setup, variables=["potential_si"])
     quality = {"converged", "flux_residual", "image_residual", "iterations"}
     quality |= {"verdict", "cautions", "total_error", "limited_by"}
     quality |= {"noise_error", "discretisation_error"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,12 @@ from napari_shadowinv import InputError, read
 from napari_shadowinv.errors import InversionCancelled, RunInterruptedError
 from napari_shadowinv.io.store import DONE, FAILED
 from napari_shadowinv.stack._worker import threads_here
+
+
+@pytest.fixture(autouse=True)
+def quick_processes(forked, monkeypatch):
+    """Let processes begin with all modules; they have nothing else of this one."""
+    monkeypatch.setattr(multiprocessing, "get_context", lambda method: forked)
 
 
 def test_the_bytes_do_not_depend_on_the_scheduler(night, out, expected):
@@ -56,9 +63,7 @@ def test_a_run_that_is_stopped_ends_its_shots_and_workers(night, out, scheduler)
     (night.folder / "release").touch()
     hanging = night.folder / "hanging"
     with pytest.raises(InversionCancelled, match="run again to resume"):
-        night.run(
-            out, reader=hang_once, scheduler=scheduler, should_stop=hanging.exists, workers=1
-        )
+        night.run(out, reader=hang_once, scheduler=scheduler, should_stop=hanging.exists, workers=1)
     assert list(read(out).status.values[3:]) == [0] * 3
     assert not children() - before
     assert "shot" not in {thread.name.partition("_")[0] for thread in threading.enumerate()}

@@ -1,7 +1,7 @@
 """The recipes for clusters, as the page has them, on a cluster imitated by a shell.
 
-`sbatch` starts the job on this machine and `scancel` ends it; scheduler, workers and the store are
-real.
+`sbatch` starts the job on this machine, with one worker in its process, and `scancel` ends it;
+scheduler, worker and the store are real.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ PATIENCE = 120
 SBATCH = """#!/bin/sh
 job=$(ls "$FAKE_SLURM" | grep -c sh$)
 cp "$1" "$FAKE_SLURM/$job.sh"
-SLURM_JOB_ID=$job setsid sh "$FAKE_SLURM/$job.sh" >"$FAKE_SLURM/$job.log" 2>&1 &
+sed "s/--nworkers [0-9]*/--nworkers 1/; s/--nanny/--no-nanny/" "$1" >"$FAKE_SLURM/$job.run"
+SLURM_JOB_ID=$job setsid sh "$FAKE_SLURM/$job.run" >"$FAKE_SLURM/$job.log" 2>&1 &
 echo $! >"$FAKE_SLURM/$job.pid"
 echo "Submitted batch job $job"
 """
@@ -134,7 +135,7 @@ def test_the_recipe_without_dask_jobqueue(project, slurm, tmp_path):
     for theirs, local in (
         ("/project", str(project)),
         ("dask scheduler", f"dask scheduler {ours} --port {port}"),
-        ("dask worker", f"dask worker {ours}"),
+        ("dask worker", f"dask worker {ours} --no-nanny"),
         ("--nworkers 32", "--nworkers 1"),
         ("$(hostname):8786", f"127.0.0.1:{port}"),
     ):

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
-from helpers.night import grouped
 from helpers.slow_reading import log_and_read
 from helpers.store_content import content
 from napari_shadowinv import (
@@ -19,11 +17,7 @@ from napari_shadowinv import (
     InputError,
     Instrument,
     InversionOptions,
-    Recipe,
-    Shot,
-    invert_stack,
     read,
-    run_stack,
 )
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion import compilation
@@ -31,10 +25,7 @@ from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.physics.setup import OpticalSetup
-from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.preprocessing import Bin
-from napari_shadowinv.stack import read_pixels
-from napari_shadowinv.stack._shots import reader_text
 
 OPTIONS = InversionOptions(n_sites=100)
 
@@ -52,9 +43,7 @@ def stop_after(count: int):
 
 def test_store_equals_the_lazy_stack(night, out, optical_setup):
     written = night.run(out, shots=night.images, setup=optical_setup)
-    lazy = invert_stack(
-        Shot(night.images, source=night.source), Recipe(options=OPTIONS, setup=optical_setup)
-    )
+    lazy = night.lazy(setup=optical_setup)
     assert (written.status == DONE).all()
     assert written.potential.dtype == np.float32
     assert written.potential.chunks[0] == (1,) * 6
@@ -86,13 +75,8 @@ def test_read_opens_it_and_so_does_plain_xarray(night, out, recwarn):
 
 def test_stored_variables_can_be_chosen(night, out):
     names = ("weights", "sites", "site_flux", "source", "reprojection")
-    written = run_stack(
-        Shot(night.images, source=night.source),
-        out,
-        Recipe(options=OPTIONS),
-        run=RunOptions(variables=names, dtype="float64"),
-    )
-    lazy = invert_stack(Shot(night.images, source=night.source), Recipe(options=OPTIONS))
+    written = night.run(out, shots=night.images, variables=names, dtype="float64")
+    lazy = night.lazy()
     assert written.sites.dims == ("shot", "site", "component")
     assert "potential" not in written
     for name in names:
@@ -124,7 +108,7 @@ def test_a_run_goes_on_where_it_stopped(night, out):
     # Finished shots are neither read nor written again.
     assert not {f"shot_{i}" for i in done} & set(night.reads[reads:])
     assert first.items() <= content(out).items()
-    lazy = invert_stack(Shot(night.images, source=night.source), Recipe(options=OPTIONS))
+    lazy = night.lazy()
     np.testing.assert_allclose(after.potential, lazy.potential, rtol=1e-6, atol=1e-6)
 
 
@@ -163,16 +147,9 @@ def test_each_shot_brings_its_own_source(night, out):
     for index, path in enumerate(sources):
         np.save(path, night.source + 5 * index * np.eye(24, 28))
     sources[2].write_bytes(b"")
-    written = run_stack(
-        Shot(night.glob, source=sources),
-        out,
-        Recipe(options=OPTIONS),
-        run=RunOptions(variables=("potential", "sites")),
-    )
+    written = night.run(out, source=sources, variables=("potential", "sites"))
     assert list(np.flatnonzero(written.status == FAILED)) == [2]
-    lazy = invert_stack(
-        Shot(night.images[4:5], source=np.load(sources[4])), Recipe(options=OPTIONS)
-    )
+    lazy = night.lazy(shots=night.images[4:5], source=np.load(sources[4]))
     np.testing.assert_allclose(written.potential[4], lazy.potential[0], rtol=1e-6, atol=1e-6)
     np.testing.assert_array_equal(written.sites[4], lazy.sites[0])
 
@@ -235,14 +212,14 @@ class TestRefusals:
 
     def test_a_name_with_another_ending(self, night, tmp_path):
         with pytest.raises(FileFormatError, match=r"ends with \.shadowinv\.zarr"):
-            run_stack(night.images, tmp_path / "night.zarr")
+            night.run(tmp_path / "night.zarr")
 
     def test_a_folder_of_another_kind_is_not_overwritten(self, night, tmp_path):
         mine = tmp_path / "thesis.shadowinv.zarr"
         mine.mkdir()
         (mine / "chapter.txt").write_text("years of work")
         with pytest.raises(FileFormatError, match="is not a stack of shots"):
-            run_stack(night.images, mine, run=RunOptions(overwrite=True))
+            night.run(mine, overwrite=True)
         assert (mine / "chapter.txt").read_text() == "years of work"
 
     @pytest.mark.parametrize(
@@ -274,13 +251,8 @@ def test_the_first_run_ever_compiles_before_its_shots(night, out, monkeypatch):
 
 def test_overwriting_begins_anew(night, out):
     night.run(out, shots=night.images)
-    other_options = InversionOptions(n_sites=60)
-    written = run_stack(
-        Shot(night.images[:2], source=night.source),
-        out,
-        Recipe(options=other_options),
-        run=RunOptions(overwrite=True),
-    )
+    few = InversionOptions(n_sites=60)
+    written = night.run(out, shots=night.images[:2], options=few, overwrite=True)
     assert written.sizes["shot"] == 2
     assert [path.name for path in out.parent.glob(".*")] == []
 
@@ -302,19 +274,18 @@ def test_store_with_truncated_names_is_refused(night, out):
         read(out)
 
 
-def test_reader_text_has_module_and_choices():
-    assert reader_text(read_pixels) == "napari_shadowinv.read_pixels"
-    chosen = partial(read_pixels, factor=2, channel="red")
-    assert reader_text(chosen) == "napari_shadowinv.read_pixels(channel='red', factor=2)"
-    assert reader_text(np.load) == "numpy.load"
+def test_a_run_with_another_reader_or_channel_is_refused(night, out):
+    night.run(out, reader=log_and_read)
+    for other in ({}, {"reader": np.load}, {"channel": "red"}):
+        with pytest.raises(InputError, match="different reader"):
+            night.run(out, **other)
 
 
 def test_fields_of_binned_shots_have_the_units_of_binned_pixels(night, out, optical_setup):
     arguments = {"source": night.source, "options": OPTIONS, "setup": optical_setup}
     arguments["filters"] = (Bin(factor=2),)
     written = night.run(out, shots=night.images[:1], **arguments, dtype="float64")
-    shots, choices = grouped(night.images[:1], arguments, None)
-    lazy = invert_stack(shots, **choices)
+    lazy = night.lazy(shots=night.images[:1], **arguments)
     angle = lazy["deflection_angle"].values
     np.testing.assert_allclose(written["deflection_angle"], angle, rtol=1e-12)
     assert setup_from_dataset(written).object_pixel_size == 2 * optical_setup.object_pixel_size

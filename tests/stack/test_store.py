@@ -12,7 +12,7 @@ import pytest
 import tifffile
 from typer.testing import CliRunner
 
-from napari_shadowinv import InversionOptions, Recipe, Shot, run_stack
+from napari_shadowinv import InversionOptions
 from napari_shadowinv.cli import app
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io.store import StackStore, read_stack
@@ -23,12 +23,7 @@ OPTIONS = InversionOptions(n_sites=100)
 @pytest.fixture
 def store(night, tmp_path) -> Path:
     path = tmp_path / "run.shadowinv.zarr"
-    run_stack(
-        Shot(night.images[:2], source=night.source),
-        path,
-        Recipe(options=OPTIONS),
-        scheduler="threads",
-    )
+    night.run(path, shots=night.images[:2])
     return path
 
 

@@ -42,8 +42,8 @@ from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_row
 from napari_shadowinv.preprocessing import Bin, PolynomialEstimate
 from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.shot import Shot
-from napari_shadowinv.stack import read_pixels
 from napari_shadowinv.stack._plan import describe_stack
+from napari_shadowinv.stack._shots import FILES
 
 SHAPE = (64, 64)
 SETUP = ProtonSetup(
@@ -347,7 +347,7 @@ def test_films_at_their_own_distance_have_pixels_of_their_own(pack: Path, out: P
 def test_a_row_is_repeated_from_its_provenance(pack: Path) -> None:
     options = InversionOptions(tolerance=1e-3, boundary="free", flux="known")
     pack = table("film0.npy,5,1.25,beam.npy", header="file,energy,brightness,source")
-    stack = describe_stack(pack, Recipe(setup=SETUP, options=options), read_pixels, None)
+    stack = describe_stack(pack, Recipe(setup=SETUP, options=options), FILES, None)
     images, _ = stack.shots.items[0].load()
     inversion = stack.task.run(images, workers=1)
     write("film0.shadowinv", inversion)
@@ -390,7 +390,7 @@ def test_masks_of_a_shot_and_of_all_hold_both_but_for_a_file(fits: bool) -> None
     )
     images = np.ones((3, *SHAPE))
     shots = Shot(images, mask=common[0], source_mask=common[1])
-    task = describe_stack(shots, recipe, read_pixels, None).task
+    task = describe_stack(shots, recipe, FILES, None).task
     joined = task.completed(Shot(images[0], mask=own[0], source_mask=own[1]), None)
     np.testing.assert_array_equal(joined.mask, common[0] & own[0])
     np.testing.assert_array_equal(joined.source_mask, common[1] & own[1])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -50,8 +50,6 @@ from napari_shadowinv.physics.setup import beam_quantities
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from napari_shadowinv._system.progress import OnProgress
     from napari_shadowinv.io.store_columns import ShotColumn
     from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
@@ -70,23 +68,13 @@ def _rate_text(status: RunStatus) -> str:
 
 @dataclass
 class _Printer:
-    """Printer of a run, by a bar or a line for each shot, with its latest status.
+    """Printer of a run, by a bar or a line for each shot, with its latest status."""
 
-    Attributes
-    ----------
-    quiet : bool
-        Whether to print only shots that fail, and warnings.
-    watched : str
-        The folder of a watch and its files in words, empty for another run.
-    show : callable, optional
-        Shows the progress of all shots.
-    """
-
-    quiet: bool
-    watched: str = ""
-    show: OnProgress | None = None
+    quiet: bool  # print only shots that fail, and warnings
+    watched: str = ""  # folder of a watch and its files in words, empty for another run
+    show: OnProgress | None = None  # the progress of all shots
     status: RunStatus | None = None
-    warned: set[str] = field(default_factory=set)
+    warned: set[str] = field(default_factory=set)  # codes of cautions
 
     def update(self, status: RunStatus) -> None:
         is_first = self.status is None
@@ -149,7 +137,7 @@ def run_batch(
     run: RunOptions,
     *,
     recipe: Recipe,
-    reader: Callable[..., ArrayLike],
+    channel: str | None,
     resume: bool,
     quiet: bool,
     scheduler: str,
@@ -176,7 +164,7 @@ def run_batch(
                 shots[0] if len(shots) == 1 else shots,
                 out,
                 recipe,
-                reader=reader,
+                channel=channel,
                 run=run,
                 scheduler=scheduler,
                 on_progress=printer.update,
@@ -381,7 +369,7 @@ def run_watch(
     watch: WatchOptions,
     *,
     recipe: Recipe,
-    reader: Callable[..., ArrayLike],
+    channel: str | None,
     quiet: bool,
 ) -> None:
     """Watch a folder; print a line for each shot and a summary."""
@@ -394,7 +382,7 @@ def run_watch(
             folder,
             out,
             recipe,
-            reader=reader,
+            channel=channel,
             watch=watch,
             on_progress=printer.update,
             should_stop=is_interrupted,

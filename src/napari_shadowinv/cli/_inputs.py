@@ -45,18 +45,6 @@ def recipe_from(flags: InversionFlags | FitFlags, settings: Settings) -> Recipe:
     return recipe.model_copy(update=changes)
 
 
-def shots_recipe_from(flags: InversionFlags, settings: Settings) -> Recipe:
-    """Return the recipe for shots to be inverted, or fitted if it has choices of a fit."""
-    recipe = recipe_from(flags, settings)
-    refused = [key for key in settings.values if key.startswith("options.")]
-    if recipe.fit is not None and refused:
-        raise InputError(
-            f"received {settings.flags.get(refused[0], refused[0])}, an option of inversions, for "
-            "a fit: set its own options, such as fit.options.samples"
-        )
-    return recipe
-
-
 def read_setup(path: Path | None, geometry: Any = None) -> Setup | None:
     """Read a setup from its file, if there is one; complete it with a geometry."""
     from napari_shadowinv.pipeline.files import setup_from

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Option
 
 from napari_shadowinv.cli import _flags
-from napari_shadowinv.cli._inputs import read_setup, shots_recipe_from
+from napari_shadowinv.cli._inputs import read_setup, recipe_from
 from napari_shadowinv.cli._outputs import Outputs
 from napari_shadowinv.cli._settings import (
     FILE_KEYS,
@@ -27,14 +26,11 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 # Help of options, where it is longer than a line.
 HELP = {
-    "scheduler": "threads, processes or tcp://host:8786.",
     "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
     "csv (a table with a row per shot).",
     "shots": "A quoted glob, a folder, files, a file of frames, an array of frames in HDF5, or a "
     "table (.csv) with a row per shot.",
     "workers": "Shots at once. Default: one per core.",
-    "resume": "Continue a run, append new shots.",
-    "pattern": "Names of the shots, in quotes.",
     "latest": "Invert the newest file first, skip older ones.",
     "idle": "Stop after SECONDS without a new file.",
     "variables": "For tiff: variables to export, separated by commas.",
@@ -63,30 +59,33 @@ Press Ctrl-C to stop; the same command continues. Exit codes as for batch.
 class RunFlags:
     """Flags of a run over many shots."""
 
-    scheduler: Annotated[str, Option(help=HELP["scheduler"])] = "threads"
+    scheduler: Annotated[str, Option(help="threads, processes or tcp://host:8786.")] = "threads"
     workers: Annotated[int | None, Option(metavar="N", help=HELP["workers"])] = None
-    resume: Annotated[bool, Option("--resume", help=HELP["resume"])] = False
+    resume: Annotated[bool, Option("--resume", help="Continue a run, append new shots.")] = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class WatchFlags:
     """Flags of a watched folder."""
 
-    pattern: Annotated[str | None, Option(help=HELP["pattern"])] = None
+    pattern: Annotated[str | None, Option(help="Names of the shots, in quotes.")] = None
     latest: Annotated[bool, Option("--latest", help=HELP["latest"])] = False
     idle: Annotated[float | None, Option(metavar="SECONDS", help=HELP["idle"])] = None
 
 
 def _stack_inputs(flags: _flags.InversionFlags, settings: Settings, quiet: bool) -> dict[str, Any]:
-    """Return the inputs of `batch` and `watch`."""
-    chosen = shots_recipe_from(flags, settings)
+    """Return the inputs of `batch` and `watch`; shots are fitted by choices of a fit."""
+    recipe = recipe_from(flags, settings)
+    refused = [key for key in settings.values if key.startswith("options.")]
+    if recipe.fit is not None and refused:
+        raise InputError(
+            f"received {settings.flags.get(refused[0], refused[0])}, an option of inversions, for "
+            "a fit: set its own options, such as fit.options.samples"
+        )
     if flags.setup is not None:
-        chosen = chosen.model_copy(update={"setup": read_setup(flags.setup)})
-    Outputs(overwrite=False, quiet=quiet).warn_of_setups([(chosen.setup, None)])
-    from napari_shadowinv.stack import read_pixels
-
-    reader = partial(read_pixels, channel=flags.channel)
-    return {"recipe": chosen, "reader": reader, "quiet": quiet}
+        recipe = recipe.model_copy(update={"setup": read_setup(flags.setup)})
+    Outputs(overwrite=False, quiet=quiet).warn_of_setups([(recipe.setup, None)])
+    return {"recipe": recipe, "channel": flags.channel, "quiet": quiet}
 
 
 @notify_errors

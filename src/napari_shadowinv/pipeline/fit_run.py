@@ -421,7 +421,7 @@ def _image_origins(
 
 
 def read_row_images(
-    rows: Sequence[ShotRow], recipe: Recipe, *, channel: str | None = None
+    rows: Sequence[ShotRow], recipe: Recipe, *, channel: str | int | None = None
 ) -> tuple[Shot, ...]:
     """Read the images of rows, whose energies or wavelengths complete the setups.
 

@@ -45,24 +45,12 @@ _PAINTED = {"caustic"}  # may have been corrected by hand
 
 @dataclass(frozen=True, eq=False)
 class Rerun:
-    """A repeated result, and the changes since the first one.
-
-    Attributes
-    ----------
-    content : Inversion, Fit or FilmDoses
-        The result.
-    dataset : Dataset
-        All of it.
-    changes : tuple of str
-        Changes of the version and the files.
-    difference : str
-        Difference of the results, `IDENTICAL` if there is none.
-    """
+    """A repeated result, and the changes since the first one."""
 
     content: AnyResult
-    dataset: xarray.Dataset
-    changes: tuple[str, ...]
-    difference: str
+    dataset: xarray.Dataset  # all of it
+    changes: tuple[str, ...]  # of the version and the files
+    difference: str  # of the results, `IDENTICAL` if there is none
 
     @property
     def is_identical(self) -> bool:

@@ -2,7 +2,6 @@
 
 - describe the inversion of many shots for dask: `invert_stack`
 - invert or fit shots one by one into ``name.shadowinv.zarr``, and resume after a crash: `run_stack`
-- read a shot's file, or one of its colour channels: `read_pixels`
 - watch a folder and invert each shot as soon as it arrives: `watch_stack`
 - what a run reports: `RunStatus`
 """
@@ -10,7 +9,6 @@
 from napari_shadowinv.stack._lazy import invert_stack
 from napari_shadowinv.stack._plan import STORED
 from napari_shadowinv.stack._run import RunStatus, run_stack
-from napari_shadowinv.stack._shots import read_pixels
 from napari_shadowinv.stack._worker import ShotOutcome
 from napari_shadowinv.stack.watch import watch_stack
 
@@ -19,7 +17,6 @@ __all__ = [
     "RunStatus",
     "ShotOutcome",
     "invert_stack",
-    "read_pixels",
     "run_stack",
     "watch_stack",
 ]

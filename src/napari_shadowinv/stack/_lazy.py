@@ -23,7 +23,7 @@ from napari_shadowinv.stack._plan import (
     describe_stack,
     dtype_of,
 )
-from napari_shadowinv.stack._shots import ArrayExposure, Exposure, Reader, read_pixels
+from napari_shadowinv.stack._shots import ArrayExposure, Exposure, FileReader, Reader
 from napari_shadowinv.stack._worker import AnyTask
 
 if TYPE_CHECKING:
@@ -34,8 +34,9 @@ def invert_stack(
     shots: Any,
     recipe: Recipe | None = None,
     *,
-    reader: Reader = read_pixels,
     variables: Collection[str] | None = None,
+    reader: Reader | None = None,
+    channel: str | int | None = None,
 ) -> xarray.Dataset:
     """Describe the inversion of many shots, which dask computes on demand.
 
@@ -57,8 +58,9 @@ def invert_stack(
     variables : collection of str, optional
         Variables to compute. Default: all.
     reader : callable, optional
-        Returns the image of a path; with a keyword ``page`` it also reads multi-page TIFFs.
-        `functools.partial(read_pixels, channel="red")` reads one channel of colour images.
+        Returns the image of a path. Default: files are read by their format.
+    channel : str or int, optional
+        Channel of colour images, as for `napari_shadowinv.io.read_shot`.
 
     Returns
     -------
@@ -95,7 +97,7 @@ def invert_stack(
             "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "
             "leave the section out"
         )
-    stack = describe_stack(shots, recipe, reader, variables)
+    stack = describe_stack(shots, recipe, FileReader(reader, channel), variables)
     return _lazy_dataset(stack)
 
 

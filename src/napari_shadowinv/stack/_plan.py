@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,14 +35,12 @@ from napari_shadowinv.provenance import index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
     Exposure,
-    Reader,
+    FileReader,
     RowsExposure,
     Shots,
     find_shots,
     find_source,
     first_image,
-    read_pixels,
-    reader_text,
     table_shots,
     usual_shape,
 )
@@ -119,7 +117,7 @@ def _row_of(shot: Exposure) -> RowsExposure:
 
 
 def describe_stack(
-    shots: Any, recipe: Recipe | None, reader: Reader, variables: Collection[str] | None
+    shots: Any, recipe: Recipe | None, reader: FileReader, variables: Collection[str] | None
 ) -> Stack:
     """Describe a stack, and check everything that can be checked before a shot is read."""
     common = shots if isinstance(shots, Shot) else Shot(shots)
@@ -157,7 +155,7 @@ def describe_stack(
         task = _plan_inversion(stack_shots, inputs, resolved, variables)
     else:
         task = _plan_fit(inputs, resolved, variables)
-    return Stack(stack_shots, task, reader_text(reader))
+    return Stack(stack_shots, task, reader.name)
 
 
 def _plan_inversion(
@@ -199,20 +197,17 @@ def _plan_fit(inputs: Inputs, recipe: Recipe, variables: Collection[str] | None)
 
 
 def _describe_inputs(
-    common: Shot, recipe: Recipe, reader: Reader
+    common: Shot, recipe: Recipe, reader: FileReader
 ) -> tuple[Shots, Inputs, Shots | None]:
     """Return the shots, all that they share, and a source for each if they have their own."""
     shots = common.image
     measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
     source = measured.file if common.source is None else common.source
-    source_reader = reader
-    if measured.variable is not None or "variable" in getattr(reader, "keywords", {}):
-        # That of the reader is the array of the shots.
-        source_reader = partial(reader, variable=measured.variable)
     lit = None
     if getattr(source, "ndim", None) == 2:
         source, lit = unpack_array(source, "source")
-    sources = find_source(source, reader=source_reader)
+    # The reader's array is that of the shots.
+    sources = find_source(source, replace(reader, variable=measured.variable))
     if isinstance(sources, Shots):
         lit = sources.mask
     if sources is None and isinstance(recipe.source, MeasuredSource):
@@ -228,7 +223,7 @@ def _describe_inputs(
         stack_shots, first = _describe_table(table, recipe, reader, image_shape)
         recipe = recipe.model_copy(update={"setup": first})
     else:
-        stack_shots = find_shots(shots, reader=reader, shape=image_shape)
+        stack_shots = find_shots(shots, reader, image_shape)
     if sources is not None:
         check_shape("source", sources.shape, stack_shots.shape, "shots")
     mask = join_masks(mask, stack_shots.mask, lit)
@@ -267,16 +262,18 @@ def _find_table(shots: Any) -> Path | Sequence[ShotRow] | None:
 
 
 def _describe_table(
-    table: Path | Sequence[ShotRow], recipe: Recipe, reader: Reader, shape: tuple[int, int] | None
+    table: Path | Sequence[ShotRow],
+    recipe: Recipe,
+    reader: FileReader,
+    shape: tuple[int, int] | None,
 ) -> tuple[Shots, Setup | None]:
     """Return the shots of a table, and the setup of the first image."""
-    part = getattr(reader, "keywords", {})
-    if getattr(reader, "func", reader) is not read_pixels or "variable" in part:
+    if reader.function is not None or reader.variable is not None:
         raise InputError(
             f"received a reader for the table {table}, which names files and their arrays: leave "
             "the reader out"
         )
-    items = table_shots(table, recipe, part.get("channel"))
+    items = table_shots(table, recipe, reader.channel)
     if recipe.fit is not None:
         image = first_image(items)
         return Shots(items, image.shape), image.setup

@@ -58,7 +58,7 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
 )
 from napari_shadowinv.stack._schedulers import Scheduler, is_local, scheduler_for
-from napari_shadowinv.stack._shots import Exposure, Reader, differences, read_pixels
+from napari_shadowinv.stack._shots import Exposure, FileReader, Reader, differences
 from napari_shadowinv.stack._worker import AnyTask, ShotOutcome, TaskContext
 
 if TYPE_CHECKING:
@@ -151,7 +151,8 @@ def run_stack(
     out: str | Path,
     recipe: Recipe | None = None,
     *,
-    reader: Reader = read_pixels,
+    reader: Reader | None = None,
+    channel: str | int | None = None,
     run: RunOptions | None = None,
     scheduler: Any = None,
     on_progress: OnStatus | None = None,
@@ -166,7 +167,7 @@ def run_stack(
 
     Parameters
     ----------
-    shots, recipe, reader
+    shots, recipe, reader, channel
         As for `invert_stack`. To resume a store, they and earlier shots must be the same. In
         a table of shots to fit, rows with the same ``shot`` are images of one object.
     out : str or Path
@@ -181,7 +182,8 @@ def run_stack(
     on_progress : callable, optional
         Receives a `RunStatus` at the start and after each shot.
     should_stop : callable, optional
-        Called regularly, also in other threads; the run ends when it returns true.
+        Called regularly by threads, also within a shot; after each shot of processes and clusters.
+        The run ends when it returns true.
 
     Returns
     -------
@@ -203,7 +205,7 @@ def run_stack(
     path = check_store_path(out)
     run = as_model(RunOptions, run, "run")
     variables = stored_variables(run.variables, recipe)
-    stack = describe_stack(shots, recipe, reader, variables)
+    stack = describe_stack(shots, recipe, FileReader(reader, channel), variables)
     stack = replace(stack, dtype=run.dtype)
     again = [FAILED] if run.redo_failed else []
     on_progress = on_progress or (lambda _: None)

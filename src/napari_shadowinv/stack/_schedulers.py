@@ -124,15 +124,14 @@ class _Cluster(Scheduler):
         on_end: Callable[[ShotOutcome], None],
         should_stop: ShouldStop,
     ) -> None:
-        from distributed import as_completed
-
+        distributed: Any = import_module("distributed")
         with self._as_interruption(), warnings.catch_warnings():
             # What shots share has to be sent, however large it is.
             warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
             graph, keys = _graph(shots, context, blocks=True)
             running = dict(zip(self._client.get(graph, keys, sync=False), shots, strict=True))
         try:
-            for future in as_completed(list(running), loop=self._client.loop):
+            for future in distributed.as_completed(list(running), loop=self._client.loop):
                 on_end(self._outcome(future, running.pop(future), context))
                 _check(should_stop)
         finally:

@@ -8,7 +8,6 @@
 from __future__ import annotations
 
 import functools
-import inspect
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -43,7 +42,7 @@ from napari_shadowinv.shot import Shot
 if TYPE_CHECKING:
     import xarray
 
-Reader = Callable[..., ArrayLike]
+Reader = Callable[[Path], ArrayLike]
 Value = TypeVar("Value")
 
 _MAX_SHAPE_READS = 3  # shots that are read for the shape of all
@@ -117,38 +116,70 @@ class ArrayExposure(Exposure):
         return functools.partial(ArrayExposure, source=self.source), (self.name, self.block)
 
 
+@dataclass(frozen=True)
+class FileReader:
+    """How files are read: by a function of the user's, or by their format.
+
+    Of files that hold several arrays it reads one, and of colour images one channel.
+    """
+
+    function: Callable[[Path], ArrayLike] | None = None
+    channel: str | int | None = None
+    variable: str | None = None
+
+    def frames(self, path: str | Path) -> list[FileFrame]:
+        """Return all frames that a path stands for; of a user's function, a file is a frame."""
+        if self.function is None:
+            return find_frames(path, self.variable)
+        if split_address(path)[1] is not None:
+            raise InputError(
+                f"shots are {path}, and their reader does not select an array: give the file alone"
+            )
+        return find_frames(path, numbered=False)
+
+    def read(self, frame: FileFrame) -> Shot:
+        if self.function is None:
+            return read_frame(frame, channel=self.channel)
+        values, usable = unpack_array(self.function(frame.path), "the shot")
+        return Shot(values, mask=usable)
+
+    @property
+    def name(self) -> str:
+        """A text by which a store is not continued with another reader."""
+        if self.function is None:
+            return "" if self.channel is None else f"channel {self.channel}"
+        kind = type(self.function).__qualname__
+        return f"{self.function.__module__}.{getattr(self.function, '__qualname__', kind)}"
+
+
 @dataclass(frozen=True, eq=False)
 class FileExposure(Exposure):
     """A file that holds one image, or a page of a TIFF or frame of an array that holds many."""
 
-    path: Path  # absolute, so that a worker elsewhere finds it
-    reader: Reader
-    page: int | None = None  # the reader takes it as a keyword
-    variable: str | None = None  # the same, of an array in an HDF5 file
+    frame: FileFrame  # its path is absolute, so that a worker elsewhere finds it
+    reader: FileReader
 
     def stamp(self) -> dict[str, Any]:
         # Before the image: it may be written to while it is read.
-        return {"variable": self.variable, **stamp(self.path)} if self.page is None else {}
+        frame = self.frame
+        return {"variable": frame.variable, **stamp(frame.path)} if frame.number is None else {}
 
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
-        parts = {"page": self.page, "variable": self.variable}
-        options: dict[str, Any] = {name: part for name, part in parts.items() if part is not None}
-        cautions: list[Caution] = []
-        digest = sha256(self.path) if self.page is None else ""
-        if "cautions" in inspect.signature(self.reader).parameters:
-            options["cautions"] = cautions
-        image, usable = unpack_array(self.reader(self.path, **options), "the shot")
+        digest = sha256(self.frame.path) if self.frame.number is None else ""
+        shot = self.reader.read(self.frame)
+        cautions = file_cautions(shot)
         metadata = {
-            "sha256": digest or checksum(image),
+            "sha256": digest or checksum(shot.image),
             **({"cautions": cautions} if cautions else {}),
         }
-        return (Shot(image, mask=usable),), metadata
+        mask = None if shot.mask is None or np.all(shot.mask) else shot.mask
+        return (Shot(shot.image, mask=mask),), metadata
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare a file as in a table's rows, and a page by its checksum."""
-        if self.page is not None:
+        if self.frame.number is not None:
             return super().unchanged(origin)
-        return self.variable == origin.get("variable") and _agrees(self.path, origin)
+        return self.frame.variable == origin.get("variable") and _agrees(self.frame.path, origin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +187,7 @@ class RowsExposure(Exposure):
     """Several images of one object to fit, or one image to invert, from rows of a table."""
 
     recipe: Recipe
-    channel: str | None = None
+    channel: str | int | None = None
     setup: Setup | None = None  # of the image to invert as recorded
 
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
@@ -236,45 +267,7 @@ def stamp(path: Path) -> dict[str, int]:
     return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
 
 
-def reader_text(reader: Reader) -> str:
-    """Return the name of a reader, so that a store is not continued with another."""
-    if isinstance(reader, functools.partial):
-        keywords = ", ".join(f"{name}={value!r}" for name, value in sorted(reader.keywords.items()))
-        return f"{reader_text(reader.func)}({keywords})"
-    module, name = reader.__module__, getattr(reader, "__qualname__", type(reader).__qualname__)
-    package = __name__.partition(".")[0]
-    # Modules of this package may move; existing stores can still be continued.
-    return f"{package}.{name}" if module.startswith(f"{package}.") else f"{module}.{name}"
-
-
-def read_pixels(
-    path: Path,
-    *,
-    page: int | None = None,
-    channel: str | int | None = None,
-    variable: str | None = None,
-    cautions: list[Caution] | None = None,
-) -> ArrayLike:
-    """Read the image of a shot; this is the default reader.
-
-    Parameters
-    ----------
-    path, channel, variable
-        As for `napari_shadowinv.io.read_shot`, whose errors this raises.
-    page : int, optional
-        Of a TIFF with many pages, or frame of the array `variable` in an HDF5 file, from 0.
-    cautions : list of Caution, optional
-        Receives the reasons to doubt the image.
-
-    Returns
-    -------
-    ndarray or MaskedArray, shape (H, W)
-        Masked where the file says that pixels do not count.
-    """
-    shot = read_frame(FileFrame(path, str(path), page, variable), channel=channel)
-    if cautions is not None:
-        cautions.extend(file_cautions(shot))
-    return shot.image if shot.mask is None else np.ma.MaskedArray(shot.image, ~shot.mask)
+FILES = FileReader()
 
 
 def file_cautions(shot: Shot) -> list[Caution]:
@@ -328,13 +321,13 @@ class Shots:
 
 
 def find_shots(
-    shots: Any, *, reader: Reader = read_pixels, shape: tuple[int, int] | None = None
+    shots: Any, reader: FileReader = FILES, shape: tuple[int, int] | None = None
 ) -> Shots:
     """Return references to the shots of an array, of files or of a list."""
     if isinstance(shots, Shots):
         return replace(shots, shape=shape or usual_shape(shots.items))
     if isinstance(shots, (str, Path)):
-        items = _shots_at(str(shots), reader)
+        items = _shots_of(reader.frames(shots), reader)
         return Shots(items, shape or usual_shape(items))
     if hasattr(shots, "dims") and hasattr(shots, "coords"):
         return _from_xarray(shots)
@@ -360,40 +353,23 @@ def find_shots(
     return _from_array(shots)
 
 
-def _parts_of(text: str, reader: Reader) -> dict[str, Any]:
-    """Return the array that a reader selects, and whether it can select frames."""
-    keywords = inspect.signature(reader).parameters
-    if split_address(text)[1] is not None and "variable" not in keywords:
-        raise InputError(
-            f"shots are {text}, and their reader does not select an array: give the file alone, or "
-            "a reader with the keyword 'variable'"
-        )
-    variable = getattr(reader, "keywords", {}).get("variable")
-    return {"variable": variable, "numbered": "page" in keywords}
-
-
-def _shots_at(path: str, reader: Reader) -> list[Exposure]:
-    return _shots_of(find_frames(path, **_parts_of(path, reader)), reader)
-
-
-def _shots_of(frames: Sequence[FileFrame], reader: Reader) -> list[Exposure]:
+def _shots_of(frames: Sequence[FileFrame], reader: FileReader) -> list[Exposure]:
     names = _distinct_names(frames)
     return [
-        FileExposure(name, frame.path.absolute(), reader, frame.number, frame.variable)
+        FileExposure(name, replace(frame, path=frame.path.absolute()), reader)
         for name, frame in zip(names, frames, strict=True)
     ]
 
 
-def _shots_of_files(paths: Sequence[str | Path], reader: Reader) -> list[Exposure]:
+def _shots_of_files(paths: Sequence[str | Path], reader: FileReader) -> list[Exposure]:
     if not paths:
         raise InputError("shots are an empty list: expected at least one path")
     frames: list[FileFrame] = []
     for path in paths:
-        parts = _parts_of(str(path), reader)
-        if split_address(path, parts["variable"])[1] is None:
+        if split_address(path, reader.variable)[1] is None:
             frames.append(FileFrame(Path(path), text_of(Path(path).name)))
         else:
-            frames += find_frames(path, **parts)
+            frames += reader.frames(path)
     return _shots_of(frames, reader)
 
 
@@ -514,22 +490,22 @@ def _common_mask(shots: Any) -> BoolArray | None:
     return common
 
 
-def find_source(source: Any, *, reader: Reader = read_pixels) -> AnyArray | Shots | None:
+def find_source(source: Any, reader: FileReader) -> AnyArray | Shots | None:
     """Return the undisturbed beam as one image, or as many."""
     if source is None:
         return None
     if isinstance(source, (str, Path)):
-        items = _shots_at(str(source), reader)
-        if len(items) == 1:
-            return items[0].read()[0]
+        frames = reader.frames(source)
+        if len(frames) == 1:
+            return np.asarray(reader.read(frames[0]).image)
     if getattr(source, "ndim", None) == 2:
         return np.asarray(source)
-    sources = find_shots(source, reader=reader)
+    sources = find_shots(source, reader)
     return sources.items[0].read()[0] if len(sources) == 1 else sources
 
 
 def table_shots(
-    table: Path | Sequence[ShotRow], recipe: Recipe, channel: str | None
+    table: Path | Sequence[ShotRow], recipe: Recipe, channel: str | int | None
 ) -> list[Exposure]:
     """Return the shots of a table, or of its rows: to fit if the recipe says so, or to invert."""
     if recipe.fit is not None:
@@ -553,7 +529,7 @@ def _with_absolute_paths(rows: Sequence[ShotRow]) -> tuple[ShotRow, ...]:
     return tuple(map_paths(row, Path.absolute) for row in rows)
 
 
-def _read_geometry(row: ShotRow, channel: str | None) -> Shot:
+def _read_geometry(row: ShotRow, channel: str | int | None) -> Shot:
     """Read an image if its file may contain a geometry; return an empty one otherwise."""
     try:
         if format_of(row.file) in (PRADFORMAT, HDF5, TEXT):

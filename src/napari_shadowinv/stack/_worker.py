@@ -345,26 +345,14 @@ def threads_here(workers: int | None = None) -> int:
 
 @dataclass(frozen=True)
 class ShotOutcome:
-    """Outcome of one shot.
-
-    Attributes
-    ----------
-    index, status : int
-        Its number, and DONE or FAILED of `napari_shadowinv.io.store`.
-    seconds : float
-        Time that its worker spent on it, reading and writing included.
-    reason, converged : str and bool
-        Why it failed, and whether the solver reached its tolerance, or the fit its end.
-    cautions : int
-        Number of cautions about its result.
-    """
+    """Outcome of one shot."""
 
     index: int
-    status: int
-    seconds: float
-    reason: str = ""
-    converged: bool = True
-    cautions: int = 0
+    status: int  # DONE or FAILED of `napari_shadowinv.io.store`
+    seconds: float  # that its worker spent on it, reading and writing included
+    reason: str = ""  # of a failure
+    converged: bool = True  # whether the solver reached its tolerance, or the fit its end
+    cautions: int = 0  # number of them about its result
 
 
 @dataclass(frozen=True)

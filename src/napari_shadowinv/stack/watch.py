@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,11 +20,11 @@ from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model
-from napari_shadowinv.errors import FileFormatError, InversionCancelled
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.files import text_of
-from napari_shadowinv.io.frames import counts_text
+from napari_shadowinv.io.frames import FileFrame, counts_text
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, check_store_path
 from napari_shadowinv.io.store_writing import remove_unfinished
 from napari_shadowinv.pipeline.run_options import WatchOptions
@@ -48,10 +47,10 @@ from napari_shadowinv.stack._run import (
 from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import (
     FileExposure,
+    FileReader,
     NoShotError,
     Reader,
     Shots,
-    read_pixels,
 )
 from napari_shadowinv.stack._status_file import status_file
 from napari_shadowinv.stack._worker import ShotOutcome
@@ -71,7 +70,7 @@ class Watch:
         path: Path,
         options: WatchOptions,
         describe: Callable[[Shots], Stack],
-        reader: Reader,
+        reader: FileReader,
         arrivals: Arrivals,
         on_progress: OnStatus,
         should_stop: ShouldStop | None,
@@ -111,7 +110,9 @@ class Watch:
         return replace(stack, dtype=self._options.dtype)
 
     def _shot(self, file: str) -> FileExposure:
-        return FileExposure(text_of(file), self._arrivals.folder / file, self._reader)
+        name = text_of(file)
+        frame = FileFrame(self._arrivals.folder / file, name, variable=self._reader.variable)
+        return FileExposure(name, frame, self._reader)
 
     def run(self) -> None:
         """Invert existing and arriving files until the watch ends."""
@@ -227,7 +228,7 @@ class Watch:
         """Return whether a file is new, or another than the one that was inverted."""
         name, shot = text_of(file), self._shot(file)
         try:
-            shot.path.stat()
+            shot.frame.path.stat()
             if self.filled is None or self._status_of(name) not in (DONE, FAILED):
                 return True
             return not shot.unchanged(self.filled.report(self.filled.numbers[name]))
@@ -255,8 +256,6 @@ class Watch:
         self._running = {filled.numbers[text_of(file)]: file for file in files}
 
         def end(outcome: ShotOutcome, result: Any) -> None:
-            if outcome.reason:
-                self._check_folder(filled, outcome)
             del self._running[outcome.index]
             self._last_end = time.monotonic()
             name = filled.names[outcome.index]
@@ -266,21 +265,14 @@ class Watch:
         task = self._stack.task
         filled.run(numbered, task, scheduler, end, self._should_stop, keeps_results=True)
 
-    def _check_folder(self, filled: StoreRun, outcome: ShotOutcome) -> None:
-        """Raise an error if a shot failed because the folder disappeared; it stays pending."""
-        try:
-            self._arrivals.check()
-        except FileFormatError:
-            filled.reopen(outcome.index)
-            raise
-
 
 def watch_stack(
     folder: str | Path | Shot,
     out: str | Path,
     recipe: Recipe | None = None,
     *,
-    reader: Reader = read_pixels,
+    reader: Reader | None = None,
+    channel: str | int | None = None,
     watch: WatchOptions | None = None,
     on_progress: OnStatus | None = None,
     should_stop: ShouldStop | None = None,
@@ -301,7 +293,7 @@ def watch_stack(
         has the setup, the masks and the source of all shots.
     out : str or Path
         The store, ``name.shadowinv.zarr``, created once a shot can be read.
-    recipe, reader
+    recipe, reader, channel
         As for `run_stack`.
     watch : WatchOptions, optional
         Choices of the watch: names of the files, when to stop, and the store. A mapping
@@ -329,14 +321,13 @@ def watch_stack(
     watch = as_model(WatchOptions, watch, "watch")
     common = folder if isinstance(folder, Shot) else Shot(folder)
     pattern, _, variable = watch.pattern.partition("::")
-    if variable:
-        reader = partial(reader, variable=variable)
+    files = FileReader(reader, channel, variable or None)
     place = checked_folder(common.image, pattern)
     path = check_store_path(out)
     variables = stored_variables(watch.variables, recipe)
 
     def describe(arrived: Shots) -> Stack:
-        return describe_stack(replace(common, image=arrived), recipe, reader, variables)
+        return describe_stack(replace(common, image=arrived), recipe, files, variables)
 
     arrivals = Arrivals(place, pattern, settle=watch.settle, existing=not watch.skip_existing)
     on_progress = on_progress or (lambda _: None)
@@ -344,7 +335,7 @@ def watch_stack(
         if watch.status_file is not None:
             status = status_file(watch.status_file, arrivals, path, on_progress)
             on_progress = opened.enter_context(status)
-        loop = Watch(path, watch, describe, reader, arrivals, on_progress, should_stop)
+        loop = Watch(path, watch, describe, files, arrivals, on_progress, should_stop)
         try:
             ensure_compiled(
                 lambda news: loop.report(stage=f"compiling, {news.message}"), should_stop
