@@ -20,15 +20,10 @@ if TYPE_CHECKING:
     from napari_shadowinv.analysis import Product, ProductResult
 
 HELP = {
-    "result": "Result, pradformat file, or store of shots.",
     "products": "Products in quotes: name, points y,x in px, name=value.",
     "file": "TOML file with a table 'products' for each.",
     "unit": "T m, MG µm, kG cm, V, m⁻², rad, px … Default: SI.",
-    "deflector": "Field of a fit: B, E, plasma or phase.",
-    "samples": "Samples of the field for the bands.",
-    "times": "Seconds between shots, or a list for each.",
     "figure": "Figure of the products: .png, .pdf or .svg.",
-    "out": "Copy of the result with the products.",
 }
 EPILOG = """
 shadowinv analyse a.shadowinv 'profile 99,20 99,180 width=5' --unit 'MG um'
@@ -47,22 +42,22 @@ class ProductFlags:
 
     products: Annotated[Path | None, Option(help=HELP["file"])] = None
     unit: Annotated[str | None, Option(help=HELP["unit"])] = None
-    deflector: Annotated[str | None, Option(help=HELP["deflector"])] = None
-    samples: Annotated[int, Option(help=HELP["samples"], metavar="N")] = 100
+    deflector: Annotated[str | None, Option(help="Field of a fit: B, E, plasma or phase.")] = None
+    samples: Annotated[int, Option(help="Samples of the field for the bands.", metavar="N")] = 100
     setup: _flags.SetupFile = None
     shots: _flags.ChosenShots = None
-    times: Annotated[str | None, Option(help=HELP["times"])] = None
+    times: Annotated[str | None, Option(help="Seconds between shots, or a list for each.")] = None
 
 
 @notify_errors
 @_flags.takes_flags
 def analyse(
-    result: Annotated[Path, _flags.argument(help=HELP["result"])],
+    result: Annotated[Path, _flags.argument(help="Result, pradformat file, or store of shots.")],
     flags: ProductFlags,
     product: Annotated[list[str] | None, _flags.argument(help=HELP["products"])] = None,
     csv: Annotated[Path | None, Option(help="Table of all numbers with their bands.")] = None,
     figure: Annotated[Path | None, Option(help=HELP["figure"])] = None,
-    out: Annotated[Path | None, Option(help=HELP["out"])] = None,
+    out: Annotated[Path | None, Option(help="Copy of the result with the products.")] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:

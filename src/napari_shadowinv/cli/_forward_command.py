@@ -35,11 +35,7 @@ if TYPE_CHECKING:
 HELP = {
     "field": "Result, displacement (2, H, W) in px, potential (H, W) in px², or 3-D field "
     "(openPMD, also fields.h5::iteration, NetCDF).",
-    "truth": "NetCDF file of line integrals.",
-    "setup": "TOML file of the geometry to predict for.",
     "recorded_with": "TOML file of the geometry in which the field was measured.",
-    "dispersion": "New ln η / old ln η of an index.",
-    "out": "Image: .tif, .npy or .png.",
 }
 SECTIONS: Sections = {"view": SizedView, "trace": TraceOptions}
 EPILOG = """
@@ -55,10 +51,10 @@ Causes: magnetic-field, electric-field, plasma, refractive-index.
 class ExperimentFlags:
     """Flags of the experiment that an image is predicted for."""
 
-    setup: Annotated[Path | None, Option(help=HELP["setup"])] = None
+    setup: Annotated[Path | None, Option(help="TOML file of the geometry to predict for.")] = None
     recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None
     deflector: _flags.Deflector = None
-    dispersion: Annotated[float, Option(help=HELP["dispersion"])] = 1.0
+    dispersion: Annotated[float, Option(help="New ln η / old ln η of an index.")] = 1.0
     source: _flags.SourceFile = None
     channel: _flags.Channel = None
 
@@ -69,8 +65,8 @@ def forward(
     field: Annotated[Path, _flags.argument(help=HELP["field"])],
     flags: ExperimentFlags,
     settings: Annotated[list[str] | None, _flags.setting(SECTIONS, "trace.output=counts")] = None,
-    out: Annotated[Path | None, Option(help=HELP["out"])] = None,
-    truth: Annotated[Path | None, Option(help=HELP["truth"])] = None,
+    out: Annotated[Path | None, Option(help="Image: .tif, .npy or .png.")] = None,
+    truth: Annotated[Path | None, Option(help="NetCDF file of line integrals.")] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:

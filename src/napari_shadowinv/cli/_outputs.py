@@ -43,25 +43,13 @@ Output = tuple[Path | None, tuple[str, ...]]
 
 @dataclass
 class Outputs:
-    """Files of a command, with the cautions that it has printed.
-
-    Attributes
-    ----------
-    overwrite, quiet : bool
-        As the command received them.
-    files : list of Path
-        Files to write; a figure that fails is taken off the list.
-    printed : list of str
-        Cautions about setups, which are printed before the work.
-    undrawn : list of Path
-        Figures that could not be drawn.
-    """
+    """Files of a command, with the cautions that it has printed."""
 
     overwrite: bool
     quiet: bool
-    files: list[Path] = field(default_factory=list)
-    printed: list[str] = field(default_factory=list)
-    undrawn: list[Path] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)  # to write, without figures that fail
+    printed: list[str] = field(default_factory=list)  # cautions about setups, before the work
+    undrawn: list[Path] = field(default_factory=list)  # figures that fail
 
     def check(self, outputs: Iterable[Output], inputs: Iterable[Path | None]) -> None:
         """Add files to be written; refuse, before any work, one that cannot be, or is read."""

@@ -33,9 +33,6 @@ HELP = {
     "E and B on a 3-D grid.",
     "energies": "MeV of each image, or wavelength in m.",
     "size": "Height and width, such as 200x200.",
-    "recorded_with": "TOML file of the object's setup.",
-    "counts": "Mean counts a pixel. Default: 1000.",
-    "out": "Table (.csv) of draws.",
 }
 SECTIONS: Sections = {"plan": ExperimentOptions, "instrument": Instrument, "view": GridView}
 EPILOG = """
@@ -56,9 +53,9 @@ class PlanFlags:
     setup: _flags.SetupFile = None
     energies: Annotated[str | None, Option(metavar="X,X,…", help=HELP["energies"])] = None
     instrument: _flags.InstrumentNames = None
-    counts: Annotated[float | None, Option(help=HELP["counts"])] = None
+    counts: Annotated[float | None, Option(help="Mean counts a pixel. Default: 1000.")] = None
     size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None
-    recorded_with: Annotated[Path | None, Option(help=HELP["recorded_with"])] = None
+    recorded_with: Annotated[Path | None, Option(help="TOML file of the object's setup.")] = None
     deflector: _flags.Deflector = None
 
 
@@ -68,7 +65,7 @@ def plan(
     object: Annotated[str, _flags.argument(help=HELP["object"])],
     flags: PlanFlags,
     settings: Annotated[list[str] | None, _flags.setting(SECTIONS, "plan.draws=5")] = None,
-    out: Annotated[Path, Option(help=HELP["out"])] = Path("plan.csv"),
+    out: Annotated[Path, Option(help="Table (.csv) of draws.")] = Path("plan.csv"),
     figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,

@@ -80,14 +80,8 @@ def settings_of(
 ) -> Settings:
     """Return the settings of flags, and of texts KEY=VALUE, which override them.
 
-    Parameters
-    ----------
-    texts : iterable of str
-    sections : mapping of str to model
-    flags : mapping of str to tuple
-        Name and value of a flag, None if it is not given, by the key that it sets.
-    names : collection of str, optional
-        Keys outside of the sections.
+    A flag has a name and a value, None if it is not given, by the key that it sets; `names` are
+    keys outside of the sections.
     """
     entered = {key: flag for key, flag in flags.items() if flag[1] is not None}
     values = {key: value for key, (_, value) in entered.items()}
@@ -147,13 +141,8 @@ def with_steps(
 ) -> tuple[Step, ...]:
     """Change steps, or insert new ones in the order of the list of steps.
 
-    Parameters
-    ----------
-    steps : tuple of Step
-    texts : iterable of str
-        Such as ``"hot-pixels 6"`` or ``"crop y=10:90"``.
-    flags : mapping
-        Values of the main parameters of steps, by the name of the step and of its flag.
+    Texts are such as ``"hot-pixels 6"`` or ``"crop y=10:90"``; flags have values of the main
+    parameters of steps, by the name of the step and of its flag.
     """
     result = list(steps)
     for name, value in flags.items():

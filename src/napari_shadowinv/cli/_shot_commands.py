@@ -34,14 +34,12 @@ if TYPE_CHECKING:
 
 # Help of arguments, where it is longer than a line.
 HELP = {
-    "out": "Result: .shadowinv, .h5 or .csv.",
     "image": "The image, if it has moved or changed; for a fit, all images in their order. "
     "Default: the files named in the result, in its folder or the current one.",
     "rerun_out": "Result file. Default: the result's name with _again, in the current folder.",
     "other_folders": "Also read the files in other folders that the result names.",
     "system": "Print the versions and the system instead, for a bug report.",
     "noise": "Standard deviation of the noise, as a fraction of the mean.",
-    "all": "List each shot of a store.",
     "verify": "Compare all files of a store with their checksums; exit code 1 if one is damaged.",
 }
 _DEMO_PEAK = 97.0  # MG·µm; caustics form from about 185
@@ -64,7 +62,7 @@ def invert(
         _flags.setting(INVERSION_SECTIONS, "options.tolerance=1e-4", FILE_KEYS),
     ] = None,
     save_recipe: _flags.SaveRecipe = None,
-    out: Annotated[Path | None, Option(help=HELP["out"])] = None,
+    out: Annotated[Path | None, Option(help="Result: .shadowinv, .h5 or .csv.")] = None,
     figure: _flags.Figure = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
@@ -141,7 +139,7 @@ def rerun(
 @notify_errors
 def info(
     file: Annotated[Path | None, _flags.argument(help="An image, a result or a store.")] = None,
-    every: Annotated[bool, Option("--all", help=HELP["all"])] = False,
+    every: Annotated[bool, Option("--all", help="List each shot of a store.")] = False,
     verify: Annotated[bool, Option("--verify", help=HELP["verify"])] = False,
     system: Annotated[bool, Option("--system", help=HELP["system"])] = False,
 ) -> None:
