@@ -3,6 +3,7 @@ import os
 import platform
 import re
 import shlex
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -19,7 +20,7 @@ import xarray as xr
 from scipy.io import savemat
 from typer.testing import CliRunner
 
-from helpers.command_line import content, flat, interrupted, shadowinv
+from helpers.command_line import content, flat, interrupted, pressing_ctrl_c, shadowinv
 from napari_shadowinv import __version__
 from napari_shadowinv import preprocessing as filters
 from napari_shadowinv import preprocessing as sources
@@ -113,12 +114,20 @@ def test_commands_are_completed_in_a_shell(monkeypatch: pytest.MonkeyPatch) -> N
     assert result.output.split() == ["invert"]
 
 
-def test_help_needs_no_heavy_import() -> None:
+def test_help_and_report_need_no_heavy_import() -> None:
     heavy = ["numba", "scipy.fft", "scipy.optimize", "xarray", "matplotlib", "skimage", "h5py"]
     heavy += ["dask", "zarr", "distributed"]
-    code = f"import sys, napari_shadowinv.cli; print([m for m in {heavy!r} if m in sys.modules])"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.stdout.strip() == "[]", result.stderr
+    script = f"""
+import sys
+from typer.testing import CliRunner
+from napari_shadowinv.cli import app
+
+heavy = set({heavy}) & set(sys.modules)
+assert CliRunner().invoke(app, ["info", "--system"]).exit_code == 0
+print([*heavy, *({{"napari", "qtpy", "PyQt6", "PySide6"}} & set(sys.modules))])
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
 
 
 @pytest.mark.draws_figures
@@ -678,19 +687,6 @@ def test_the_report_survives_a_compiler_that_fails(monkeypatch: pytest.MonkeyPat
     assert last.endswith("unknown: ImportError: llvmlite does not load")
 
 
-def test_the_report_loads_neither_napari_nor_qt() -> None:
-    script = """
-import sys
-from typer.testing import CliRunner
-from napari_shadowinv.cli import app
-
-assert CliRunner().invoke(app, ["info", "--system"]).exit_code == 0
-print(sorted({"napari", "qtpy", "PyQt6", "PySide6"} & set(sys.modules)))
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout.strip() == "[]", done.stderr
-
-
 def test_info_needs_a_file_or_report(refused: Callable[..., None]) -> None:
     refused("info", names="--system")
     refused("info", "shot.npy", "--system", names="no file")
@@ -798,20 +794,10 @@ def test_a_bug_keeps_its_traceback(shot: Path, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
 def test_ctrl_c_while_computing_leaves_nothing(folder: Path) -> None:
     np.save("shot.npy", synthetic_image(gaussian_blob((100, 100), 100.0, 12.0).displacement))
-    say_when = """
-        import contextlib
-        from napari_shadowinv.cli import _terminal
-
-        @contextlib.contextmanager
-        def bars():
-            yield lambda progress: print("now" if progress.stage == "transport" else "")
-
-        _terminal.progress_bars = bars
-    """
     before = content(folder)
-    many = "--set=options.n_sites=30000"
-    code, errors = interrupted(folder, say_when, ["invert", "shot.npy", many])
-    assert (code, errors.strip()) == (130, "Cancelled")
+    with pressing_ctrl_c("transport", pause=0.05):
+        result = shadowinv("invert", "shot.npy", "--set=options.n_sites=30000")
+    assert (result.exit_code, result.stderr.strip()) == (130, "Cancelled")
     assert content(folder) == before
 
 
@@ -839,21 +825,30 @@ def test_ctrl_c_converted_by_a_library_still_cancels(folder: Path, shot: Path) -
     assert sorted(content(folder)) == ["shot.npy"]
 
 
-@pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
-def test_ctrl_c_while_writing_keeps_the_old_result(folder: Path, shot: Path) -> None:
+@pytest.mark.parametrize("presses", [1, 2])
+def test_ctrl_c_while_writing_keeps_the_old_result(
+    folder: Path, shot: Path, monkeypatch: pytest.MonkeyPatch, presses: int
+) -> None:
+    """Also if it is pressed again before the clean-up after the first begins."""
     (folder / "shot.shadowinv").write_text("old")
-    slow_disk = """
-        from pathlib import Path
 
-        def write_slowly(path, content):
-            path.write_text("half")
-            stall()
+    class Room:
+        def __enter__(self) -> None:
+            signal.raise_signal(signal.SIGINT)
 
-        Path.write_bytes = write_slowly
-    """
+        def __exit__(self, *_: object) -> None:
+            pass
+
+    def write_half(path: Path, _: bytes) -> None:
+        path.write_text("half")
+        if presses == 2:
+            monkeypatch.setattr("napari_shadowinv.io.files.defer_interrupts", Room)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Path, "write_bytes", write_half)
     before = content(folder)
-    code, errors = interrupted(folder, slow_disk, ["invert", "shot.npy", "--overwrite"])
-    assert (code, errors.strip()) == (130, "Cancelled")
+    result = shadowinv("invert", shot, "--overwrite")
+    assert (result.exit_code, result.stderr.strip()) == (130, "Cancelled")
     assert content(folder) == before
 
 
@@ -893,32 +888,6 @@ def test_a_figure_that_fails_does_not_cost_the_result(
     assert "latex was not able" in result.stderr
     assert "shot.shadowinv" in result.stdout
     assert "shot.png" not in result.stdout
-
-
-@pytest.mark.skipif(os.name == "nt", reason="SIGINT cannot be sent to one process there")
-def test_a_second_ctrl_c_does_not_interrupt_the_clean_up(folder: Path, shot: Path) -> None:
-    impatient = """
-        import signal
-        from pathlib import Path
-        from napari_shadowinv.io import files
-
-        class Room:
-            def __enter__(self):
-                # What is left between the interrupt and the block that puts it off.
-                signal.raise_signal(signal.SIGINT)
-            def __exit__(self, *error):
-                pass
-
-        def write_slowly(path, content):
-            path.write_text("half")
-            files.defer_interrupts = Room
-            stall()
-
-        Path.write_bytes = write_slowly
-    """
-    code, errors = interrupted(folder, impatient, ["invert", "shot.npy"])
-    assert (code, errors.strip()) == (130, "Cancelled")
-    assert sorted(content(folder)) == ["shot.npy"]
 
 
 SIGNAL_IN_IMPORT = """

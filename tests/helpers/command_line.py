@@ -7,8 +7,11 @@ import shlex
 import signal
 import textwrap
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from threading import Timer
 from unittest.mock import patch
 
 import typer.testing
@@ -16,6 +19,7 @@ from typer.main import get_command
 from typer.testing import CliRunner, Result
 
 from helpers.signals import start
+from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.cli import app
 
 # Built once: to build all flags takes longer than most of the commands.
@@ -48,6 +52,24 @@ def flat(text: str) -> str:
 def content(folder: Path) -> dict[str, bytes]:
     """Read all files of a folder."""
     return {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+
+
+@contextmanager
+def pressing_ctrl_c(stage: str, pause: float = 0.0) -> Iterator[None]:
+    """Press Ctrl-C a pause after a stage of the work of a command in this process has begun."""
+    press = Timer(pause, lambda: os.kill(os.getpid(), signal.SIGINT))
+
+    @contextmanager
+    def bars() -> Iterator[Callable[[Progress], None]]:
+        def show(progress: Progress) -> None:
+            if progress.stage == stage and press.ident is None:
+                press.start()
+
+        yield show
+
+    with patch("napari_shadowinv.cli._terminal.progress_bars", bars):
+        yield
+    press.join()
 
 
 def interrupted(

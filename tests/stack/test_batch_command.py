@@ -9,10 +9,10 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
@@ -34,7 +34,6 @@ from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.stack import RunStatus
 
 HERE = Path(__file__).parent
-SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
 BATCH = ["batch", "shots/shot_*.npy", "--out", "n.shadowinv.zarr", "--set=options.n_sites=100"]
 OPTICAL = """
 kind = "optical"
@@ -54,6 +53,7 @@ pixel_size = 1e-5
 @pytest.fixture
 def folder(night, tmp_path, monkeypatch) -> Path:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)  # Ctrl-C changes it
     np.save("reference.npy", night.source)
     Path("setup.toml").write_text(OPTICAL)
     return tmp_path
@@ -379,42 +379,22 @@ def test_without_its_package_mp4_is_refused_in_one_sentence(store, monkeypatch):
     assert not Path("plume.mp4").exists()
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
-def test_ctrl_c_leaves_a_store_that_is_resumed(make_night, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    night = make_night(60)
-    np.save("reference.npy", night.source)
-    command = [
-        "batch", "shots/shot_*.npy", "--source", "reference.npy", "--out", "n.shadowinv.zarr",
-        "--set=options.n_sites=100",
-    ]  # fmt: skip
-    out = tmp_path / "n.shadowinv.zarr"
-    process = subprocess.Popen(
-        [sys.executable, "-c", "from napari_shadowinv.cli import app; app()", *command,
-         "--workers", "1"],
-        env={**os.environ, "PYTHONPATH": str(SOURCES)},
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )  # fmt: skip
-    try:
-        end = time.monotonic() + 90
-        while not list(out.glob("status/c/*")):
-            assert process.poll() is None
-            assert time.monotonic() < end
-            time.sleep(0.02)
-        # As a terminal does: to the command and to its workers.
-        os.killpg(process.pid, signal.SIGINT)
-        _, stderr = process.communicate(timeout=60)
-    finally:
-        process.kill()
-    assert process.returncode == 130
-    assert "Repeat the command with --resume to continue" in flat(stderr)
-    assert "Traceback" not in stderr
-    statuses = StackStore(out).statuses()
-    assert set(statuses) == {DONE, PENDING}
-    resumed = shadowinv(*command, "--resume", "--scheduler", "threads", "--quiet")
-    assert resumed.exit_code == 0
+def test_ctrl_c_leaves_a_store_that_is_resumed(folder, monkeypatch):
+    update, out = _Printer.update, folder / "n.shadowinv.zarr"
+
+    def update_and_interrupt(printer, status):
+        update(printer, status)
+        if status.outcome is not None:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(_Printer, "update", update_and_interrupt)
+        cancelled = batch("--workers", 1)
+    assert cancelled.exit_code == 130
+    (sentence,) = cancelled.stderr.splitlines()
+    assert sentence.startswith("Cancelled: 1 done, 0 failed, 5 pending. Repeat the command with")
+    assert StackStore(out).statuses().tolist() == [DONE] + [PENDING] * 5
+    assert batch("--resume", "--quiet").exit_code == 0
     assert (StackStore(out).statuses() == DONE).all()
 
 
@@ -441,30 +421,26 @@ def test_ctrl_c_while_workers_start_gives_one_sentence(night, folder):
     assert re.match(r"Cancelled: (nothing written|0 done, 0 failed, 6 pending)\. ", sentence)
 
 
-@pytest.mark.skipif(os.name != "posix", reason="signals to a process group")
-def test_ctrl_c_while_the_store_is_made_leaves_nothing(night, folder):
-    # As Zarr does, which would go on after the interrupt.
-    behind_our_back = """
-        import time
-        from concurrent.futures import ThreadPoolExecutor
-        from pathlib import Path
-        from napari_shadowinv.io import store_writing as store
+def test_ctrl_c_while_the_store_is_made_leaves_nothing(folder, monkeypatch):
+    """Zarr writes in a thread of its own, which would go on after the interrupt."""
+    write = store_writing._write_template
 
-        write = store._write_template
-        pool = ThreadPoolExecutor(1)
+    def write_slowly(path, *arguments):
+        write(path, *arguments)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.3)
+        Path(path, "late").mkdir(parents=True)
 
-        def write_slowly(path, *arguments):
-            write(path, *arguments)
-            print("now")
-            time.sleep(0.3)
-            Path(path, "late").mkdir(parents=True)
-
-        store._write_template = lambda *arguments: pool.submit(write_slowly, *arguments).result()
-    """
     before = sorted(folder.rglob("*"))
-    code, output = interrupted(folder, behind_our_back, [*BATCH, "--scheduler", "threads"], 0.1)
-    assert code == 130
-    assert "Cancelled: nothing written" in output
+    with ThreadPoolExecutor(1) as pool:
+        monkeypatch.setattr(
+            store_writing,
+            "_write_template",
+            lambda *each: pool.submit(write_slowly, *each).result(),
+        )
+        result = batch()
+    assert result.exit_code == 130
+    assert "Cancelled: nothing written" in result.output
     assert sorted(folder.rglob("*")) == before
 
 
