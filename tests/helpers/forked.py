@@ -31,7 +31,7 @@ SEARCHED = os.pathsep.join([str(SOURCES), str(TESTS)])  # by Python for modules
 @contextmanager
 def forking() -> Iterator[Any]:
     """Provide multiprocessing's context of such processes, also for the workers of dask."""
-    if "forkserver" not in multiprocessing.get_all_start_methods():
+    if sys.platform != "linux":  # libraries elsewhere may not be forked
         yield multiprocessing.get_context("spawn")
         return
     from distributed.utils import get_mp_context

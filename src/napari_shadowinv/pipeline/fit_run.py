@@ -127,22 +127,28 @@ class FitInputs:
         """The setups of all images after the steps; None if there are none."""
         return values_of(self.shots, "setup")
 
-    def run(self, on_progress: OnProgress | None, should_stop: ShouldStop | None) -> Fit:
-        """Fit the fields to the images."""
+    def run(
+        self,
+        fields: tuple[str, ...] | None = None,
+        options: FitOptions | None = None,
+        *,
+        on_progress: OnProgress | None = None,
+        should_stop: ShouldStop | None = None,
+    ) -> Fit:
+        """Fit the fields, or others with other options, to the images.
+
+        The fit has its setups and its provenance, whose recipe names its fields.
+        """
         result = fit(
             self.shots,
-            fields=self.fields,
+            fields=fields or self.fields,
             instrument=self.provenance.recipe.instrument,
-            options=self.choices.options,
+            options=options or self.choices.options,
             on_progress=on_progress,
             should_stop=should_stop,
         )
-        return self.with_provenance(result)
-
-    def with_provenance(self, result: Fit) -> Fit:
-        """Return a fit with its setups and its provenance; the recipe names its fields."""
-        names, options = tuple(field.name for field in result.fields), result.options
-        choices = self.choices.model_copy(update={"fields": names, "options": options})
+        names = tuple(field.name for field in result.fields)
+        choices = self.choices.model_copy(update={"fields": names, "options": result.options})
         recipe = self.provenance.recipe.model_copy(update={"fit": choices})
         provenance = self.provenance.model_copy(update={"recipe": recipe})
         return replace(result, setups=self.setups or (), provenance=provenance)
@@ -180,7 +186,8 @@ def run_fit(
     InversionCancelled
         If `should_stop` returned true.
     """
-    return collect_fit_inputs(recipe, shots, should_stop=should_stop).run(on_progress, should_stop)
+    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
+    return inputs.run(on_progress=on_progress, should_stop=should_stop)
 
 
 def run_comparison(
@@ -204,15 +211,8 @@ def run_comparison(
         )
     options = inputs.choices.options.model_copy(update={"evidence": True})
     fits = [
-        fit(
-            inputs.shots,
-            fields=choice,
-            instrument=recipe.instrument,
-            options=options,
-            on_progress=on_progress,
-            should_stop=should_stop,
-        )
-        for choice in compared_fields(inputs.setups)
+        inputs.run(fields, options, on_progress=on_progress, should_stop=should_stop)
+        for fields in compared_fields(inputs.setups)
     ]
     evidences = {each: each.report.log_evidence or 0.0 for each in fits}
     least = max(evidences.values()) - decisive
@@ -220,7 +220,7 @@ def run_comparison(
     def rank(one: Fit) -> tuple[float, float]:
         return (len(one.fields) if evidences[one] > least else np.inf), -evidences[one]
 
-    return tuple(map(inputs.with_provenance, sorted(fits, key=rank)))
+    return tuple(sorted(fits, key=rank))
 
 
 def collect_fit_inputs(

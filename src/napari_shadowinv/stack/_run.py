@@ -57,7 +57,7 @@ from napari_shadowinv.stack._plan import (
     describe_stack,
     dtype_of,
 )
-from napari_shadowinv.stack._schedulers import Scheduler, is_local, scheduler_for
+from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import Exposure, FileReader, Reader, differences
 from napari_shadowinv.stack._worker import AnyTask, ShotOutcome, TaskContext
 
@@ -209,14 +209,6 @@ def run_stack(
     stack = replace(stack, dtype=run.dtype)
     again = [FAILED] if run.redo_failed else []
     on_progress = on_progress or (lambda _: None)
-    if is_local(scheduler):
-        # Once, instead of in all workers during their first shot.
-        ensure_compiled(
-            lambda news: on_progress(
-                RunStatus(total=len(stack.shots), stage=f"compiling, {news.message}")
-            ),
-            should_stop,
-        )
     with clear_up_when_terminated(), locked(path):
         filled = None
         if path.exists() and not run.overwrite:
@@ -229,6 +221,13 @@ def run_stack(
                 return read_stack(path)
         # Before the store is created: a scheduler that does not respond must leave nothing behind.
         with _resumable(), scheduler_for(scheduler, run.workers) as chosen:
+            if chosen.is_local:  # once, instead of in all workers during their first shot
+                ensure_compiled(
+                    lambda news: on_progress(
+                        RunStatus(total=len(stack.shots), stage=f"compiling, {news.message}")
+                    ),
+                    should_stop,
+                )
             if filled is None:
                 filled = StoreRun(create(path, stack, overwrite=run.overwrite))
             else:

@@ -45,6 +45,8 @@ _STOPPED = "stopped on request; run again to resume"
 class Scheduler:
     """A scheduler of dask on this machine; `_Cluster` is one elsewhere."""
 
+    is_local = True
+
     def __init__(
         self,
         name: str,
@@ -106,6 +108,8 @@ class Scheduler:
 
 class _Cluster(Scheduler):
     """The scheduler of a client of dask.distributed."""
+
+    is_local = False
 
     def __init__(self, client: Any) -> None:
         address = getattr(client.scheduler, "address", "?") if client.scheduler else "?"
@@ -204,43 +208,47 @@ def _check(should_stop: ShouldStop) -> None:
 
 @contextmanager
 def scheduler_for(scheduler: Any = None, workers: int | None = None) -> Iterator[Scheduler]:
-    """Find a scheduler, or start a pool for it, which ends with the block."""
-    chosen = _resolve(scheduler)
-    count = workers or available_threads(None)
-    with ExitStack() as opened:
-        if is_local(chosen):
-            yield opened.enter_context(_local(chosen, count))
-            return
-        try:
-            distributed: Any = import_module("distributed")
-        except ImportError:
-            raise InputError(
-                f"the scheduler {scheduler} needs distributed: install it with pip install "
-                "'napari-shadowinv[cluster]', or use threads or processes"
-            ) from None
-        if not isinstance(chosen, distributed.Client):
-            # No tracebacks of a lost connection in the terminal: our errors report it.
-            for logger in map(logging.getLogger, ("distributed", "distributed.client")):
-                opened.callback(logger.setLevel, logger.level)
-                logger.setLevel(logging.CRITICAL)
-            chosen = opened.enter_context(_connected(distributed, chosen))
-        yield _Cluster(chosen)
+    """Find a scheduler, or start a pool for it, which ends with the block.
 
-
-def is_local(scheduler: Any) -> bool:
-    """Return whether `scheduler_for` finds a scheduler on this machine."""
-    chosen = _resolve(scheduler)
-    is_name = isinstance(chosen, str) and "://" not in chosen
-    return is_name or callable(chosen) or isinstance(chosen, Executor)
-
-
-def _resolve(scheduler: Any) -> Any:
-    """Return the scheduler; by default dask's current client, its setting, or threads."""
+    By default it is dask's current client, its setting, or threads.
+    """
     if scheduler is None and "distributed" in sys.modules:
         with suppress(ValueError):
-            return import_module("distributed").default_client()
+            scheduler = import_module("distributed").default_client()
     dask: Any = import_module("dask")
-    return scheduler or dask.config.get("scheduler", None) or "threads"
+    chosen = scheduler or dask.config.get("scheduler", None) or "threads"
+    is_name = isinstance(chosen, str) and "://" not in chosen
+    is_local = is_name or callable(chosen) or isinstance(chosen, Executor)
+    count = workers or available_threads(None)
+    with _local(chosen, count) if is_local else _cluster(chosen) as found:
+        yield found
+
+
+@contextmanager
+def _cluster(scheduler: Any) -> Iterator[Scheduler]:
+    try:
+        distributed: Any = import_module("distributed")
+    except ImportError:
+        raise InputError(
+            f"the scheduler {scheduler} needs distributed: install it with pip install "
+            "'napari-shadowinv[cluster]', or use threads or processes"
+        ) from None
+    if isinstance(scheduler, distributed.Client):
+        yield _Cluster(scheduler)
+        return
+    with ExitStack() as opened:
+        # No tracebacks of a lost connection in the terminal: our errors report it.
+        for logger in map(logging.getLogger, ("distributed", "distributed.client")):
+            opened.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL)
+        try:
+            client = distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
+        except (OSError, RuntimeError, TypeError, ValueError) as error:
+            raise FileFormatError(
+                f"no scheduler responds at {scheduler} ({type(error).__name__}): start it with "
+                "'dask scheduler', and check the address and, for tls://, the keys"
+            ) from None
+        yield _Cluster(opened.enter_context(client))
 
 
 @contextmanager
@@ -302,13 +310,3 @@ def _begin_worker(stop: Any) -> None:
 
 def _is_worker_stopped() -> bool:
     return bool(_stop_of_worker.is_set())
-
-
-def _connected(distributed: Any, scheduler: Any) -> Any:
-    try:
-        return distributed.Client(scheduler, timeout=_CONNECT_TIMEOUT_S, set_as_default=False)
-    except (OSError, RuntimeError, TypeError, ValueError) as error:
-        raise FileFormatError(
-            f"no scheduler responds at {scheduler} ({type(error).__name__}): start it with 'dask "
-            "scheduler', and check the address and, for tls://, the keys"
-        ) from None
