@@ -97,46 +97,20 @@ class Gain:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ExperimentPlan(Summarised):
-    """Simulated shots of an experiment with their inversions or fits.
+    """Simulated shots of an experiment with their inversions or fits."""
 
-    Attributes
-    ----------
-    title : str
-        The object.
-    setups : tuple of Setup
-        The experiment of each image; none if it is planned in pixels.
-    shape : tuple of int
-        Height and width of an image in px.
-    instrument : Instrument
-        As stated.
-    options : ExperimentOptions
-        As stated.
-    method : {"inversion", "fit"}
-        By which fields were retrieved.
-    shots : tuple of PlannedShot
-        One for each draw, in order.
-    images : ndarray, shape (L, H, W)
-        Counts of the first draw.
-    truth, retrieved : ndarray, shape (2, H, W)
-        Displacement in the first image, px: at the stated energy, and of the first draw.
-    seconds : dict of str to float
-        Time of each stage.
-    is_thin : bool
-        Whether the object is taken as thin, not traced.
-    """
-
-    title: str
-    setups: tuple[Setup, ...]
-    shape: tuple[int, int]
-    instrument: Instrument
+    title: str  # of the object
+    setups: tuple[Setup, ...]  # of each image; none if it is planned in pixels
+    shape: tuple[int, int]  # height and width of an image, px
+    instrument: Instrument  # as stated, as are the options
     options: ExperimentOptions
-    method: str
-    shots: tuple[PlannedShot, ...]
-    images: FloatArray
-    truth: FloatArray
-    retrieved: FloatArray
-    seconds: dict[str, float]
-    is_thin: bool = True
+    method: str  # "inversion" or "fit", by which fields were retrieved
+    shots: tuple[PlannedShot, ...]  # one for each draw, in order
+    images: FloatArray  # (L, H, W), counts of the first draw
+    truth: FloatArray  # (2, H, W), displacement in the first image, px, at the stated energy
+    retrieved: FloatArray  # (2, H, W), the same of the first draw
+    seconds: dict[str, float]  # of each stage
+    is_thin: bool = True  # whether the object is taken as thin, not traced
 
     def _picture(self) -> FloatArray:
         return np.asarray(self.images[0])

@@ -31,20 +31,11 @@ _COLUMNS = ("file", "mask", "setup", "energy", "strength", "exclude")
 
 
 def read_pack(path: Path) -> Pack:
-    """Read a pack; file names in it are relative to its folder.
+    """Read a pack from a TOML file; file names in it are relative to its folder.
 
-    Parameters
-    ----------
-    path : Path
-        TOML file. Its `layers` are tables, or the name of a table (.csv) with a row for each; its
-        `setup` is a table, or the name of a TOML file.
-
-    Raises
-    ------
-    FileFormatError
-        If a file cannot be read.
-    InputError
-        If an entry is invalid; the message names it.
+    Its `layers` are tables, or the name of a table (.csv) with a row for each; its `setup` is a
+    table, or the name of a TOML file. A `FileFormatError` if a file cannot be read; an `InputError`
+    names an invalid entry.
     """
     path = Path(path).absolute()
     entries = read_toml(path)
@@ -64,26 +55,10 @@ def write_layers(
 ) -> list[Path]:
     """Write the fluence of each layer as an image, its mask, its setup, and a table of them.
 
-    The table, ``layers.csv``, is for `shadowinv fit` and `shadowinv batch`. Without a setup it
-    contains the energy of each layer and the displacement of its protons by a magnetic field,
-    relative to the first.
-
-    Parameters
-    ----------
-    doses : FilmDoses
-        Result of `run_film`.
-    folder : Path
-        Created if it does not exist.
-
-    Returns
-    -------
-    list of Path
-        The files, the table last.
-
-    Raises
-    ------
-    FileFormatError
-        If a file exists, unless `overwrite`, or cannot be written.
+    Returns the files, the table last: ``layers.csv``, for `shadowinv fit` and `shadowinv batch`.
+    Without a setup it contains the energy of each layer and the displacement of its protons by a
+    magnetic field, relative to the first. The folder is made if it does not exist; a
+    `FileFormatError` if a file exists, unless `overwrite`, or cannot be written.
     """
     make_folder(folder)
     setups, rows = doses.setups, []

@@ -70,54 +70,24 @@ _ALTERNATIVES = "use the same, overwrite the store, or choose another name"
 
 @dataclass(frozen=True)
 class RunStatus:
-    """Status of a run, or of a watched folder.
+    """Status of a run, or of a watched folder."""
 
-    Attributes
-    ----------
-    total, done, failed : int
-        Numbers of shots, including earlier runs.
-    doubtful : int
-        Shots that are done, with cautions.
-    skipped : int
-        Files of a watched folder that came while newer ones were inverted, and are in no store.
-    waiting : int
-        Shots that have not ended; of a watched folder, files that have arrived.
-    ended : int
-        Shots that have ended in this run.
-    seconds : float
-        Time of this run; of a watched folder, the time during which shots were inverted.
-    scheduler : str
-        Name of the scheduler that runs the shots.
-    stage : str
-        Current stage of the preparation, before all shots.
-    name, outcome : str, ShotOutcome or None
-        The shot that has just ended, if any, and its outcome.
-    result : Inversion, Fit or None
-        Its result, for a watched folder; do not keep a reference.
-    again : bool
-        Whether the shot was inverted before and its file has changed since.
-    failures : tuple of (str, str)
-        Names of the failed shots, with the reasons.
-    note : str
-        A sentence for the user.
-    """
-
-    total: int = 0
+    total: int = 0  # shots, including those of earlier runs, as are the next three
     done: int = 0
     failed: int = 0
-    doubtful: int = 0
-    skipped: int = 0
-    waiting: int = 0
-    ended: int = 0
-    seconds: float = 0.0
-    scheduler: str = ""
-    stage: str = ""
-    name: str = ""
-    outcome: ShotOutcome | None = None
-    result: Inversion | Fit | None = None
-    again: bool = False
-    failures: tuple[tuple[str, str], ...] = ()
-    note: str = ""
+    doubtful: int = 0  # done, with cautions
+    skipped: int = 0  # files that came while newer ones were inverted, and are in no store
+    waiting: int = 0  # shots that have not ended; of a watched folder, files that have arrived
+    ended: int = 0  # shots, in this run
+    seconds: float = 0.0  # of this run; of a watched folder, while shots were inverted
+    scheduler: str = ""  # its name
+    stage: str = ""  # of the preparation, before all shots
+    name: str = ""  # of the shot that has just ended, if any
+    outcome: ShotOutcome | None = None  # of this shot
+    result: Inversion | Fit | None = None  # of it in a watched folder; do not keep a reference
+    again: bool = False  # whether it was inverted before, and its file has changed since
+    failures: tuple[tuple[str, str], ...] = ()  # names of the failed shots, with the reasons
+    note: str = ""  # a sentence for the user
 
     @property
     def rate(self) -> float:
