@@ -147,11 +147,11 @@ def test_only_one_module_connects_to_events_of_napari():
     places = [
         f"{path.name}:{node.lineno}"
         for path, tree in TREES.items()
-        if module_of(path) != f"{PACKAGE}._napari.events"
+        if module_of(path) != f"{PACKAGE}._napari.viewer_sync"
         for node in ast.walk(tree)
         if isinstance(node, ast.Attribute) and node.attr == "events"
     ]
-    assert not places, "use _napari/events.py"
+    assert not places, "use connect of _napari/viewer_sync.py"
 
 
 @cache

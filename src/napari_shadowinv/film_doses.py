@@ -1,17 +1,19 @@
-"""The result of a film pack: `FilmDoses`."""
+"""The result of a film pack: `FilmDoses`; its mean spectrum in a region: `Spectrum`."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, ClassVar
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._system.validation import validate
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import (
@@ -53,7 +55,23 @@ _VARIABLES: dict[str, tuple[str, tuple[str, ...], str, str]] = {
     "by_images": ("by_images", ("layer",), "1", "Aligned on the image content"),
     "corners": ("corners", ("layer", "corner", "component"), PIXEL, "Corners on the scan"),
 }
+_MIN_SIGNIFICANCE = 2.0  # fluence over its error, dose over that of a flat background
+_MAX_BACKGROUND_SHARE = 0.05  # of the largest dose; above, the last film sees the beam
 _BANDS = ("peak", "energy_low", "energy_high")  # columns of `FilmDoses.bands`
+
+
+class Spectrum(NamedTuple):
+    """Mean over the usable pixels of a region, by film; NaN for films without usable pixels."""
+
+    energies: FloatArray  # MeV
+    fluence: FloatArray  # protons per m² and MeV
+    error: FloatArray  # median standard deviation of a pixel; mostly common to all pixels
+    bands: FloatArray  # shape (n, 2), MeV
+    is_measured: BoolArray
+    """False for layers without usable pixels or with a fluence below twice its error, and for the
+    last layer, whose fluence depends on the assumed spectrum beyond it. Also for a faint layer
+    whose dose exceeds the dose of the last film, which electrons or X-rays may leave in all films,
+    by less than twice that dose."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -192,6 +210,25 @@ class FilmDoses(Summarised):
         if not self.usable[index].any():
             parts.append("excluded")
         return f"film {index + 1}: {', '.join(parts)}"
+
+    def spectrum(self, region: BoolArray | None = None) -> Spectrum:
+        """Return the mean fluence of each film over the usable pixels of a region; None is all."""
+        inside = self.usable if region is None else self.usable & region
+
+        def reduce(planes: FloatArray, statistic: Callable[[AnyArray], Any]) -> FloatArray:
+            films = zip(planes, inside, strict=True)
+            values = [statistic(plane[used]) if used.any() else np.nan for plane, used in films]
+            return np.array(values, float)
+
+        fluence = reduce(self.fluence, partial(np.mean, dtype=np.float64))
+        error = reduce(self.fluence_error, np.median)
+        is_measured = fluence > _MIN_SIGNIFICANCE * error  # False for NaN
+        is_measured[-1] = False
+        dose = reduce(self.dose, partial(np.mean, dtype=np.float64))
+        background = dose[-1]
+        is_faint = dose < _MAX_BACKGROUND_SHARE * np.nanmax(dose, initial=0.0)
+        is_measured &= ~(is_faint & (dose - background < _MIN_SIGNIFICANCE * background))
+        return Spectrum(self.energies, fluence, error, self.bands[:, 1:], is_measured)
 
     @property
     def _range(self) -> str:

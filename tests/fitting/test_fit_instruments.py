@@ -280,9 +280,11 @@ def test_each_step_is_told_with_its_stage_and_objective() -> None:
         assert objectives
         assert all(isinstance(value, float) for value in objectives)
     descent = next(news for news in reports if news.message == "smoothness")
-    assert descent.text == f"smoothness, objective {descent.objective:.6g}"
-    steps = [news.step for news in reports]
-    assert steps == sorted(steps)
+    assert descent.text == f"stage 2 of 3, smoothness, objective {descent.objective:.6g}"
+    assert not any("nan" in news.text for news in reports)
+    stages = [news.step for news in reports if news.stage == "fit"]  # the bar never goes back
+    assert stages == sorted(stages)
+    assert set(stages) == {0, 1, 2}
 
 
 def test_a_beam_assumed_uniform_is_fitted_as_an_unknown_one() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import functools
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,16 @@ pytest.importorskip("napari")
 from napari.components import ViewerModel
 
 import napari_shadowinv
+from helpers.fits import doubtful_fit
 from napari_shadowinv import InversionOptions, invert
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
 from napari_shadowinv.pipeline import read_pack, run_film
-from simulated_pack import Truth, simulate
+from simulated_pack import simulate
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_preferences(tmp_path_factory: pytest.TempPathFactory) -> None:
+def _no_preferences(tmp_path_factory):
     """Keep the tests and the preferences of whoever runs them apart."""
     from napari import settings
 
@@ -36,7 +35,7 @@ def _no_preferences(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _manifests_parsed_once() -> None:
+def _manifests_parsed_once():
     """Keep the content of manifests, which each new window parses anew: a third of its time."""
     from npe2.manifest import _bases
 
@@ -47,7 +46,7 @@ def _manifests_parsed_once() -> None:
 
 
 @pytest.fixture
-def preferences() -> Iterator[Any]:
+def preferences():
     """The plugin's preferences, which have their defaults again after a test."""
     from napari import settings
 
@@ -58,14 +57,14 @@ def preferences() -> Iterator[Any]:
 
 
 @pytest.fixture
-def manifest() -> Any:
+def manifest():
     from npe2 import PluginManifest
 
     return PluginManifest.from_file(Path(napari_shadowinv.__file__).with_name("napari.yaml"))
 
 
 @pytest.fixture
-def viewer() -> ViewerModel:
+def viewer():
     """A viewer without a window, with this plugin as it is installed."""
     from npe2 import PluginManager
 
@@ -74,7 +73,7 @@ def viewer() -> ViewerModel:
 
 
 @pytest.fixture(scope="session")
-def solved() -> Inversion:
+def solved():
     """A small inversion that was really solved, of an object without symmetry, and determined."""
     image = synthetic_image(ellipse_pair((40, 52)).displacement)
     options = InversionOptions(n_sites=500, max_error=0.2)
@@ -82,19 +81,29 @@ def solved() -> Inversion:
 
 
 @pytest.fixture(scope="session")
-def film_pack(tmp_path_factory: pytest.TempPathFactory) -> Truth:
+def doubtful():
+    return doubtful_fit("B")
+
+
+@pytest.fixture(scope="session")
+def two_fields():
+    return doubtful_fit("B", "E")
+
+
+@pytest.fixture(scope="session")
+def film_pack(tmp_path_factory):
     """Scans of three small films, and their pack file."""
     folder = tmp_path_factory.mktemp("films") / "trio"
     return simulate(folder, layers=3, shape=(80, 100), strata=4, seed=2)
 
 
 @pytest.fixture(scope="session")
-def pack_doses(film_pack: Truth) -> Any:
+def pack_doses(film_pack):
     return run_film(read_pack(film_pack.pack))
 
 
 @pytest.fixture
-def messages(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def messages(monkeypatch):
     """The texts of napari's notifications."""
     from napari.utils import notifications
 
@@ -108,15 +117,15 @@ def messages(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.fixture
-def in_loop(qtbot: Any) -> Any:
+def in_loop(qtbot):
     """Call a function from within the event loop, as a menu does, and return its result."""
     from qtpy.QtCore import QTimer
 
-    def call(function: Any, *args: Any) -> Any:
+    def call(function, *args):
         answers: list[Any] = []
         errors: list[Exception] = []
 
-        def answer() -> None:
+        def answer():
             try:
                 answers.append(function(*args))
             except Exception as error:
@@ -131,7 +140,7 @@ def in_loop(qtbot: Any) -> Any:
     return call
 
 
-def run_alone(code: str, tmp_path: Path) -> str:
+def run_alone(code, tmp_path):
     """Run Python code in a process of its own and return what it printed."""
     import subprocess
 
@@ -143,12 +152,12 @@ def run_alone(code: str, tmp_path: Path) -> str:
 
 
 @pytest.fixture
-def alone(tmp_path: Path) -> Any:
+def alone(tmp_path):
     return lambda code: run_alone(code, tmp_path)
 
 
 @pytest.fixture
-def noisy() -> np.ndarray:
+def noisy():
     """An image of counts with one hot pixel and a slope."""
     image = np.random.default_rng(3).normal(400, 4, (48, 60)) + np.linspace(0, 200, 60)
     image[10, 20] = 5000

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import Any
 
 import numpy as np
 import pytest
-from napari.components import ViewerModel
 
 from helpers.shifted_pair import shifted_pair
 from napari_shadowinv import (
     InputError,
     InversionOptions,
-    ProtonSetup,
     add_to_viewer,
     invert,
 )
@@ -35,18 +32,16 @@ from napari_shadowinv.preprocessing import measure_shift, move
 
 
 @pytest.fixture
-def shot() -> np.ndarray:
+def shot():
     return synthetic_image(ellipse_pair((32, 40)).displacement)
 
 
-def add_shot(viewer: Any, image: Any, setup: ProtonSetup | None = None) -> Any:
+def add_shot(viewer, image, setup=None):
     data, keywords, _ = shot_layer(image, "shot", setup, (0.0, 2.0))
     return viewer.add_image(data, **keywords)
 
 
-def test_invert_makes_the_layers_of_the_default_inversion(
-    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
-) -> None:
+def test_invert_makes_the_layers_of_the_default_inversion(viewer, shot, proton_setup):
     layer = add_shot(viewer, shot, proton_setup)
     layer.translate = (30.0, 60.0)
     by_role = {role_of(keywords): (data, keywords)
@@ -59,7 +54,7 @@ def test_invert_makes_the_layers_of_the_default_inversion(
     assert keywords["scale"] == (1.5, 1.5)
 
 
-def test_the_shot_that_is_shown_is_taken_of_a_stack(viewer: ViewerModel, shot: np.ndarray) -> None:
+def test_the_shot_that_is_shown_is_taken_of_a_stack(viewer, shot):
     layer = add_shot(viewer, np.stack([np.full_like(shot, 5), shot]))
     viewer.dims.set_point(0, 1)
     ((data, keywords, _),) = commands.high_pass(layer, viewer)
@@ -68,7 +63,7 @@ def test_the_shot_that_is_shown_is_taken_of_a_stack(viewer: ViewerModel, shot: n
     assert keywords["name"] == "shot 1 high-pass σ=4.8 px"
 
 
-def test_hot_pixels_are_replaced_and_counted(viewer: ViewerModel, noisy: np.ndarray) -> None:
+def test_hot_pixels_are_replaced_and_counted(viewer, noisy):
     ((data, keywords, _),) = commands.remove_hot_pixels(add_shot(viewer, noisy))
     assert keywords["name"] == "shot without 1 hot or dead pixels"
     assert data[10, 20] < 700
@@ -76,18 +71,14 @@ def test_hot_pixels_are_replaced_and_counted(viewer: ViewerModel, noisy: np.ndar
     assert changed.sum() == 1
 
 
-def test_high_pass_takes_the_slope_and_keeps_the_mean(
-    viewer: ViewerModel, noisy: np.ndarray
-) -> None:
+def test_high_pass_takes_the_slope_and_keeps_the_mean(viewer, noisy):
     ((data, _, _),) = commands.high_pass(add_shot(viewer, noisy))
     assert data.mean() == pytest.approx(noisy.mean())
     slope = data[:, -10:].mean() - data[:, :10].mean()
     assert abs(slope) < 60  # 167 before
 
 
-def test_the_estimate_is_a_source_of_the_same_flux(
-    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
-) -> None:
+def test_the_estimate_is_a_source_of_the_same_flux(viewer, shot, proton_setup):
     ((data, keywords, _),) = commands.estimate_source(add_shot(viewer, shot, proton_setup))
     assert role_of(keywords) == "source"
     assert is_estimate(keywords)
@@ -99,7 +90,7 @@ def test_the_estimate_is_a_source_of_the_same_flux(
 @pytest.mark.parametrize(
     "command", [commands.invert_uniform, commands.high_pass, commands.estimate_source]
 )
-def test_a_wrong_layer_is_one_sentence(viewer: ViewerModel, command: Any) -> None:
+def test_a_wrong_layer_is_one_sentence(viewer, command):
     with pytest.raises(InputError, match="no layer is selected: select an image"):
         command(None)
     with pytest.raises(InputError, match="'Points' is of type Points: select a grey image"):
@@ -108,16 +99,14 @@ def test_a_wrong_layer_is_one_sentence(viewer: ViewerModel, command: Any) -> Non
         command(viewer.add_image(np.zeros((5, 6, 3)), rgb=True, name="colours"))
 
 
-def test_what_shows_no_inversion_is_not_refined(viewer: ViewerModel, shot: np.ndarray) -> None:
+def test_what_shows_no_inversion_is_not_refined(viewer, shot):
     with pytest.raises(InputError, match="no layer is selected: select a layer of an inversion"):
         commands.refine(None)
     with pytest.raises(InputError, match="'shot' shows no result: select a layer of an inversion"):
         commands.refine(add_shot(viewer, shot))
 
 
-def test_an_inversion_is_refined_from_any_of_its_layers(
-    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
-) -> None:
+def test_an_inversion_is_refined_from_any_of_its_layers(viewer, shot, proton_setup):
     inversion = invert(shot, options=InversionOptions(n_sites=500))
     layers = add_to_viewer(viewer, inversion, proton_setup, name="shot", translate=(30.0, 60.0))
     arrows = next(layer for layer in layers if role_of(layer) == "arrows")
@@ -132,14 +121,14 @@ def test_an_inversion_is_refined_from_any_of_its_layers(
     assert "uncertainty" in by_role
 
 
-def outline(viewer: ViewerModel, layer: Any, low: int, high: int) -> Any:
+def outline(viewer, layer, low, high):
     """A rectangle over the pixels from `low` to `high` of both axes, in the world of a layer."""
     corners = [layer.data_to_world((y, x)) for y in (low, high) for x in (low, high)]
     rectangle = np.array(corners)[[0, 1, 3, 2]]
     return viewer.add_shapes([rectangle], shape_type="rectangle", units=layer.units)
 
 
-def placed_shot(viewer: ViewerModel, shot: np.ndarray, setup: ProtonSetup) -> Any:
+def placed_shot(viewer, shot, setup):
     layer = add_shot(viewer, shot, setup)
     layer.translate = (30.0, 60.0)
     layer.metadata[KEY] |= {"source": 2 * shot, "usable": shot < shot.max()}
@@ -147,9 +136,7 @@ def placed_shot(viewer: ViewerModel, shot: np.ndarray, setup: ProtonSetup) -> An
 
 
 @pytest.mark.parametrize("selected", ["image", "rectangle"])
-def test_a_crop_keeps_place_setup_source_and_mask(
-    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup, selected: str
-) -> None:
+def test_a_crop_keeps_place_setup_source_and_mask(viewer, shot, proton_setup, selected):
     layer = placed_shot(viewer, shot, proton_setup)
     rectangle = outline(viewer, layer, 5, 14)
     if selected == "rectangle":
@@ -167,16 +154,14 @@ def test_a_crop_keeps_place_setup_source_and_mask(
     np.testing.assert_array_equal(usable_of(cropped), data < shot.max())
 
 
-def test_without_a_rectangle_there_is_no_crop(viewer: ViewerModel, shot: np.ndarray) -> None:
+def test_without_a_rectangle_there_is_no_crop(viewer, shot):
     layer = add_shot(viewer, shot)
     viewer.add_shapes([[(3, 3), (20, 20)]], shape_type="line", name="profile")
     with pytest.raises(InputError, match="no rectangle to crop to: draw one in a shapes layer"):
         commands.crop(layer, viewer)
 
 
-def test_binned_pixels_are_larger_and_stay_in_place(
-    viewer: ViewerModel, shot: np.ndarray, proton_setup: ProtonSetup
-) -> None:
+def test_binned_pixels_are_larger_and_stay_in_place(viewer, shot, proton_setup):
     layer = placed_shot(viewer, shot, proton_setup)
     ((data, keywords, _),) = commands.bin_pixels(layer)
     assert data.sum() == pytest.approx(shot.sum())
@@ -186,7 +171,7 @@ def test_binned_pixels_are_larger_and_stay_in_place(
     assert source_of(binned).sum() == pytest.approx(2 * data.sum())
 
 
-def test_a_source_is_moved_to_fit_its_image(viewer: ViewerModel) -> None:
+def test_a_source_is_moved_to_fit_its_image(viewer):
     image, source = shifted_pair((2.3, -1.6))
     layer = add_shot(viewer, image)
     with pytest.raises(InputError, match="no source for 'shot' is selected: select its source"):
@@ -210,25 +195,13 @@ def test_a_source_is_moved_to_fit_its_image(viewer: ViewerModel) -> None:
     np.testing.assert_array_equal(again, data)
 
 
-def registered(name: str) -> Any:
+def registered(name):
     from napari._app_model import get_app_model
 
     return lambda: get_app_model().commands.execute_command(f"napari-shadowinv.{name}").result()
 
 
-def test_from_the_menu_the_selected_layer_is_filtered_beside_the_window(
-    make_napari_viewer: Any, noisy: np.ndarray, in_loop: Any, qtbot: Any
-) -> None:
-    window = make_napari_viewer()
-    add_shot(window, noisy)
-    in_loop(registered("remove_hot_pixels"))
-    qtbot.waitUntil(lambda: len(window.layers) == 2, timeout=30_000)
-    assert window.layers[-1].data[10, 20] < 700
-
-
-def test_from_the_menu_the_selected_image_is_not_its_own_source(
-    make_napari_viewer: Any, in_loop: Any, qtbot: Any
-) -> None:
+def test_from_the_menu_the_selected_image_is_not_its_own_source(make_napari_viewer, in_loop, qtbot):
     window = make_napari_viewer()
     image, source = shifted_pair((2.3, -1.6))
     beam = window.add_image(source, name="beam", metadata={KEY: {"role": "source"}})
@@ -243,21 +216,9 @@ def test_from_the_menu_the_selected_image_is_not_its_own_source(
     assert beam in window.layers
 
 
-def test_from_the_menu_an_inversion_brings_its_layers_and_the_scale_bar(
-    make_napari_viewer: Any, shot: np.ndarray, in_loop: Any, qtbot: Any, proton_setup: ProtonSetup
-) -> None:
-    window = make_napari_viewer()
-    add_shot(window, shot, proton_setup)
-    in_loop(registered("invert_uniform"))
-    qtbot.waitUntil(lambda: len(window.layers) == 5, timeout=120_000)
-    assert window.layers.selection.active.name == "± |∫B×dz| (µT·m) – shot"
-    overlays = getattr(getattr(window, "canvas", None), "overlays", window)  # napari before 0.9
-    assert overlays.scale_bar.visible
-
-
-def test_from_the_menu_a_mistake_is_one_notification(
-    make_napari_viewer: Any, in_loop: Any, qtbot: Any, messages: list[str]
-) -> None:
+def test_from_the_menu_the_selected_layer_is_worked_on_beside_the_window(
+    make_napari_viewer, noisy, shot, in_loop, qtbot, messages, proton_setup
+):
     window = make_napari_viewer()
     in_loop(registered("invert_uniform"))
     assert messages == ["No layer is selected: select an image in the layer list"]
@@ -265,12 +226,21 @@ def test_from_the_menu_a_mistake_is_one_notification(
     in_loop(registered("invert_uniform"))
     qtbot.waitUntil(lambda: len(messages) == 2, timeout=30_000)
     assert messages[1].startswith("Image has 400 negative pixels")
-    assert len(window.layers) == 1
+    add_shot(window, noisy)
+    in_loop(registered("remove_hot_pixels"))
+    qtbot.waitUntil(lambda: len(window.layers) == 3, timeout=30_000)
+    assert window.layers[-1].data[10, 20] < 700
+    add_shot(window, shot, proton_setup)
+    in_loop(registered("invert_uniform"))
+    qtbot.waitUntil(lambda: len(window.layers) == 8, timeout=120_000)
+    assert window.layers.selection.active.name.startswith("± |∫B×dz| (µT·m) – shot")
+    overlays = getattr(getattr(window, "canvas", None), "overlays", window)  # napari before 0.9
+    assert overlays.scale_bar.visible
 
 
 def test_the_cross_of_the_progress_bar_ends_an_inversion(
-    make_napari_viewer: Any, in_loop: Any, qtbot: Any, messages: list[str]
-) -> None:
+    make_napari_viewer, in_loop, qtbot, messages
+):
     from napari.utils.progress import cancelable_progress, progress
 
     window = make_napari_viewer()
@@ -286,12 +256,11 @@ def test_the_cross_of_the_progress_bar_ends_an_inversion(
 
 
 def test_closing_the_window_ends_a_command(
-    make_napari_viewer: Any, shot: np.ndarray, in_loop: Any, qtbot: Any, messages: list[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    make_napari_viewer, shot, in_loop, qtbot, messages, monkeypatch
+):
     stopped = threading.Event()
 
-    def wait_for_stop(*_: Any, should_stop: Any, **__: Any) -> None:
+    def wait_for_stop(*_, should_stop, **__):
         while not should_stop():
             time.sleep(0.01)
         stopped.set()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pint
 import pytest
@@ -11,7 +9,6 @@ from napari.components import ViewerModel
 
 from napari import __version__ as napari_version
 from napari_shadowinv import Recipe, invert_stack, read, write
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.setup import OpticalSetup
 
 PIXEL_M = 2e-6
@@ -26,9 +23,7 @@ reads_coordinates = pytest.mark.skipif(
 
 @reads_coordinates
 @pytest.mark.parametrize("origin", ["memory", "file", "stack"])
-def test_field_in_metres_lies_over_a_layer_of_its_pixels(
-    origin: str, inversion: Inversion, tmp_path: Path
-) -> None:
+def test_field_in_metres_lies_over_a_layer_of_its_pixels(origin, inversion, tmp_path):
     dataset = inversion.in_units(SETUP).to_dataset()
     path = tmp_path / "shot.shadowinv"
     if origin == "file":
@@ -49,7 +44,7 @@ def test_field_in_metres_lies_over_a_layer_of_its_pixels(
 
 
 @reads_coordinates
-def test_field_without_a_setup_is_in_pixels_of_napari(inversion: Inversion) -> None:
+def test_field_without_a_setup_is_in_pixels_of_napari(inversion):
     viewer = ViewerModel()
     image = viewer.add_image(inversion.image)
     field = viewer.add_image(inversion.to_dataset()["potential"])
@@ -57,7 +52,7 @@ def test_field_without_a_setup_is_in_pixels_of_napari(inversion: Inversion) -> N
     np.testing.assert_array_equal(field.scale, image.scale)
 
 
-def test_units_of_a_result_are_parsed_by_pint_as_meant(inversion: Inversion) -> None:
+def test_units_of_a_result_are_parsed_by_pint_as_meant(inversion):
     dataset = inversion.in_units(SETUP).to_dataset()
     units = {name: registry.Unit(dataset[name].attrs["units"]) for name in dataset.variables}
     pixel = registry.Unit("pixel")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import napari_shadowinv
 from napari_shadowinv.io import formats
@@ -16,7 +15,7 @@ ROOT = Path(napari_shadowinv.__file__).parent
 NEW_MENUS = {"napari/layers/metadata"}
 
 
-def test_it_is_valid_and_each_command_can_be_imported(manifest: Any) -> None:
+def test_it_is_valid_and_each_command_can_be_imported(manifest):
     manifest.validate_imports()
     assert manifest.name == "napari-shadowinv"
 
@@ -25,7 +24,7 @@ def test_it_is_valid_and_each_command_can_be_imported(manifest: Any) -> None:
 OPENED_BY_NAPARI = formats.SCAN_SUFFIXES | {".npy", formats.SITES.suffix}
 
 
-def test_its_readers_and_writers_are_those_of_the_registry(manifest: Any) -> None:
+def test_its_readers_and_writers_are_those_of_the_registry(manifest):
     contributions = manifest.contributions
     (reader,) = contributions.readers
     readable = {end for each in formats.FORMATS if each.title for end in each.suffixes}
@@ -39,7 +38,7 @@ def test_its_readers_and_writers_are_those_of_the_registry(manifest: Any) -> Non
     assert sorted(written) == sorted(writers)
 
 
-def test_napari_itself_opens_what_is_left_to_it() -> None:
+def test_napari_itself_opens_what_is_left_to_it():
     import napari_builtins
     from npe2 import PluginManifest
 
@@ -50,7 +49,7 @@ def test_napari_itself_opens_what_is_left_to_it() -> None:
     assert {f"*{suffix}" for suffix in OPENED_BY_NAPARI} <= patterns
 
 
-def test_its_menus_exist(manifest: Any) -> None:
+def test_its_menus_exist(manifest):
     from napari._app_model.constants._menus import MenuId
 
     menus = set(manifest.contributions.menus)
@@ -60,11 +59,11 @@ def test_its_menus_exist(manifest: Any) -> None:
     assert missing == (NEW_MENUS if version("napari").startswith("0.7.") else set())
 
 
-def test_a_menu_is_short(manifest: Any) -> None:
+def test_a_menu_is_short(manifest):
     assert max(map(len, manifest.contributions.menus.values())) <= 4
 
 
-def test_every_command_is_used_and_every_use_is_a_command(manifest: Any) -> None:
+def test_every_command_is_used_and_every_use_is_a_command(manifest):
     contributions = manifest.contributions
     ids = {command.id for command in contributions.commands}
     used = [
@@ -77,14 +76,14 @@ def test_every_command_is_used_and_every_use_is_a_command(manifest: Any) -> None
     assert ids == set(used)
 
 
-def test_the_installed_plugin_is_this_manifest() -> None:
+def test_the_installed_plugin_is_this_manifest():
     from importlib.metadata import entry_points
 
     (entry,) = entry_points(group="napari.manifest", name="napari-shadowinv")
     assert entry.value == "napari_shadowinv:napari.yaml"
 
 
-def test_reading_the_manifest_and_asking_the_reader_stays_light(alone: Any, tmp_path: Path) -> None:
+def test_reading_the_manifest_and_asking_the_reader_stays_light(alone, tmp_path):
     for name in ("foreign.h5", "foreign.mat", "foreign.tif"):
         (tmp_path / name).write_bytes(b"\x89HDF\r\n\x1a\n" + b"\0" * 90)
     heavy = alone(
@@ -103,7 +102,7 @@ print([m for m in sys.modules if m in ("qtpy", "PyQt6", "PySide6", "numba", "nap
     assert heavy.strip() == "[]"
 
 
-def test_the_package_works_where_napari_is_not_installed(alone: Any) -> None:
+def test_the_package_works_where_napari_is_not_installed(alone):
     printed = alone(
         """
 import sys
@@ -136,7 +135,7 @@ except ModuleNotFoundError as error:
     assert printed.split() == ["400", "napari"]
 
 
-def test_the_public_function_does_not_import_napari(alone: Any) -> None:
+def test_the_public_function_does_not_import_napari(alone):
     printed = alone(
         """
 import sys

@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from napari.components import ViewerModel
 from napari.layers import Image
 
-from napari_shadowinv import ProtonSetup, add_to_viewer
+from napari_shadowinv import add_to_viewer
 from napari_shadowinv._napari import preferences as about
 from napari_shadowinv._napari.layer_metadata import frame_for, role_of
 from napari_shadowinv._napari.samples import toroid
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv.inversion import Inversion
 
 
 @pytest.fixture
-def configurations(manifest: Any) -> dict[str, Any]:
+def configurations(manifest):
     return dict(manifest.contributions.configurations)
 
 
-def test_the_manifest_has_the_defaults(configurations: dict[str, Any]) -> None:
+def test_the_manifest_has_the_defaults(configurations):
     declared = {
         group: {name: field.default for name, field in configuration.properties.items()}
         for group, configuration in configurations.items()
@@ -30,16 +26,14 @@ def test_the_manifest_has_the_defaults(configurations: dict[str, Any]) -> None:
     assert declared == about.DEFAULTS
 
 
-def test_napari_has_every_colour_map_on_offer(configurations: dict[str, Any]) -> None:
+def test_napari_has_every_colour_map_on_offer(configurations):
     offered = {
         name for field in configurations["colour_maps"].properties.values() for name in field.enum
     }
     assert {Image(np.eye(2), colormap=name).colormap.name for name in offered} == offered
 
 
-def test_new_layers_have_the_preferred_colours(
-    viewer: ViewerModel, solved: Inversion, preferences: Any
-) -> None:
+def test_new_layers_have_the_preferred_colours(viewer, solved, preferences):
     add_to_viewer(viewer, solved, all_layers=True)
     colours = preferences.colour_maps
     colours.field, colours.signed, colours.image = "viridis", "PiYG", "gray_r"
@@ -58,25 +52,21 @@ def test_new_layers_have_the_preferred_colours(
     ("choice", "unit", "scale"),
     [("automatic", "mm", 0.02), ("µm", "um", 20), ("cm", "cm", 2e-3), ("m", "m", 2e-5)],
 )
-def test_axes_have_the_preferred_unit(
-    preferences: Any, choice: str, unit: str, scale: float
-) -> None:
+def test_axes_have_the_preferred_unit(preferences, choice, unit, scale):
     preferences.units.length = choice
     frame = frame_for((600, 400), None, pixel_size=20e-6)  # 12 mm high
     assert frame.units == (unit, unit)
     assert frame.scale == pytest.approx((scale, scale))
 
 
-def test_a_unit_that_napari_must_know(
-    viewer: ViewerModel, preferences: Any, proton_setup: ProtonSetup, solved: Inversion
-) -> None:
+def test_a_unit_that_napari_must_know(viewer, preferences, proton_setup, solved):
     preferences.units.length = "mm"
     (field, *_) = add_to_viewer(viewer, solved, proton_setup)
     assert {str(unit) for unit in field.units} == {"millimeter"}
     assert field.scale == pytest.approx([1.5e-3, 1.5e-3])
 
 
-def test_an_older_napari_has_the_defaults(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_older_napari_has_the_defaults(monkeypatch):
     monkeypatch.delattr("napari.settings.get_plugin_settings", raising=False)
     assert about.preference("units", "length") == "automatic"
     assert about.colour_map("field") == "inferno"

@@ -5,13 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import tifffile
-from napari.components import ViewerModel
 from napari.utils.notifications import notification_manager
 from scipy.io import savemat
 
@@ -27,17 +25,16 @@ from napari_shadowinv._napari.reader import get_reader, read_paths
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv._napari.stores import follow_shots
 from napari_shadowinv._napari.widgets._layers import cautions_of
-from napari_shadowinv.inversion import Inversion
 
 PLUGIN = "napari-shadowinv"
 
 
 @pytest.fixture
-def shot() -> np.ndarray:
+def shot():
     return np.random.default_rng(0).uniform(1, 9, (12, 17))
 
 
-def write_shot(path: Path, image: np.ndarray, **changes: Any) -> Path:
+def write_shot(path, image, **changes):
     with h5py.File(path, "w") as file:
         file["image"] = image
         file.attrs.update(
@@ -56,9 +53,7 @@ def write_shot(path: Path, image: np.ndarray, **changes: Any) -> Path:
     return path
 
 
-def test_pradformat_opens_with_its_pixels_and_setup(
-    viewer: ViewerModel, shot: np.ndarray, tmp_path: Path
-) -> None:
+def test_pradformat_opens_with_its_pixels_and_setup(viewer, shot, tmp_path):
     (layer,) = viewer.open(write_shot(tmp_path / "d3he.h5", shot), plugin=PLUGIN)
     setup = setup_of(layer)
     assert isinstance(setup, ProtonSetup)
@@ -70,9 +65,7 @@ def test_pradformat_opens_with_its_pixels_and_setup(
     assert metadata_of(layer)["file"]["sha256"]
 
 
-def test_pixels_stay_pixels_where_the_magnification_is_unknown(
-    viewer: ViewerModel, shot: np.ndarray, tmp_path: Path
-) -> None:
+def test_pixels_stay_pixels_where_the_magnification_is_unknown(viewer, shot, tmp_path):
     path = write_shot(tmp_path / "a.h5", shot)
     with h5py.File(path, "a") as file:
         del file.attrs["source_object_dist"]
@@ -83,9 +76,7 @@ def test_pixels_stay_pixels_where_the_magnification_is_unknown(
 
 
 @pytest.mark.parametrize("suffix", [".mat", ".txt", ".dat", ".b16"])
-def test_formats_that_napari_does_not_know_need_no_choice(
-    viewer: ViewerModel, tmp_path: Path, suffix: str
-) -> None:
+def test_formats_that_napari_does_not_know_need_no_choice(viewer, tmp_path, suffix):
     path, counts = tmp_path / f"shot{suffix}", np.arange(60).reshape(6, 10)
     if suffix == ".mat":
         savemat(path, {"image": counts.astype(np.float64)})
@@ -102,7 +93,7 @@ def test_formats_that_napari_does_not_know_need_no_choice(
 
 
 @pytest.mark.parametrize("suffix", [".h5", ".nxs"])
-def test_hdf5_without_image_is_left_to_others_at_once(tmp_path: Path, suffix: str) -> None:
+def test_hdf5_without_image_is_left_to_others_at_once(tmp_path, suffix):
     path = tmp_path / f"other{suffix}"
     with h5py.File(path, "w") as file:
         file["times"] = np.zeros(5)
@@ -111,7 +102,7 @@ def test_hdf5_without_image_is_left_to_others_at_once(tmp_path: Path, suffix: st
     assert get_reader(str(path)) is None
 
 
-def test_what_is_no_shot_is_left_to_others(tmp_path: Path) -> None:
+def test_what_is_no_shot_is_left_to_others(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.zarr").mkdir()
     for name in ("empty", "notes.zarr", "film.mov", "paper.pdf"):
@@ -120,7 +111,7 @@ def test_what_is_no_shot_is_left_to_others(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     folder = tmp_path / "run 3"
     folder.mkdir()
     for shot in (1, 2, 10):
@@ -129,7 +120,7 @@ def run(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_folder_is_a_lazy_stack_in_counting_order(viewer: ViewerModel, run: Path) -> None:
+def test_a_folder_is_a_lazy_stack_in_counting_order(viewer, run):
     (layer,) = viewer.open(run, plugin=PLUGIN)
     assert type(layer.data).__module__.startswith("dask")
     assert layer.data.shape == (3, 6, 8)
@@ -140,14 +131,12 @@ def test_a_folder_is_a_lazy_stack_in_counting_order(viewer: ViewerModel, run: Pa
     assert names == ["shot1.tif", "shot2.tif", "shot10.tif"]
 
 
-def test_only_the_first_shot_is_read(
-    viewer: ViewerModel, run: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_the_first_shot_is_read(viewer, run, monkeypatch):
     import napari_shadowinv.io
 
     read, names = napari_shadowinv.io.read_shot, []
 
-    def watched(path: Path, **keywords: Any) -> Any:
+    def watched(path, **keywords):
         names.append(path.name)
         return read(path, **keywords)
 
@@ -160,7 +149,7 @@ def test_only_the_first_shot_is_read(
     assert names == ["shot1.tif", "shot2.tif", "shot10.tif"]
 
 
-def test_lists_and_patterns_are_stacks_too(viewer: ViewerModel, run: Path) -> None:
+def test_lists_and_patterns_are_stacks_too(viewer, run):
     files = sorted(str(path) for path in run.glob("*.tif"))
     ((data, _, _),) = read_paths(files[:2])
     assert data.shape == (2, 6, 8)
@@ -170,7 +159,7 @@ def test_lists_and_patterns_are_stacks_too(viewer: ViewerModel, run: Path) -> No
     np.testing.assert_array_equal(data[:, 0, 0].compute(), [1, 10])
 
 
-def test_pages_of_a_tiff_are_a_lazy_stack(viewer: ViewerModel, tmp_path: Path) -> None:
+def test_pages_of_a_tiff_are_a_lazy_stack(viewer, tmp_path):
     planes = np.random.default_rng(0).uniform(1, 9, (3, 12, 17)).astype(np.float32)
     tifffile.imwrite(tmp_path / "film.tif", planes, photometric="minisblack")
     (layer,) = add_layers(viewer, read_paths(str(tmp_path / "film.tif")))
@@ -179,7 +168,7 @@ def test_pages_of_a_tiff_are_a_lazy_stack(viewer: ViewerModel, tmp_path: Path) -
     np.testing.assert_array_equal(layer.data, planes)
 
 
-def test_a_stray_file_is_dark_and_gives_a_warning(run: Path) -> None:
+def test_a_stray_file_is_dark_and_gives_a_warning(run):
     tifffile.imwrite(run / "shot3.tif", np.ones((5, 5), np.float32))
     complete = (run / "shot1.tif").read_bytes()
     (run / "shot4.tif").write_bytes(complete[:-40])
@@ -193,20 +182,20 @@ def test_a_stray_file_is_dark_and_gives_a_warning(run: Path) -> None:
     assert data[4].compute().all()
 
 
-def test_a_stray_first_file_does_not_end_the_show(run: Path) -> None:
+def test_a_stray_first_file_does_not_end_the_show(run):
     (run / "shot0.tif").write_bytes(b"nonsense")
     ((data, _, _),) = read_paths(str(run))
     assert data.shape == (4, 6, 8)
     assert data[1].compute().all()
 
 
-def test_no_shot_at_all_is_one_sentence(tmp_path: Path) -> None:
+def test_no_shot_at_all_is_one_sentence(tmp_path):
     (tmp_path / "a.tif").write_bytes(b"nonsense")
     with pytest.raises(FileFormatError, match=r"none of 1 files can be read as a shot: .*a.tif"):
         read_paths(str(tmp_path))
 
 
-def test_a_folder_that_has_lost_its_images_is_one_sentence(run: Path) -> None:
+def test_a_folder_that_has_lost_its_images_is_one_sentence(run):
     read = get_reader(str(run))
     assert read is not None
     for file in run.iterdir():
@@ -215,9 +204,7 @@ def test_a_folder_that_has_lost_its_images_is_one_sentence(run: Path) -> None:
         read(str(run))
 
 
-def test_a_pradformat_inversion_shows_its_field(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
-) -> None:
+def test_a_pradformat_inversion_shows_its_field(viewer, solved, proton_setup, tmp_path):
     write(tmp_path / "field.h5", solved, setup=proton_setup)
     layers = {role_of(layer): layer for layer in viewer.open(tmp_path / "field.h5", plugin=PLUGIN)}
     assert list(layers) == ["field", "arrows"]
@@ -226,9 +213,7 @@ def test_a_pradformat_inversion_shows_its_field(
     np.testing.assert_allclose(layers["field"].scale, 1.5)
 
 
-def test_a_result_of_the_command_line_opens_whole(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path
-) -> None:
+def test_a_result_of_the_command_line_opens_whole(viewer, solved, proton_setup, tmp_path):
     write(tmp_path / "shot9.shadowinv", solved, setup=proton_setup)
     layers = viewer.open(tmp_path / "shot9.shadowinv", plugin=None)
     assert all(layer.name.endswith(" – shot9") for layer in layers)
@@ -250,9 +235,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_bad_files_are_one_notification_in_a_window(
-    viewer: ViewerModel, tmp_path: Path, name: str, in_loop: Any, messages: list[str]
-) -> None:
+def test_bad_files_are_one_notification_in_a_window(viewer, tmp_path, name, in_loop, messages):
     content, words = BAD[name]
     (tmp_path / name).write_bytes(content)
     assert in_loop(lambda: viewer.open(tmp_path / name, plugin=None)) == []
@@ -263,7 +246,7 @@ def test_bad_files_are_one_notification_in_a_window(
 
 
 @pytest.fixture
-def store(solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path) -> Path:
+def store(solved, proton_setup, tmp_path):
     """Three shots, the first still empty, as a run writes them."""
     import xarray as xr
 
@@ -282,9 +265,7 @@ def store(solved: Inversion, proton_setup: ProtonSetup, tmp_path: Path) -> Path:
     return path
 
 
-def test_a_store_opens_as_lazy_layers(
-    viewer: ViewerModel, store: Path, solved: Inversion, proton_setup: ProtonSetup
-) -> None:
+def test_a_store_opens_as_lazy_layers(viewer, store, solved, proton_setup):
     layers = {role_of(layer): layer for layer in viewer.open(store, plugin=PLUGIN)}
     assert set(layers) == {"residual", "field", "caustic", "arrows"}
     missing = add_layers(viewer, missing_layers(viewer, layers["field"]))
@@ -310,7 +291,7 @@ def test_a_store_opens_as_lazy_layers(
     assert [name for name, layer in layers.items() if layer.visible] == ["field"]
 
 
-def test_the_contrast_of_a_store_suits_its_strongest_shot(store: Path, solved: Inversion) -> None:
+def test_the_contrast_of_a_store_suits_its_strongest_shot(store, solved):
     import xarray as xr
 
     with xr.open_zarr(store, consolidated=False) as run:
@@ -331,14 +312,12 @@ def test_the_contrast_of_a_store_suits_its_strongest_shot(store: Path, solved: I
     assert np.median(residual) < high < residual.max()
 
 
-def rays(solved: Inversion, factor: float = 1.0) -> Any:
+def rays(solved, factor=1.0):
     """Start and displacement of the arrows of a shot of the store."""
     return sample_arrows(factor * solved.displacement)[0]
 
 
-def test_arrows_follow_the_shot_in_view(
-    viewer: ViewerModel, store: Path, solved: Inversion
-) -> None:
+def test_arrows_follow_the_shot_in_view(viewer, store, solved):
     layers = {role_of(layer): layer for layer in viewer.open(store, plugin=PLUGIN)}
     arrows = layers["arrows"]
     assert (arrows.data[:, 0, 0] == 1).all()  # the first that is done
@@ -368,9 +347,7 @@ def test_arrows_follow_the_shot_in_view(
     assert (arrows.data[:, 0, 0] == 1).all()
 
 
-def test_arrows_of_a_store_follow_in_a_window(
-    make_napari_viewer: Any, store: Path, solved: Inversion, qtbot: Any
-) -> None:
+def test_arrows_of_a_store_follow_in_a_window(make_napari_viewer, store, solved, qtbot):
     window = make_napari_viewer()
     layers = {role_of(layer): layer for layer in window.open(store, plugin=PLUGIN)}
     qtbot.waitUntil(lambda: window.layers.selection.active is layers["field"])
@@ -378,7 +355,7 @@ def test_arrows_of_a_store_follow_in_a_window(
     np.testing.assert_allclose(layers["arrows"].data[:, :, 1:], rays(solved, 0.5))
 
 
-def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved: Inversion) -> None:
+def test_shots_that_are_marked_as_pending_are_not_looked_at(store, solved):
     import xarray as xr
 
     with xr.open_zarr(store, consolidated=False) as run:
@@ -392,7 +369,7 @@ def test_shots_that_are_marked_as_pending_are_not_looked_at(store: Path, solved:
     assert by_role["field"]["contrast_limits"][1] == pytest.approx(0.5 * factor * strongest)
 
 
-def test_a_damaged_store_is_one_sentence(store: Path) -> None:
+def test_a_damaged_store_is_one_sentence(store):
     shutil.rmtree(store / "displacement")
     (store / "zarr.json").unlink()
     with pytest.raises(FileFormatError, match=r"could not be read|not a store"):
@@ -401,7 +378,7 @@ def test_a_damaged_store_is_one_sentence(store: Path) -> None:
         read_paths(str(store.with_name("gone.shadowinv.zarr")))
 
 
-def test_a_scan_of_film_is_told_and_so_is_its_result(viewer: ViewerModel, tmp_path: Path) -> None:
+def test_a_scan_of_film_is_told_and_so_is_its_result(viewer, tmp_path):
     film = np.full((24, 32), 60_000, np.uint16)
     film[6:-6, 8:-8] = 20_000
     tifffile.imwrite(tmp_path / "film.tif", film)
@@ -418,9 +395,7 @@ def test_a_scan_of_film_is_told_and_so_is_its_result(viewer: ViewerModel, tmp_pa
     assert cautions_of(viewer.add_image(film)) == ()
 
 
-def test_pradreader_brings_its_source_and_its_mask(
-    viewer: ViewerModel, shot: np.ndarray, tmp_path: Path
-) -> None:
+def test_pradreader_brings_its_source_and_its_mask(viewer, shot, tmp_path):
     mask = np.zeros(shot.shape)
     mask[:, :3] = 1
     header = "\n".join(f"{name} {shot.shape}" for name in ("flux2D", "flux2D_ref", "mask"))
@@ -431,7 +406,7 @@ def test_pradreader_brings_its_source_and_its_mask(
     np.testing.assert_array_equal(layers[2].data, shot)
 
 
-def test_a_pipe_is_refused_and_does_not_block(tmp_path: Path) -> None:
+def test_a_pipe_is_refused_and_does_not_block(tmp_path):
     for name in ("shot.h5", "shot.tif", "shot.shadowinv"):
         os.mkfifo(tmp_path / name)
         reader = get_reader(str(tmp_path / name))
@@ -440,7 +415,7 @@ def test_a_pipe_is_refused_and_does_not_block(tmp_path: Path) -> None:
                 reader(str(tmp_path / name))
 
 
-def test_damage_within_a_result_is_one_sentence(tmp_path: Path, inversion: Inversion) -> None:
+def test_damage_within_a_result_is_one_sentence(tmp_path, inversion):
     path = write(tmp_path / "shot.shadowinv", inversion)
     with h5py.File(path, "r+") as file:
         file.attrs["report"] = '{"converged": '
@@ -450,7 +425,7 @@ def test_damage_within_a_result_is_one_sentence(tmp_path: Path, inversion: Inver
     assert "\n" not in str(error.value)
 
 
-def test_images_of_an_hdf5_file_are_layers(viewer: ViewerModel, tmp_path: Path) -> None:
+def test_images_of_an_hdf5_file_are_layers(viewer, tmp_path):
     path = tmp_path / "run.nxs"
     frames = np.arange(60.0).reshape(3, 4, 5)
     usable = np.ones((4, 5), np.uint32)
@@ -471,7 +446,7 @@ def test_images_of_an_hdf5_file_are_layers(viewer: ViewerModel, tmp_path: Path) 
     np.testing.assert_array_equal(data, frames[0] + 1)
 
 
-def test_an_array_opens_by_the_address_of_its_file(viewer: ViewerModel, tmp_path: Path) -> None:
+def test_an_array_opens_by_the_address_of_its_file(viewer, tmp_path):
     path = tmp_path / "run 1.nxs"
     frames = np.arange(60.0).reshape(3, 4, 5)
     with h5py.File(path, "w") as file:
@@ -486,7 +461,7 @@ def test_an_array_opens_by_the_address_of_its_file(viewer: ViewerModel, tmp_path
     assert (beam.name, frame.name) == ("entry/beam", "entry/data[2]")
 
 
-def test_images_of_a_matlab_file_are_layers(viewer: ViewerModel, tmp_path: Path) -> None:
+def test_images_of_a_matlab_file_are_layers(viewer, tmp_path):
     beam, shots = np.arange(20.0).reshape(4, 5), np.arange(60.0).reshape(4, 5, 3)
     savemat(tmp_path / "run.mat", {"beam": beam, "shots": shots, "time": 3.0})
     layers = {layer.name: layer.data for layer in viewer.open(tmp_path / "run.mat", plugin=PLUGIN)}
@@ -495,7 +470,7 @@ def test_images_of_a_matlab_file_are_layers(viewer: ViewerModel, tmp_path: Path)
     assert len(layers) == 2
 
 
-def test_images_that_are_not_opened_are_counted(tmp_path: Path) -> None:
+def test_images_that_are_not_opened_are_counted(tmp_path):
     path = tmp_path / "many.h5"
     with h5py.File(path, "w") as file:
         for number in range(10):

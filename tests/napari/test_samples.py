@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from napari.components import ViewerModel
 
 from napari_shadowinv import OpticalSetup, ProtonSetup, read
 from napari_shadowinv._napari import samples
@@ -18,7 +17,7 @@ SHOTS = ("toroid", "toroid_with_caustics", "four_toroids", "coaxial_line")
 
 
 @pytest.mark.parametrize("name", [*SHOTS, "two_energies", "wakefield_run"])
-def test_each_opens_with_its_setup(viewer: ViewerModel, name: str) -> None:
+def test_each_opens_with_its_setup(viewer, name):
     layers = viewer.open_sample("napari-shadowinv", name)
     assert layers
     for layer in layers:
@@ -27,7 +26,7 @@ def test_each_opens_with_its_setup(viewer: ViewerModel, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [*SHOTS, "wakefield_run"])
-def test_the_beam_is_known_and_has_the_light_of_the_shot(viewer: ViewerModel, name: str) -> None:
+def test_the_beam_is_known_and_has_the_light_of_the_shot(viewer, name):
     layers = {role_of(layer): layer for layer in viewer.open_sample("napari-shadowinv", name)}
     beam: Any = source_of(layers["shot"])
     np.testing.assert_array_equal(layers["source"].data, beam)
@@ -36,19 +35,19 @@ def test_the_beam_is_known_and_has_the_light_of_the_shot(viewer: ViewerModel, na
     assert 0.95 < share < 1.005
 
 
-def test_the_beams_of_single_toroids_are_flat_and_so_known() -> None:
+def test_the_beams_of_single_toroids_are_flat_and_so_known():
     for make in (samples.toroid, samples.toroid_with_caustics):
         assert np.ptp(make()[0][0]) == 0
 
 
-def test_caustics_are_where_the_name_promises_them() -> None:
+def test_caustics_are_where_the_name_promises_them():
     *_, (image, _, _) = samples.toroid_with_caustics()
     below = samples.toroid()[-1][0]
     assert image.max() > 8 * image.mean()
     assert below.max() < 8 * below.mean()
 
 
-def test_two_energies_are_one_object_in_one_beam_that_is_not_told(viewer: ViewerModel) -> None:
+def test_two_energies_are_one_object_in_one_beam_that_is_not_told(viewer):
     films = viewer.open_sample("napari-shadowinv", "two_energies")
     setups: Any = [setup_of(film) for film in films]
     assert [setup.energy for setup in setups] == [14.7, 3.0]
@@ -63,12 +62,12 @@ def test_two_energies_are_one_object_in_one_beam_that_is_not_told(viewer: Viewer
     np.testing.assert_allclose(shares[0], shares[1], atol=0.05)
 
 
-def test_the_same_sample_is_the_same_every_time() -> None:
+def test_the_same_sample_is_the_same_every_time():
     for make in (samples.four_toroids, samples.coaxial_line, samples.two_energies):
         np.testing.assert_array_equal(make()[-1][0], make()[-1][0])
 
 
-def test_the_run_is_lazy_and_changes_with_time() -> None:
+def test_the_run_is_lazy_and_changes_with_time():
     *_, (stack, keywords, _) = samples.wakefield_run()
     assert type(stack).__module__.startswith("dask")
     assert len(stack) == 20
@@ -82,12 +81,8 @@ def test_the_run_is_lazy_and_changes_with_time() -> None:
 
 
 def test_without_a_network_the_menu_says_so_once(
-    make_napari_viewer: Any,
-    in_loop: Any,
-    messages: list[str],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    make_napari_viewer, in_loop, messages, tmp_path, monkeypatch
+):
     from napari._app_model import get_app_model
 
     name = next(name for name in public_images.PUBLIC_FILES if name.startswith("burner/"))
@@ -103,9 +98,7 @@ def test_without_a_network_the_menu_says_so_once(
     assert not window.layers
 
 
-def test_the_burner_comes_with_its_reference(
-    viewer: ViewerModel, burner: list[Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_burner_comes_with_its_reference(viewer, burner, monkeypatch):
     monkeypatch.setattr(samples, "fetch_burner", lambda: burner[:2])
     layers = {role_of(layer): layer for layer in viewer.open_sample("napari-shadowinv", "burner")}
     reference, frame = (read(path).image for path in burner[:2])

@@ -7,19 +7,17 @@ import runpy
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from napari_shadowinv import ProtonSetup, read, write
+from napari_shadowinv import read, write
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of
-from napari_shadowinv.inversion import Inversion
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
-def test_headless_needs_no_display_and_saves_what_it_shows(tmp_path: Path) -> None:
+def test_headless_needs_no_display_and_saves_what_it_shows(tmp_path):
     environment = {name: value for name, value in os.environ.items() if name != "DISPLAY"}
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / "napari_headless.py")],
@@ -40,20 +38,14 @@ def test_headless_needs_no_display_and_saves_what_it_shows(tmp_path: Path) -> No
 
 
 @pytest.fixture
-def window(make_napari_viewer: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+def window(make_napari_viewer, monkeypatch):
     """A napari window that a script gets when it asks for one."""
     opened = make_napari_viewer()
     monkeypatch.setattr("napari.Viewer", lambda: opened)
     return opened
 
 
-def test_view_opens_a_saved_result(
-    window: Any,
-    solved: Inversion,
-    proton_setup: ProtonSetup,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_view_opens_a_saved_result(window, solved, proton_setup, tmp_path, monkeypatch):
     path = write(tmp_path / "a.shadowinv", solved, setup=proton_setup)
     monkeypatch.setattr(sys, "argv", ["napari_view.py", str(path)])
     runpy.run_path(str(EXAMPLES / "napari_view.py"))
@@ -61,7 +53,7 @@ def test_view_opens_a_saved_result(
     assert setup_of(window.layers[0]) == proton_setup
 
 
-def test_view_shows_a_sample_and_its_field(window: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_view_shows_a_sample_and_its_field(window, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["napari_view.py"])
     runpy.run_path(str(EXAMPLES / "napari_view.py"))
     field = window.layers["± |∫B×dz| (mT·m) – toroid"]
@@ -71,8 +63,8 @@ def test_view_shows_a_sample_and_its_field(window: Any, monkeypatch: pytest.Monk
 
 
 def test_add_to_running_lays_the_result_on_the_selected_shot(
-    make_napari_viewer: Any, solved: Inversion, proton_setup: ProtonSetup
-) -> None:
+    make_napari_viewer, solved, proton_setup
+):
     from napari_shadowinv._napari.shots import shot_layer
 
     running = make_napari_viewer()

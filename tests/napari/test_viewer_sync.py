@@ -1,18 +1,42 @@
-"""Synchronisation with a viewer: the colour bar, and images that are opened next to results."""
+"""Synchronisation with a viewer: events, the colour bar, images that are opened next to results."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Any
 
 import numpy as np
-from napari.components import ViewerModel
 
-from napari_shadowinv import ProtonSetup, add_to_viewer
+from napari_shadowinv import add_to_viewer
 from napari_shadowinv._napari.layer_metadata import frame_of, metadata_for, role_of
-from napari_shadowinv.inversion import Inversion
+from napari_shadowinv._napari.viewer_sync import connect, connect_layers, without_proxy
 
 
-def bars(viewer: ViewerModel) -> list[str]:
+def test_each_layer_is_followed_until_it_is_disconnected(viewer):
+    first = viewer.add_image(np.ones((4, 5)))
+    calls: list[Any] = []
+    names = "name", "paint"  # images have no event `paint`
+    disconnect = connect_layers(viewer.layers, names, lambda event: calls.append(event.source))
+    second = viewer.add_image(np.ones((4, 5)))
+    first.name, second.name = "b", "c"
+    assert calls == [first, second]
+    disconnect()
+    third = viewer.add_image(np.ones((4, 5)))
+    first.name, second.name, third.name = "d", "e", "f"
+    assert len(calls) == 2
+
+
+def test_the_list_behind_a_proxy_is_the_same_each_time(viewer):
+    from napari.utils._proxies import PublicOnlyProxy
+
+    proxies = [PublicOnlyProxy(viewer) for _ in range(2)]
+    assert all(without_proxy(proxy.layers) is viewer.layers for proxy in proxies)
+    calls: list[Any] = []
+    connect(proxies[0].layers, "inserted", calls.append)
+    layer = viewer.add_image(np.ones((4, 5)))
+    assert calls[0].value is layer
+
+
+def bars(viewer):
     """Names beside visible colour bars."""
     with_bar = [
         layer for layer in viewer.layers if hasattr(layer, "colorbar") and layer.colorbar.visible
@@ -23,9 +47,7 @@ def bars(viewer: ViewerModel) -> list[str]:
     return [layer.name for layer in with_bar]
 
 
-def test_only_the_image_that_is_seen_has_a_colour_bar(
-    viewer: ViewerModel, solved: Inversion
-) -> None:
+def test_only_the_image_that_is_seen_has_a_colour_bar(viewer, solved):
     add_to_viewer(viewer, solved, name="a")
     add_to_viewer(viewer, solved, name="b")
     layers = viewer.layers
@@ -45,9 +67,7 @@ def test_only_the_image_that_is_seen_has_a_colour_bar(
     assert bars(viewer) == ["✓ residual (% of mean) – b"]
 
 
-def test_a_colour_bar_that_was_switched_off_stays_off(
-    viewer: ViewerModel, solved: Inversion
-) -> None:
+def test_a_colour_bar_that_was_switched_off_stays_off(viewer, solved):
     add_to_viewer(viewer, solved, name="a")
     viewer.layers["✓ |d| (px) – a"].colorbar.visible = False
     viewer.layers["✓ |d| (px) – a"].visible = False
@@ -55,9 +75,7 @@ def test_a_colour_bar_that_was_switched_off_stays_off(
     assert not any(layer.colorbar.visible for layer in viewer.layers if hasattr(layer, "colorbar"))
 
 
-def test_a_long_name_is_smaller_beside_the_colour_bar(
-    viewer: ViewerModel, solved: Inversion
-) -> None:
+def test_a_long_name_is_smaller_beside_the_colour_bar(viewer, solved):
     add_to_viewer(viewer, solved, name="a")
     add_to_viewer(viewer, solved, name=80 * "b")
     short, long = (viewer.layers[f"✓ |d| (px) – {name}"] for name in ("a", 80 * "b"))
@@ -67,9 +85,8 @@ def test_a_long_name_is_smaller_beside_the_colour_bar(
 
 
 def test_an_image_of_the_same_size_lies_on_the_result(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str],
-    tmp_path: Path,
-) -> None:  # fmt: skip
+    viewer, solved, proton_setup, messages, tmp_path
+):
     layers = add_to_viewer(viewer, solved, proton_setup, name="a", translate=(3.0, 4.0))
     frame = frame_of(next(layer for layer in layers if role_of(layer) == "field"))
     for data in (np.ones((40, 52)), np.ones((5, 40, 52)), np.ones((40, 52), np.uint8)):
@@ -86,8 +103,8 @@ def test_an_image_of_the_same_size_lies_on_the_result(
 
 
 def test_an_image_of_another_size_is_told_how_to_get_a_scale(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str]
-) -> None:
+    viewer, solved, proton_setup, messages
+):
     add_to_viewer(viewer, solved, proton_setup, name="a")
     image = viewer.add_image(np.ones((30, 52)), name="other")
     assert tuple(image.scale) == (1, 1)
@@ -95,9 +112,7 @@ def test_an_image_of_another_size_is_told_how_to_get_a_scale(
     assert "Invert" in messages[-1]
 
 
-def test_what_has_a_place_keeps_it(
-    viewer: ViewerModel, solved: Inversion, proton_setup: ProtonSetup, messages: list[str]
-) -> None:
+def test_what_has_a_place_keeps_it(viewer, solved, proton_setup, messages):
     viewer.add_image(np.ones((40, 52)))
     add_to_viewer(viewer, solved, name="in pixels")
     first = viewer.add_image(np.ones((40, 52)))

@@ -15,10 +15,10 @@ from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
-from napari_shadowinv._napari.events import without_proxy
-from napari_shadowinv._napari.layer_metadata import Frame, frame_of, layer_name, main_layers
+from napari_shadowinv._napari.layer_metadata import frame_of, layer_name, main_layers
 from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.shots import shot_layer, shot_of_layer
+from napari_shadowinv._napari.viewer_sync import without_proxy
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
@@ -29,26 +29,20 @@ if TYPE_CHECKING:
     import napari.types
 
     import napari
-    from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.preprocessing import Step
     from napari_shadowinv.shot import Shot
 
 
 @dataclass(frozen=True)
 class _Selection:
-    """The image on which a command works."""
+    """The plane on which a command works, with the name, setup, source and mask of its layer."""
 
-    shot: Shot
-    name: str
-    frame: Frame
-    setup: Setup | None
-    setup_origin: str
-    role: str | None
     layer: Any
+    shot: Shot
 
     @property
-    def image(self) -> FloatArray:
-        return self.shot.image
+    def name(self) -> str:
+        return str(self.shot.name)
 
 
 Work = Callable[[_Selection, ShouldStop], results.LayerData]
@@ -76,15 +70,14 @@ def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> results.La
     """Invert the selected image against a uniform source, with the default options."""
     from napari_shadowinv._napari.jobs import InversionJob
 
-    origins = {"Source": "uniform"}
-    if selection.setup_origin:
-        origins["Setup"] = selection.setup_origin
+    origins = {"Source": "uniform", "Setup": about.setup_origin_of(selection.layer)}
+    uniform = preprocessing.UniformEstimate()
     job = InversionJob(
-        recipe=preprocessing.Recipe(source=preprocessing.UniformEstimate(), setup=selection.setup),
+        recipe=preprocessing.Recipe(source=uniform, setup=selection.shot.setup),
         name=selection.name,
-        frame=selection.frame,
-        origins=origins,
-        shot=selection.shot,
+        frame=frame_of(selection.layer),
+        origins={title: text for title, text in origins.items() if text},
+        shot=replace(selection.shot, name=None, setup=None, source=None, mask=None),
     )
     return main_layers(job.work(lambda _: None, should_stop).layer_data)
 
@@ -108,27 +101,27 @@ def refine(
 @_in_thread("Removing hot pixels from", about.may_be_source)
 def remove_hot_pixels(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
     """Replace pixels that stand out of the noise by the median of their neighbours."""
-    image, hot, dead = preprocessing.remove_hot_pixels(selection.image, should_stop=should_stop)
-    title = f"without {int((hot | dead).sum())} hot or dead pixels"
-    return [_filtered_layer(selection, image, title)]
+    before = selection.shot.image
+    image = preprocessing.HotPixelFilter().filter_image(before, should_stop=should_stop)
+    return [_derived(selection, image, f"without {(image != before).sum()} hot or dead pixels")]
 
 
 @_in_thread("Filtering", about.may_be_source)
 def high_pass(selection: _Selection, _: ShouldStop) -> results.LayerData:
     """Remove structures larger than about 0.15 of the image's shorter side; keep the mean."""
-    width = 0.15 * min(selection.image.shape)
-    image = preprocessing.HighPassFilter(width=width).filter_image(selection.image)
-    return [_filtered_layer(selection, image, f"high-pass σ={width:.3g} px")]
+    width = 0.15 * min(selection.shot.shape)
+    image = preprocessing.HighPassFilter(width=width).filter_image(selection.shot.image)
+    return [_derived(selection, image, f"high-pass σ={width:.3g} px")]
 
 
 @_in_thread("Estimating the source of")
 def estimate_source(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
     """Estimate the undisturbed beam as the image of least total variation near the selected one."""
     estimate = preprocessing.TotalVariationEstimate()
-    source = estimate.source(selection.image, should_stop=should_stop)
+    source = estimate.source(selection.shot.image, should_stop=should_stop)
     made_from = {"image": selection.name, "estimate": "total variation"}
-    selection = replace(selection, role=about.SOURCE)
-    return [_filtered_layer(selection, source, "source by total variation", made_from=made_from)]
+    title = "source by total variation"
+    return [_derived(selection, source, title, role=about.SOURCE, made_from=made_from)]
 
 
 @viewer_sync.notify_errors(otherwise=list)
@@ -160,13 +153,13 @@ def crop(
         show_info(f"Draw a rectangle on '{selection.name}', then choose this again")
         return []
     height, width = step.shape_after(selection.shot.shape)
-    return [_moved_layer(selection, step, f"cropped to {width} × {height} px")]
+    return [_moved(selection, step, f"cropped to {width} × {height} px")]
 
 
 @_in_thread("Binning", about.may_be_source)
 def bin_pixels(selection: _Selection, _: ShouldStop) -> results.LayerData:
     """Sum blocks of 2 × 2 pixels of the selected image."""
-    return [_moved_layer(selection, preprocessing.Bin(factor=2), "binned 2 × 2")]
+    return [_moved(selection, preprocessing.Bin(factor=2), "binned 2 × 2")]
 
 
 @viewer_sync.notify_errors(otherwise=list)
@@ -178,14 +171,14 @@ def align_source(
     source, name = _source_for(selection, without_proxy(viewer))
 
     def align(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
-        usable = about.usable_of(selection.layer)
-        measured = preprocessing.measure_shift(selection.image, source, usable)
+        measured = preprocessing.measure_shift(selection.shot.image, source, selection.shot.mask)
         if not measured.is_significant.any():
             raise InputError(f"'{name}' need not be moved, or cannot: its shift is {measured.text}")
         aligned = preprocessing.move(source, measured.significant)
-        made_from = {"image": selection.name, "source": f"{name}, moved by {measured.text}"}
-        moved = replace(selection, name=name, role=about.SOURCE)
-        return [_filtered_layer(moved, aligned, f"moved by {measured.text}", made_from=made_from)]
+        title = f"moved by {measured.text}"
+        made_from = {"image": selection.name, "source": f"{name}, {title}"}
+        beam = replace(selection, shot=replace(selection.shot, name=name))
+        return [_derived(beam, aligned, title, role=about.SOURCE, made_from=made_from)]
 
     return _start(selection, align, "Aligning the source with", viewer)
 
@@ -215,7 +208,7 @@ def _source_for(selection: _Selection, viewer: Any) -> tuple[FloatArray, str]:
     fitting = [
         each
         for each in layers
-        if _is_image(each) and each.ndim == 2 and tuple(each.data.shape) == selection.image.shape
+        if _is_image(each) and each.ndim == 2 and tuple(each.data.shape) == selection.shot.shape
     ]
     selected = [each for each in fitting if each in viewer.layers.selection]
     sources = [each for each in fitting if about.role_of(each) == about.SOURCE]
@@ -223,23 +216,22 @@ def _source_for(selection: _Selection, viewer: Any) -> tuple[FloatArray, str]:
         if len(candidates) == 1:
             beam = source_on(candidates[0], candidates[0].data, layer)
             return np.asarray(beam, dtype=np.float64), candidates[0].name
-    supplied = about.source_of(layer)
-    if supplied is None:
+    if selection.shot.source is None:
         raise InputError(
             f"no source for '{selection.name}' is selected: select its source, too (Ctrl+click), "
             "an image of the same size"
         )
-    return supplied, f"{selection.name} source"
+    return selection.shot.source, f"{selection.name} source"
 
 
 def _has_outline(layer: Any) -> bool:
     """Whether a layer has shapes other than lines."""
-    is_of_shapes = layer.__class__.__name__ == "Shapes"
+    is_of_shapes = about.kind_of(layer) == "shapes"
     return is_of_shapes and not {"line", "path"}.issuperset(layer.shape_type)
 
 
 def _is_image(layer: Any) -> bool:
-    return layer.__class__.__name__ == "Image" and not layer.rgb
+    return about.kind_of(layer) == "image" and not layer.rgb
 
 
 def _select_image(
@@ -257,15 +249,19 @@ def _select_image(
     if not usable(layer):
         kind = "a source" if about.role_of(layer) == about.SOURCE else "part of a result"
         raise InputError(f"layer '{layer.name}' is {kind}: select the shot")
-    data, name = layer.data[0] if layer.multiscale else layer.data, layer.name
+    data, name = about.data_of(layer), layer.name
     if data.ndim > 2:
         steps = [0] * data.ndim if viewer is None else viewer.dims.current_step
         index = tuple(int(step) for step in steps[-data.ndim : -2])
         data, name = data[index], f"{name} {','.join(map(str, index))}"
-    shot, frame = shot_of_layer(layer, np.asarray(data)), frame_of(layer)
-    setup, origin = about.setup_of(layer), about.setup_origin_of(layer)
-    role = about.role_of(layer)
-    return _Selection(shot, name, frame, setup, origin, role, without_proxy(layer))
+    shot = replace(
+        shot_of_layer(layer, np.asarray(data)),
+        name=name,
+        setup=about.setup_of(layer),
+        source=about.source_of(layer),
+        mask=about.usable_of(layer),
+    )
+    return _Selection(without_proxy(layer), shot)
 
 
 def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> list[Any]:
@@ -282,28 +278,27 @@ def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> lis
     return []
 
 
-def _moved_layer(selection: _Selection, step: Step, title: str) -> results.FullLayerData:
+def _moved(selection: _Selection, step: Step, title: str) -> results.FullLayerData:
     """Return an image after a step that moves pixels, with its source and usable pixels."""
-    source, usable = about.source_of(selection.layer), about.usable_of(selection.layer)
-    shot = replace(selection.shot, setup=selection.setup, source=source, mask=usable)
-    moved = step.apply(shot)
-    frame = selection.frame.beneath(step.matrix(shot.shape))
-    selection = replace(selection, shot=moved, frame=frame, setup=moved.setup)
-    return _filtered_layer(selection, moved.image, title, source=moved.source, usable=moved.mask)
+    moved, before = step.apply(selection.shot), selection.shot.shape
+    frame = frame_of(selection.layer).beneath(step.matrix(before))
+    kept = {"frame": frame, "setup": moved.setup, "source": moved.source, "usable": moved.mask}
+    return _derived(selection, moved.image, title, **kept)
 
 
-def _filtered_layer(
-    selection: _Selection, image: FloatArray, title: str, **metadata: Any
+def _derived(
+    selection: _Selection, image: FloatArray, title: str, role: str | None = None, **changes: Any
 ) -> results.FullLayerData:
+    """Return an image that was made from the selected one, of its setup, place and role."""
+    layer = selection.layer
+    place = {"frame": frame_of(layer), "setup": selection.shot.setup, **changes}
     return shot_layer(
         image,
         f"{selection.name} {title}",
-        selection.setup,
-        intensity_limits(selection.image),  # the same limits show the effect of the filter
-        selection.role,
-        frame=selection.frame,
-        setup_origin=selection.setup_origin or None,
-        **metadata,
+        limits=intensity_limits(selection.shot.image),  # they show the effect of the filter
+        role=role or about.role_of(layer),
+        setup_origin=about.setup_origin_of(layer) or None,
+        **place,
     )
 
 

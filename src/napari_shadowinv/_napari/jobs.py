@@ -13,11 +13,10 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.costs import FitProgress, fit_cost, inversion_cost
 from napari_shadowinv._napari.layer_metadata import KEY, Frame, Result, frame_of, result_of, role_of
 from napari_shadowinv._napari.layers import LayerData, fit_layers, result_layers
 from napari_shadowinv._napari.shots import shot_in_memory, shot_layer
-from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.progress import OnProgress, Progress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
@@ -25,7 +24,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import (
     FitChoices,
 )
-from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.pipeline.costs import fit_cost, inversion_cost
 from napari_shadowinv.pipeline.fit_run import refinement_choices, run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import Cache, run
 from napari_shadowinv.preprocessing import Estimate, Recipe, estimate_source
@@ -117,7 +116,7 @@ class InversionJob(ImageJob):
     def layers(self, content: Inversion) -> LayerData:
         """Describe the layers of the inversion; of a preview only the field and its caustics."""
         name = f"{self.name} preview" if self.preview else self.name
-        result = Result(content, content.setup, self.origins)
+        result = Result(content, self.origins)
         layer_data = result_layers(result, self.frame, name)
         mask = self.shot.source_mask
         for _, keywords, _ in layer_data:
@@ -188,20 +187,24 @@ class FitJob(ImageJob):
         return self.recipe.fit
 
     @cached_property
-    def progress(self) -> FitProgress:
-        """Progress of the fit, and its objectives so far."""
-        return FitProgress()
+    def history(self) -> list[tuple[str, float]]:
+        """Steps of the fit so far, with their objectives."""
+        return []
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
-        fit = self.compute(lambda state: on_progress(self.progress.update(state)), should_stop)
+        def note(progress: Progress) -> None:
+            if progress.objective is not None:
+                self.history.append((progress.message, progress.objective))
+            on_progress(progress)
+
+        fit = self.compute(note, should_stop)
         shape, instrument = self.recipe.shape_after(self.shots[0].shape), self.recipe.instrument
         cost = fit_cost(shape, len(self.shots), self.choices, instrument)
         FitJob.pace = sum(fit.report.seconds.values()) / cost.seconds
         return fit
 
     def layers(self, content: Fit) -> LayerData:
-        result = Result(content, content.setup, self.origins)
-        return fit_layers(result, self.frame, self.name)
+        return fit_layers(Result(content, self.origins), self.frame, self.name)
 
     def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         """Load the images, apply the recipe's steps, and fit."""
@@ -218,12 +221,11 @@ class Refinement(FitJob):
     """A fit to the image of an inversion, starting from the inversion."""
 
     inversion: Inversion
-    setup: Setup | None
 
     def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         return run_refinement(
             self.inversion,
-            self.setup,
+            self.inversion.setup,
             self.choices,
             on_progress=on_progress,
             should_stop=should_stop,
@@ -242,17 +244,16 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
             f"layer '{layer.name}' shows {kind}: select a layer of an inversion's result, such as "
             "the field"
         )
-    inversion, setup = result.content, result.setup
+    inversion = result.content
     start = f"the inversion of '{name}'"
     return Refinement(
-        recipe=Recipe(fit=refinement_choices(inversion, setup, psf)),
+        recipe=Recipe(fit=refinement_choices(inversion, inversion.setup, psf)),
         shots=(Shot(inversion.image, name=name),),
         name=f"{name} refined",
         frame=frame_of(layer),
         origins={"Start": start, "Point spread": f"σ {psf:g} px" if psf else "none"},
         image=image,
         inversion=inversion,
-        setup=setup,
     )
 
 

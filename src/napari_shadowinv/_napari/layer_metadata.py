@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 
-from napari_shadowinv._napari.preferences import AUTOMATIC, preference
+from napari_shadowinv._napari.preferences import AUTOMATIC, colour_map, preference
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Level
 
@@ -162,10 +162,12 @@ class Kind:
         **facts: Any,
     ) -> _LayerTuple:
         """Describe a layer of a result, of which `name` is the shot's; `words` are in its title."""
+        has_colours = self.type == "image" and self.colormap
         keywords = {
             "name": layer_name(self.title.format(**words), name, level),
             "metadata": metadata_for(self.role, words.get("unit", self.unit), setup, **facts),
             "visible": self.visible,
+            **({"colormap": colour_map(self.colormap)} if has_colours else {}),
             **frame.keywords(stacked=bool(stack_axis), stack_axis=stack_axis),
             **look,
         }
@@ -199,8 +201,6 @@ KINDS = (
     Kind("sites", "sites", "sites{share}", colormap="field", type="points", shown_of="shot"),
 )
 _MAIN_ROLES = {kind.role for kind in KINDS if kind.main or kind.visible}
-MASKED_ROLES = {"reprojection", "residual", "potential", "field y", "field x", "field"}
-MASKED_ROLES |= {"uncertainty", "significance"}
 
 
 def main_layers(layer_data: Sequence[_LayerTuple], also: Collection[str] = ()) -> list[_LayerTuple]:
@@ -246,7 +246,6 @@ class Result(Generic[Content]):
     """The complete result that its layers show, with everything needed to save it."""
 
     content: Content
-    setup: Setup | None = None
     origins: Mapping[str, str] = field(default_factory=dict)  # rows of its report: title, text
 
 
@@ -254,8 +253,19 @@ def metadata_for(
     role: str | None, unit: str, setup: Setup | None = None, **more: Any
 ) -> dict[str, Any]:
     """Return the metadata of a layer; an unknown role is None, an unknown unit empty."""
-    entries = {} if setup is None else {"setup": setup.model_dump()}
+    entries = {} if setup is None else {"setup": setup}
     return {KEY: {"role": role, "unit": unit, **entries, **more}}
+
+
+def kind_of(layer: Any) -> str:
+    """Return a layer's type, such as ``"image"`` or ``"labels"``."""
+    # Not by type(): a widget may get a proxy, whose class is its content's only here.
+    return str(layer.__class__.__name__).lower()
+
+
+def data_of(layer: Any) -> Any:
+    """Return a layer's data, of a pyramid of images the largest."""
+    return layer.data[0] if getattr(layer, "multiscale", False) else layer.data
 
 
 def metadata_of(layer: Any) -> dict[str, Any]:
@@ -282,10 +292,8 @@ def unit_of(layer: Any) -> str:
 
 def setup_of(layer: Any) -> Setup | None:
     """Return the setup of a layer, or None."""
-    from napari_shadowinv.physics.setup import setup_from_dict
-
-    entries = metadata_of(layer).get("setup")
-    return None if entries is None else setup_from_dict(entries, "the layer's setup")
+    setup: Setup | None = metadata_of(layer).get("setup")
+    return setup
 
 
 def setup_origin_of(layer: Any) -> str:
@@ -300,7 +308,7 @@ def store_setup(layer: Any, setup: Setup | None, origin: str) -> None:
     entries.pop("setup", None)
     entries.pop("setup_origin", None)
     if setup is not None:
-        entries |= {"setup": setup.model_dump(), "setup_origin": origin}
+        entries |= {"setup": setup, "setup_origin": origin}
     layer.metadata[KEY] = entries
 
 

@@ -18,8 +18,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, role_of
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
-from napari_shadowinv.facts import Level
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
@@ -39,7 +38,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.result import RetrievedField
     from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.results import AnyResult
 
 FullLayerData = tuple[Any, dict[str, Any], str]
 LayerData = list[FullLayerData]
@@ -51,6 +49,13 @@ _STRUCTURE_COLOUR = "#ff3d7f"
 _ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 
 _FIELD_VARIABLES = ("displacement", "potential")
+_MASKED_VARIABLES = (
+    *_FIELD_VARIABLES,
+    "reprojection",
+    "residual",
+    "displacement_uncertainty",
+    "significance",
+)
 _MAX_ARROWS_PER_SIDE = 20
 _MIN_ARROW_LENGTH = 0.05  # relative to the longest
 _MAX_SHOWN_SITES = 200_000
@@ -72,9 +77,9 @@ def inversion_layers(
     **placement: Any,
 ) -> LayerData:
     """Describe the layers of a result, with the keywords of `add_to_viewer`."""
-    setup = inversion.setup if setup is None else setup
-    frame = frame_for(inversion.potential.shape, setup, **placement)
-    return result_layers(Result(inversion, setup, dict(origins or {})), frame, name)
+    inversion = inversion if setup is None else inversion.in_units(setup)
+    frame = frame_for(inversion.potential.shape, inversion.setup, **placement)
+    return result_layers(Result(inversion, dict(origins or {})), frame, name)
 
 
 def add_to_viewer(
@@ -153,7 +158,7 @@ def field_layers(result: Result[RetrievedField], frame: Frame, name: str = "") -
     field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]].assign(
         significance_variables(content.displacement, content.displacement_std, content.structures)
     )
-    return dataset_layers(View(field, result.setup), frame, name, shared_metadata(result, name))
+    return dataset_layers(View(field, content.setup), frame, name, {"result": result, "name": name})
 
 
 def significance_variables(
@@ -169,11 +174,6 @@ def significance_variables(
     }
 
 
-def shared_metadata(result: Result[AnyResult], name: str) -> dict[str, Any]:
-    """Return the metadata that all layers of a result share."""
-    return {"result": result, "name": name}
-
-
 def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> LayerData:
     """Describe the layers of an inversion."""
     import xarray as xr
@@ -183,9 +183,8 @@ def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> La
     dataset = xr.Dataset(
         {name: (dims, content.variable(name)) for name, (dims, _, _) in VARIABLES.items()}
     ).assign(significance_variables(content.displacement, std, content.structures))
-    view = View(dataset, result.setup)
-    facts, level = shared_metadata(result, name), content.headline.level
-    layer_data = dataset_layers(view, frame, name, facts, level)
+    facts = {"result": result, "name": name, "level": content.headline.level}
+    layer_data = dataset_layers(View(dataset, content.setup), frame, name, facts)
     for _, keywords, _ in layer_data:
         if role_of(keywords) == "image":
             # With beam and mask, the image can be inverted again.
@@ -202,9 +201,9 @@ def fit_layers(
     The fields of alternative solutions are hidden. `with_images` as for a file.
     """
     fit = result.content
-    verdict = {"verdict": fit.verdict.value, "explanation": fit.explanation}
-    facts = shared_metadata(result, name) | verdict
-    layers = _image_layers(fit, frame, name, facts, with_images=with_images)
+    facts = {"result": result, "name": name, "level": fit.headline.level}
+    layers = _fitted_images(fit, frame, name, facts) if with_images else []
+    layers += _predicted_images(fit, frame, name, facts)
     for number in reversed(range(len(fit.basins))):
         layers += _solution_layers(fit, number, frame, name, facts)
     return layers
@@ -224,74 +223,59 @@ def _solution_layers(
             title = f"{name} from the inversion" if start == "given" else f"{name} {start}"
             displacement = _full_size(fit.basins[number].displacement[m], displacement.shape[1:])
         variables: dict[str, Any] = {"displacement": (("component", "y", "x"), displacement)}
-        part, level = {"part": f"{field.name} {number}"}, None
+        more = {"part": f"{field.name} {number}", "level": None}
         if not number:
             variables["potential"] = ("y", "x"), field.potential
             if fit.mask.shape[1:] == field.potential.shape:
                 variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
             std, structures = per_pixel_of(field.errors), fit.structures(field)
             variables |= significance_variables(displacement, std, structures)
-            part, level = {"part": field.name} if m else {}, fit.headline.level
+            more = {"part": field.name} if m else {}
         title = title if len(fit.fields) == 1 else f"{title} {field.name}"
         deflector = deflector_titles()[field.name]
         view = View(xr.Dataset(variables), fit.setup, deflector=deflector)
-        more = facts | part | {"displacement": displacement}
-        for layer in dataset_layers(view, frame, title, more, level):
+        more = facts | more | {"displacement": displacement}
+        for layer in dataset_layers(view, frame, title, more):
             layer[1]["visible"] &= m == number == 0
             if not number or role_of(layer[1]) in _ALTERNATIVE_ROLES:
                 layers.append(layer)
     return layers
 
 
-def _image_layers(
-    fit: Fit, frame: Frame, name: str, facts: dict[str, Any], *, with_images: bool
-) -> LayerData:
+def _predicted_images(fit: Fit, frame: Frame, name: str, facts: dict[str, Any]) -> LayerData:
     """Describe hidden layers of the re-projections, the residuals and a non-uniform beam."""
     grey = intensity_limits(fit.images[0])
     means = [image[use].mean() for image, use in zip(fit.images, fit.mask, strict=True)]
     percent = np.where(fit.mask, 100 * fit.residual / np.array(means)[:, None, None], np.nan)
-    content = {"reprojection": (fit.reprojection, grey), "residual": (percent, None)}
+    contents = {"reprojection": (fit.reprojection, grey)}
+    contents["residual"] = percent, symmetric_limits(percent[0])
     if np.ptp(fit.source[0]):
         # One plane unless the beams differ in more than their brightness.
         beams = fit.source / fit.source.mean(axis=(1, 2), keepdims=True)
         is_common = np.abs(beams - beams[0]).max() < _MAX_BEAM_DIFFERENCE
-        content = {"source": (fit.source[:1] if is_common else fit.source, grey), **content}
-    layers: LayerData = _fitted_images(fit, frame, name, facts, grey) if with_images else []
-    for role, (planes, limits) in content.items():
-        kind = _KINDS[role]
-        data = planes[0] if len(planes) == 1 else planes
-        more = facts | {"main": role != "reprojection"}
-        look = {
-            "visible": False,
-            "colormap": colour_map(kind.colormap),
-            "contrast_limits": limits or symmetric_limits(planes[0]),
-        }
-        more |= {"level": fit.headline.level, "stack_axis": "image" if data.ndim == 3 else ""}
-        layers.append(kind.layer(data, name, frame, fit.setup, look, **more))
+        contents = {"source": (fit.source[:1] if is_common else fit.source, grey), **contents}
+    layers: LayerData = []
+    for role, (planes, limits) in contents.items():
+        is_stack, look = len(planes) > 1, {"contrast_limits": limits}
+        more = facts | {"main": role != "reprojection", "stack_axis": "image" if is_stack else ""}
+        data = planes if is_stack else planes[0]
+        layers.append(_KINDS[role].layer(data, name, frame, fit.setup, look, **more))
     return layers
 
 
-def _fitted_images(
-    fit: Fit, frame: Frame, name: str, facts: dict[str, Any], limits: Limits
-) -> LayerData:
+def _fitted_images(fit: Fit, frame: Frame, name: str, facts: dict[str, Any]) -> LayerData:
     """Describe a hidden layer of each image, which can be fitted again, a single one inverted."""
-    kind, is_single = _KINDS["image"], len(fit.images) == 1
-    look = {
-        "visible": False,
-        "colormap": colour_map(kind.colormap),
-        "contrast_limits": limits,
-    }
+    look, is_single = {"contrast_limits": intensity_limits(fit.images[0])}, len(fit.images) == 1
     layers: LayerData = []
     for k, (image, used) in enumerate(zip(fit.images, fit.mask, strict=True)):
         setup = fit.setups[k] if fit.setups else None
-        more = facts | {"main": True, "level": fit.headline.level}
-        more["usable"] = None if used.all() else used
+        more = facts | {"main": True, "usable": None if used.all() else used}
         if is_single:
             more["source"] = fit.source[k]
         else:
             more |= {"part": str(k + 1), "strength": float(fit.strengths[k, 0])}
         title = name if is_single else f"{name} {k + 1}"
-        layers.append(kind.layer(image, title, frame, setup, look, **more))
+        layers.append(_KINDS["image"].layer(image, title, frame, setup, look, **more))
     return layers
 
 
@@ -302,32 +286,33 @@ def _full_size(displacement: FloatArray, shape: tuple[int, ...]) -> FloatArray:
     return np.stack(planes)
 
 
-def dataset_layers(
-    view: View, frame: Frame, name: str, facts: Mapping[str, Any], level: Level | None = None
-) -> LayerData:
-    """Describe the layers of a result, with the mark of its level, or of a stack."""
+def dataset_layers(view: View, frame: Frame, name: str, facts: Mapping[str, Any]) -> LayerData:
+    """Describe the layers of a result, or of a stack; `facts` as for `Kind.layer`."""
     layers = []
     for kind in about.KINDS:
         if not view.has(kind):
             continue
         data, words, look = _CONTENTS[kind.type](view, kind)
-        if kind.role in about.MASKED_ROLES and view.masked is not None:
-            # On lazy arrays, numpy's functions are dask's.
-            data = np.where(view.masked, np.nan, data)
         axis = "" if view.shot is None else "shot"
-        choices: Any = {"words": words, "stack_axis": axis, "level": level, **facts}
+        choices: Any = {"words": words, "stack_axis": axis, **facts}
         layers.append(kind.layer(data, name, frame, view.setup, look, **choices))
     return layers
 
 
 @dataclass
 class View:
-    """A result, or a stack with the units and contrast of one shot."""
+    """A result, or a stack with the units and contrast of one shot; masked pixels are NaN."""
 
     dataset: xarray.Dataset
     setup: Setup | None
     shot: int | None = None
     deflector: str | None = None
+
+    def __post_init__(self) -> None:
+        mask = self.dataset.get("mask")
+        if mask is not None and ("shot" in mask.dims or not mask.all()):
+            hidden = [name for name in _MASKED_VARIABLES if name in self.dataset]
+            self.dataset = self.dataset.assign({n: self.dataset[n].where(mask) for n in hidden})
 
     def has(self, kind: Kind) -> bool:
         excluded = "stack" if self.shot is None else "shot"
@@ -349,28 +334,9 @@ class View:
         return np.asarray(plane, dtype=np.float64)
 
     @cached_property
-    def masked(self) -> Any | None:
-        """Pixels without data in the shot, or lazily in all shots; None if there are none."""
-        mask = self.dataset.get("mask")
-        if mask is None or ("shot" not in mask.dims and mask.all()):
-            return None
-        return ~mask.data.astype(bool)
-
-    @cached_property
-    def used(self) -> BoolArray:
-        """Pixels with data in the shot."""
-        if self.masked is None:
-            return np.ones(self.dataset["displacement"].shape[-2:], dtype=np.bool_)
-        return ~np.asarray(self.masked[self.shot] if self.masked.ndim == 3 else self.masked)
-
-    @cached_property
     def field(self) -> ShownField:
         (field,) = shown_fields([self.plane("displacement")], self.setup, self.deflector)
         return field
-
-    @cached_property
-    def magnitude(self) -> FloatArray:
-        return self.field.magnitude
 
     @cached_property
     def vectors(self) -> Any:
@@ -416,16 +382,16 @@ def _image(view: View, kind: Kind) -> Content:
     words: dict[str, str] = {}
     data = view.dataset[kind.variable].data
     if kind.role == "direction":
-        colours = direction_colours(np.where(view.used, view.field.vectors, 0.0))
+        colours = direction_colours(np.nan_to_num(view.field.vectors))
         return colours, {"symbol": view.field.symbol}, {"rgb": True}
     if kind.role == "uncertainty":
         # A field is proportional to its displacement.
-        strength_per_pixel = _ratio(view.magnitude, np.hypot(*view.plane("displacement")))
+        strength_per_pixel = _ratio(view.field.magnitude, np.hypot(*view.plane("displacement")))
         data = strength_per_pixel * np.hypot(*view.plane(kind.variable))
         words = {"unit": view.field.unit, "symbol": view.field.symbol}
-        limits = 0.0, float(np.percentile(data[view.used], _LIMITS_PERCENTILE))
+        limits = 0.0, float(np.nanpercentile(data, _LIMITS_PERCENTILE))
     elif kind.role == "significance":
-        finite = data[view.used & np.isfinite(data)]
+        finite = data[np.isfinite(data)]
         highest = np.percentile(finite, _LIMITS_PERCENTILE) if finite.size else 0.0
         limits = 0.0, max(_MIN_SIGNIFICANCE_LIMIT, float(highest))
     elif kind.variable == "displacement":
@@ -438,8 +404,7 @@ def _image(view: View, kind: Kind) -> Content:
         else:
             ratio = view.relative_to_shot(lambda setup: float(setup.potential(np.ones(1))[0]))
             data = data * (ratio * _ratio(values, plane))
-        used = values[view.used]
-        limits, words = (float(used.min()), float(used.max())), {"unit": unit}
+        limits, words = (float(np.nanmin(values)), float(np.nanmax(values))), {"unit": unit}
     elif kind.role == "residual":
         if kind.unit == "%":
             used = view.plane("image")[view.dataset["mask"].values]
@@ -448,8 +413,7 @@ def _image(view: View, kind: Kind) -> Content:
         limits = symmetric_limits(plane)
     else:
         limits = view.intensity_limits
-    look = {"colormap": colour_map(kind.colormap), "contrast_limits": _nonempty(limits)}
-    return data, words, look
+    return data, words, {"contrast_limits": _nonempty(limits)}
 
 
 def direction_colours(vectors: FloatArray) -> FloatArray:
@@ -469,13 +433,13 @@ def direction_colours(vectors: FloatArray) -> FloatArray:
 def _field(view: View, role: str) -> tuple[Any, Limits, dict[str, str]]:
     """Return strength or a component of the field, its limits, unit and symbol."""
     field = view.field
-    peak = float(view.magnitude[view.used].max())
+    peak = field.largest
     if role == "field":
-        data = view.magnitude if view.shot is None else np.hypot(*view.vectors)
+        data = field.magnitude if view.shot is None else np.hypot(*view.vectors)
         return data, (0.0, peak), {"unit": field.unit, "symbol": field.symbol}
     axis = "yx".index(role[-1])
     # In another shot of a stack the field may lie along the other axis.
-    limit = peak if view.shot is not None else float(np.abs(field.vectors[:, view.used]).max())
+    limit = peak if view.shot is not None else float(np.nanmax(np.abs(field.vectors)))
     words = {"unit": field.unit, "symbol": field.components[axis]}
     return view.vectors[axis], (-limit, limit), words
 
@@ -508,7 +472,7 @@ def _arrows(view: View, kind: Kind) -> Content:
     """Return arrows on a grid, few enough to be distinguishable."""
     is_field = kind.role == "field arrows"
     vectors = view.field.vectors if is_field else view.plane("displacement")
-    data, spacing = sample_arrows(np.where(view.used, vectors, 0.0))
+    data, spacing = sample_arrows(np.nan_to_num(vectors))
     lengths = np.hypot(*data[:, 1].T)
     # Most arrows stay within their cell of the grid; the longest cross two cells at most.
     typical_length = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
@@ -572,7 +536,7 @@ _CONTENTS: dict[str, Callable[[View, Kind], Content]] = {
 
 def _ratio(values: FloatArray, plane: FloatArray) -> float:
     """Return the factor between two proportional planes."""
-    largest = np.unravel_index(np.argmax(np.abs(plane)), plane.shape)
+    largest = np.unravel_index(np.nanargmax(np.abs(plane)), plane.shape)
     return float(values[largest] / plane[largest]) if plane[largest] else 1.0
 
 

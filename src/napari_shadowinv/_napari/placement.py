@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import affine_transform
 
-from napari_shadowinv._napari.layer_metadata import Frame, frame_of
+from napari_shadowinv._napari.layer_metadata import Frame, data_of, frame_of
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 
@@ -93,8 +93,7 @@ def _size(layer: Any) -> str:
 
 
 def _shape(layer: Any) -> tuple[int, int]:
-    data = layer.data[0] if getattr(layer, "multiscale", False) else layer.data
-    height, width = data.shape[-2:]
+    height, width = data_of(layer).shape[-2:]
     return height, width
 
 

@@ -26,7 +26,6 @@ from napari_shadowinv._napari.layers import (
 from napari_shadowinv._napari.packs import pack_layers
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import PRADFORMAT, RESULT, SITES, Format
 from napari_shadowinv.results import result_from_dataset
@@ -65,12 +64,13 @@ def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
     state = json.loads(dataset.attrs.get(_STATE, "{}"))
     looks: dict[str, dict[str, Any]] = state.get("looks", {})
     content = result_from_dataset(dataset)
-    setup = content.setup
-    result = Result(content, setup, dict(state.get("origins", {})))
+    result = Result(content, dict(state.get("origins", {})))
     placement = next(iter(looks.values()), {})
     shape = dataset.sizes["y"], dataset.sizes["x"]
     places = {key: placement.get(key) for key in _PLACEMENT}
-    frame = frame_for(shape, setup, **places, pixel_size=dataset.attrs.get("scan_pixel_size"))
+    frame = frame_for(
+        shape, content.setup, **places, pixel_size=dataset.attrs.get("scan_pixel_size")
+    )
     if all(name in placement for name in _TRANSFORM):  # not in those of a script
         frame = replace(
             frame,
@@ -128,7 +128,7 @@ def _shown_inputs(viewer: Any, result: Result[AnyResult] | None) -> set[str]:
     return {
         inputs[about.role_of(layer)]
         for layer in viewer.layers
-        if type(layer).__name__ == "Image"
+        if about.kind_of(layer) == "image"
         and about.role_of(layer) in inputs
         and tuple(layer.data.shape) == shape
     }
@@ -144,8 +144,6 @@ def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]
             state["name"] = name
         if about.role_of(keywords) == "caustic":  # of an inversion
             content = replace(content, caustic=np.asarray(data) > 0)
-    if isinstance(content, Inversion):
-        content = content.in_units(result.setup)
     saved: xarray.Dataset = content.to_dataset()
     return saved.assign_attrs({_STATE: json.dumps(state, default=_plain)})
 

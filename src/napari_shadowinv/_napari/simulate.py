@@ -1,6 +1,6 @@
 """The window that simulates an object before its shot: `Simulate`.
 
-- the object: a phantom, a 3-D field in a file (`GridFile`), or the field of a layer (`InputField`)
+- the object: a phantom, a 3-D field in a file (`GridFile`), or the field of a layer
 - its image: `ForwardJob`; a plan of shots of it: `PlanJob`
 """
 
@@ -30,19 +30,13 @@ from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of
 from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors, push_button
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel, validate
-from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Level, percent
 from napari_shadowinv.io.field_grids import read_field_grid
-from napari_shadowinv.options import Instrument, InversionOptions
+from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.field_grid import FieldGrid
-from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
-from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
-from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.physics.trace_options import GridView
-from napari_shadowinv.physics.tracing import trace
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.experiment import plan_experiment
 from napari_shadowinv.pipeline.experiment_object import (
@@ -55,6 +49,7 @@ from napari_shadowinv.pipeline.experiment_object import (
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan
 from napari_shadowinv.pipeline.inversion_run import plane_of
+from napari_shadowinv.pipeline.prediction import Prediction, predict
 from napari_shadowinv.plotting import draw_errors
 
 _IMAGE, _PLAN = "image", "plan"  # tasks
@@ -86,31 +81,12 @@ class GridFile(GridView, _File):
         return self.file.stem
 
 
-@dataclass(frozen=True, eq=False)
-class InputField:
-    """The field of a result."""
-
-    displacement: FloatArray  # (2, H, W), px
-    setup: Setup | None = None
-    title: str = ""
-
-
-SimulatedObject = PhantomRecipe | GridFile | InputField
+SimulatedObject = PhantomRecipe | GridFile | PlannedObject
 
 
 def is_field(layer: Any) -> bool:
     """Whether a layer shows the field or the potential of one result."""
     return about.role_of(layer) in _FIELDS and about.displacement_of(layer) is not None
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """The image that an object casts, with its displacement and source."""
-
-    image: FloatArray  # in the unit of the source
-    displacement: FloatArray  # px
-    source: FloatArray | None  # the beam past opaque parts of the object; None if uniform
-    warning: str = ""  # about caustics, lost flux and assumptions
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,38 +106,15 @@ class ForwardJob(Job):
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Prediction:
         Reporter(on_progress, should_stop)("field", 0, None)
-        callbacks: Any = {"on_progress": on_progress, "should_stop": should_stop}
-        source = None if self.source is None else plane_of(self.source, "the source")
-        shadow, warnings = None, []
-        if isinstance(self.object, GridFile):
-            shape: Any = self.shape if source is None else source.shape
-            particles = check_particles(self.setup)
-            traced = trace(self.object.field(), particles, shape, profile=source, **callbacks)
-            image, displacement = traced.image, np.nan_to_num(traced.displacement)
-            flux = traced.source.sum()
-            doubts = [fact.text for fact in traced.facts if fact.level is not Level.SOUND]
-            warnings += [f"{text[0].upper()}{text[1:]}." for text in doubts]
-        else:
-            if isinstance(self.object, InputField):
-                displacement, warnings = self._transfer(self.object)
-            else:
-                displacement = self.object.phantom(self.shape, self.setup).displacement
-                shadow = self.object.shadow(self.shape, self.setup)
-            if shadow is not None:
-                source = np.where(shadow, 0.0, 1.0 if source is None else source)
-            image = synthetic_image(displacement, source, **callbacks)
-            flux = image.size if source is None else source.sum()
-        caustic = jacobian_determinant(displacement) < InversionOptions().caustic_jacobian
-        share = float((caustic if shadow is None else caustic & ~shadow).mean())
-        if share > 0:
-            warnings.append(
-                f"Caustics: rays cross or nearly cross in {percent(share)} of the pixels. Once "
-                "rays cross, one image no longer determines the whole field."
-            )
-        inside = float(image.sum() / flux) if flux else 1.0
-        if inside < 0.99:
-            warnings.append(f"Only {percent(inside)} of the flux lands inside the image.")
-        return Prediction(image, displacement, source, " ".join(warnings))
+        return predict(
+            self.object.field() if isinstance(self.object, GridFile) else self.object,
+            self.setup,
+            self.shape,
+            source=None if self.source is None else plane_of(self.source, "the source"),
+            deflector=self.deflector,
+            on_progress=on_progress,
+            should_stop=should_stop,
+        )
 
     def layers(self, content: Prediction) -> LayerData:
         origin = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
@@ -177,19 +130,6 @@ class ForwardJob(Job):
         )
         return [layer]
 
-    def _transfer(self, field: InputField) -> tuple[FloatArray, list[str]]:
-        """Return the displacement in the chosen setup, and the assumption behind it."""
-        displacement, setup = field.displacement, self.setup
-        if field.setup is None or setup is None or field.setup == setup:
-            return displacement, []
-        deflector = self.deflector or default_deflector(field.setup, setup)
-        shape: Any = None if self.source is None else np.shape(self.source)
-        moved = transferred_displacement(
-            displacement, field.setup, setup, deflector=deflector, shape=shape
-        )
-        text = f"Converted to another setup, assuming that only a {deflector} deflects the beam."
-        return moved, [text]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlanJob(Job):
@@ -204,18 +144,12 @@ class PlanJob(Job):
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> ExperimentPlan:
         choices = {"shape": self.shape, "instrument": self.instrument, "options": self.options}
         keywords: Any = {**choices, "on_progress": on_progress, "should_stop": should_stop}
-        setups, target = self.setups or None, self._object(on_progress, should_stop)
-        return plan_experiment(target, setups, **keywords)
-
-    def _object(self, *callbacks: Any) -> PhantomRecipe | PlannedObject:
-        if isinstance(self.object, PhantomRecipe):
-            return self.object
-        Reporter(*callbacks)("field", 0, None)
-        if isinstance(self.object, GridFile):
-            setup, name = next(iter(self.setups), None), self.object.file.name
-            return object_of_field(self.object.field(), setup, title=name)
-        field = self.object
-        return object_of_displacement(field.displacement, field.setup, title=field.title)
+        target: Any = self.object
+        if isinstance(target, GridFile):
+            Reporter(on_progress, should_stop)("field", 0, None)
+            setup = next(iter(self.setups), None)
+            target = object_of_field(target.field(), setup, title=target.file.name)
+        return plan_experiment(target, self.setups or None, **keywords)
 
     def layers(self, plan: ExperimentPlan) -> LayerData:
         """Describe the image of the first draw."""
@@ -299,7 +233,7 @@ class Simulate(panels.ToolPanel):
         for part in parts:
             part.changed.connect(self._on_change)
         for line in (self.side, self.energies):
-            line.textChanged.connect(lambda _: self.keep())
+            line.textChanged.connect(lambda _: self._on_change())
 
     @notify_errors
     def start_from(self, layer: Any) -> None:
@@ -362,7 +296,9 @@ class Simulate(panels.ToolPanel):
                 "open a .shadowinv file (File → Open), or select a simulated object"
             )
         displacement = np.asarray(about.displacement_of(layer), dtype=np.float64)
-        return InputField(displacement, result.setup, name_of_result(layer))
+        return object_of_displacement(
+            displacement, result.content.setup, title=name_of_result(layer)
+        )
 
     def _image_job(
         self, target: SimulatedObject, setup: Setup | None, shape: tuple[int, int]
@@ -370,7 +306,7 @@ class Simulate(panels.ToolPanel):
         beam: Any = self.source.layer
         source = None if beam is None else image_of(beam)
         layer: Any = None
-        if isinstance(target, InputField):
+        if isinstance(target, PlannedObject):
             layer, setup = self.field.layer, setup or target.setup
             shape = layer.data.shape[-2:]
             source = None if source is None else source_on(beam, source, layer)
@@ -439,6 +375,8 @@ class Simulate(panels.ToolPanel):
             self._on_change()
 
     def _on_change(self) -> None:
+        if not self.panel.running:
+            self.panel.say("")  # an error of other choices
         kind, is_plan = self.object.kind, self.task.kind == _PLAN
         self.save_result.setVisible(not is_plan)
         self._size_row.setVisible(is_plan or kind != _LAYER)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._napari.events import connect
 from napari_shadowinv._napari.layer_metadata import frame_for, main_layers, metadata_of
 from napari_shadowinv._napari.layers import (
     FullLayerData,
@@ -22,6 +21,7 @@ from napari_shadowinv._napari.layers import (
     sample_arrows,
     widen_limits,
 )
+from napari_shadowinv._napari.viewer_sync import connect
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
@@ -162,8 +162,8 @@ def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
         if current != [shot_in_view()]:
             read()
 
-    def leave(removed: Any) -> None:
-        if removed is layer:
+    def leave(event: Any) -> None:
+        if event.value is layer:
             connections.close()
 
     connections = ExitStack()

@@ -1,7 +1,8 @@
 """Synchronisation with a viewer, and messages to its user.
 
-Colour bar, placement of new images, label of the shown film; a sentence instead of a traceback for
-a user's error.
+- events of napari's models: `connect`, of all layers: `connect_layers`
+- a sentence instead of a traceback for a user's error: `notify_errors`
+- colour bar, placement of new images, label of the shown film: `connect_viewer`
 """
 
 from __future__ import annotations
@@ -9,11 +10,19 @@ from __future__ import annotations
 import functools
 import sys
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any, TypeVar
 
-from napari_shadowinv._napari.events import connect, connect_layers, without_proxy
-from napari_shadowinv._napari.layer_metadata import Frame, frame_of, metadata_of, role_of
+from napari_shadowinv._napari.layer_metadata import (
+    Frame,
+    data_of,
+    frame_of,
+    kind_of,
+    metadata_of,
+    result_of,
+    role_of,
+)
 from napari_shadowinv._system.validation import FieldError
 from napari_shadowinv.errors import InputError
 
@@ -21,6 +30,45 @@ USER_ERRORS = (InputError, OSError, MemoryError)
 """Errors that a user can resolve; all others are bugs, whose traceback is needed."""
 
 ReturnValue = TypeVar("ReturnValue")
+Disconnect = Callable[[], None]
+
+
+def without_proxy(model: Any) -> Any:
+    """Return a model itself where a widget got a proxy, perhaps a new one each time."""
+    return getattr(model, "__wrapped__", model)
+
+
+def connect(model: Any, names: str | Sequence[str], callback: Callable[[Any], Any]) -> Disconnect:
+    """Call a function at events of a model, and return a function that disconnects it.
+
+    It gets napari's event, which holds methods weakly. Of several events, the model may lack some.
+    """
+    events = without_proxy(model).events
+    names = (names,) if isinstance(names, str) else names
+    emitters = [getattr(events, name) for name in names if name in events]
+    for emitter in emitters:
+        emitter.connect(callback)
+
+    def disconnect() -> None:
+        for emitter in emitters:
+            emitter.disconnect(callback)
+
+    return disconnect
+
+
+def connect_layers(
+    layers: Any, names: str | Sequence[str], callback: Callable[[Any], Any]
+) -> Disconnect:
+    """Call a function at events of each layer in a list, present or to come."""
+    connections = ExitStack()
+
+    def watch(layer: Any) -> None:
+        connections.callback(connect(layer, names, callback))
+
+    for layer in layers:
+        watch(layer)
+    connections.callback(connect(layers, "inserted", lambda event: watch(event.value)))
+    return connections.close
 
 
 def in_event_loop() -> bool:
@@ -107,8 +155,8 @@ def once_added(viewer: Any, count: int, show: Callable[[list[Any]], Any]) -> Non
 
     added: list[Any] = []
 
-    def collect(layer: Any) -> None:
-        added.append(layer)
+    def collect(event: Any) -> None:
+        added.append(event.value)
         if len(added) == count:
             disconnect()
             # napari selects a layer after the event of its insertion.
@@ -142,7 +190,7 @@ def _follow_top_image(viewer: Any) -> None:
 def _top_image(layers: Any) -> Any | None:
     """Return the topmost visible image, unless it is a colour image without a colour bar."""
     for layer in reversed(layers):
-        if layer.visible and layer.__class__.__name__ == "Image":
+        if layer.visible and kind_of(layer) == "image":
             return layer if hasattr(layer, "colorbar") and not layer.rgb else None
     return None
 
@@ -159,7 +207,8 @@ def _place_new_images(viewer: Any) -> None:
     """Place new images without a scale on results of the same size, or explain how to."""
     # With pixels and lengths together, napari drops the unit of its scale bar.
 
-    def receive(layer: Any) -> None:
+    def receive(event: Any) -> None:
+        layer = event.value
         fields = [result for result in viewer.layers if role_of(result) == "field"]
         fields = [field for field in fields if frame_of(field).units != Frame().units]
         if fields and _is_bare_image(layer):
@@ -171,8 +220,7 @@ def _place_new_images(viewer: Any) -> None:
 def _place_on_result(layer: Any, fields: list[Any]) -> None:
     from napari.utils.notifications import show_info, show_warning
 
-    data = layer.data[0] if layer.multiscale else layer.data
-    shape = data.shape[:-1] if layer.rgb else data.shape
+    shape = data_of(layer).shape[: -1 if layer.rgb else None]
     same_size = [field for field in fields if field.data.shape[-2:] == tuple(shape[-2:])]
     if not same_size:
         unit = f"{fields[-1].units[-1]:~P}"
@@ -193,7 +241,7 @@ def _place_on_result(layer: Any, fields: list[Any]) -> None:
 
 def _is_bare_image(layer: Any) -> bool:
     """Whether a layer is the user's image at napari's default placement."""
-    if layer.__class__.__name__ != "Image" or not 2 <= layer.ndim <= 3:
+    if kind_of(layer) != "image" or not 2 <= layer.ndim <= 3:
         return False
     is_plugin_layer = role_of(layer) is not None and layer.source.path is None
     return not is_plugin_layer and frame_of(layer) == Frame()
@@ -205,25 +253,20 @@ def plane_in_view(viewer: Any, layer: Any) -> int:
     return min(max(index, 0), len(layer.data) - 1)
 
 
-# The contrast limits of a stack's films, and the one in view.
-_Planes = weakref.WeakKeyDictionary[Any, tuple[list[Any], int]]
-
-
 def _label_films(viewer: Any) -> None:
     """Label the shown film of a pack on the canvas, and restore its contrast."""
-    planes: _Planes = weakref.WeakKeyDictionary()
     labels: list[str] = []
 
     def follow(_: Any = None) -> None:
         text = ""
         for layer in viewer.layers:
-            films = metadata_of(layer).get("films")
-            if films is None or layer.ndim != 3:
+            doses: Any = getattr(result_of(layer), "content", None)
+            if not hasattr(doses, "film_label"):
                 continue
             plane = plane_in_view(viewer, layer)
-            _restore_contrast(planes, layer, plane)
+            _restore_contrast(layer, plane)
             if layer.visible:
-                text = films[plane]
+                text = doses.film_label(plane)
         if text or labels:
             overlay = _text_overlay(viewer)
             if not text and overlay.text in labels:
@@ -238,15 +281,12 @@ def _label_films(viewer: Any) -> None:
     follow()
 
 
-def _restore_contrast(planes: _Planes, layer: Any, plane: int) -> None:
+def _restore_contrast(layer: Any, plane: int) -> None:
     """Restore the contrast limits that a film had when it was last shown."""
-    limits = metadata_of(layer).get("limits")
-    if limits is None:
-        return
-    old_limits, old = planes.get(layer, (None, plane))
-    planes[layer] = limits, plane
-    if old_limits is not None and old_limits is limits and old != plane:
-        limits[old] = tuple(layer.contrast_limits)
+    facts = metadata_of(layer)
+    limits, before, facts["plane"] = facts.get("limits"), facts.get("plane", plane), plane
+    if limits is not None and before != plane:
+        limits[before] = tuple(layer.contrast_limits)
         low, high = limits[plane]
         # Fluences of films differ by powers of ten: the slider spans the range of one film.
         layer.contrast_limits_range = (min(0.0, low), 2 * high)

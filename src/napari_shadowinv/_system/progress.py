@@ -29,10 +29,11 @@ class Progress:
 
     @property
     def text(self) -> str:
-        """The message with the objective."""
-        if self.objective is None or not math.isfinite(self.objective):
+        """The message, of a fit with its stage and the objective."""
+        if self.objective is None:
             return self.message
-        return f"{self.message}, objective {self.objective:.6g}"
+        text = f"stage {self.step + 1} of {self.total}, {self.message}"
+        return f"{text}, objective {self.objective:.6g}" if math.isfinite(self.objective) else text
 
 
 OnProgress = Callable[[Progress], None]

@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count
 from typing import Any
 
 import numpy as np
@@ -49,6 +48,11 @@ from napari_shadowinv.fitting.starts import collect_starts
 from napari_shadowinv.fitting.summary import field_errors, report_of, summarise
 from napari_shadowinv.fitting.verdict import VerdictLimits
 from napari_shadowinv.options import FitOptions, Instrument
+
+# Of the names of steps; those of starts are 0.
+_STAGES = {"smoothness": 1} | dict.fromkeys(
+    ("other starts", "full size", "point spread", "rivals", "samples", "evidence"), 2
+)
 
 
 def fit(
@@ -215,7 +219,7 @@ def _find_pattern(
 ) -> Pattern:
     pattern = find_pattern(data, refined)
     if pattern.lacks_counts() and summary.posterior is not None:
-        posterior = summary.posterior.reporting(lambda: on_step("samples", refined.objective))
+        posterior = summary.posterior.reporting(lambda: on_step("samples", np.nan))
         absorbed = posterior.count_determined(np.random.default_rng(data.options.seed))
         share = pattern.missing_counts - absorbed / np.count_nonzero(minima.scene.weights)
         pattern = replace(pattern, missing_counts=share)
@@ -246,9 +250,15 @@ def _with_cause(
 
 
 def _report_steps(on_progress: OnProgress | None, should_stop: ShouldStop | None) -> OnStep:
-    """Return a callback that reports each step with its number."""
-    report, numbers = Reporter(on_progress, should_stop), count(1)
-    return lambda stage, objective: report("fit", next(numbers), None, stage, objective)
+    """Return a callback that reports each step with its stage: starts, smoothness, full size."""
+    report, reached = Reporter(on_progress, should_stop), 0
+
+    def on_step(name: str, objective: float) -> None:
+        nonlocal reached
+        reached = max(reached, _STAGES.get(name, 0))
+        report("fit", reached, 3, name, objective)
+
+    return on_step
 
 
 def _reweight_counts(data: FitData, scene: Scene, minimum: Minimum) -> Scene:

@@ -102,7 +102,7 @@ def explore(
         is_dense = scene.imperfect.resembles_fields
         rays = SPACING_WITH_NUMBERS if is_dense else spacing
         middle = replace(best.coarsen(scene), spacing=rays)
-        return Posterior(middle, start.unknowns, rng, lambda: on_step("samples", best.value), modes)
+        return Posterior(middle, start.unknowns, rng, lambda: on_step("samples", np.nan), modes)
 
     posterior = posterior_with(scene, best, None if data.single else copy(best.modes))
     options = data.options

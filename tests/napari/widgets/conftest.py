@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Iterator
 from importlib import import_module
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from napari_shadowinv.inversion import invert
@@ -19,7 +16,7 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 
 
 @pytest.fixture(autouse=True)
-def settings_folder(tmp_path: Path) -> Path:
+def settings_folder(tmp_path):
     """Keep the widgets' state out of the user's settings."""
     from qtpy.QtCore import QSettings
 
@@ -29,7 +26,7 @@ def settings_folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _lasting() -> None:
+def _lasting():
     """Exclude what earlier modules leave from the garbage collections of napari, two a test."""
     import_module("napari._qt.qt_main_window")
     gc.collect()
@@ -37,7 +34,7 @@ def _lasting() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _no_collection_for_each_layer() -> None:
+def _no_collection_for_each_layer():
     """Collect garbage once a window, not with each layer that it closes, as drivers may need."""
     from napari._vispy import canvas
 
@@ -46,20 +43,20 @@ def _no_collection_for_each_layer() -> None:
 
 
 @pytest.fixture(scope="session")
-def shot() -> np.ndarray[Any, Any]:
+def shot():
     """An off-centre blob in an even beam, in counts, that no edge cuts."""
     blob = gaussian_blob((48, 60), 15.0, 6.0, (22.0, 33.0))
     return 300 * synthetic_image(blob.displacement)
 
 
 @pytest.fixture(scope="session")
-def _compiled(shot: np.ndarray[Any, Any]) -> None:
+def _compiled(shot):
     """Compile the kernels of an inversion, so that no test waits for them."""
     invert(shot, options=InversionOptions(n_sites=700))
 
 
 @pytest.fixture
-def window(make_napari_viewer: Any, qtbot: Any, _compiled: None) -> Iterator[Any]:
+def window(make_napari_viewer, qtbot, _compiled):
     """A viewer in a visible window; at the end none of the plugin's threads runs."""
     viewer = make_napari_viewer(show=True)
     viewer.window._qt_window.resize(700, 400)  # a large canvas takes long to draw without a card
@@ -68,10 +65,10 @@ def window(make_napari_viewer: Any, qtbot: Any, _compiled: None) -> Iterator[Any
 
 
 @pytest.fixture
-def open_widget(window: Any) -> Callable[[str], Any]:
+def open_widget(window):
     """Open a widget as the menu does."""
 
-    def opened(name: str) -> Any:
+    def opened(name):
         _, widget = window.window.add_plugin_dock_widget("napari-shadowinv", name)
         return widget
 
@@ -79,11 +76,11 @@ def open_widget(window: Any) -> Callable[[str], Any]:
 
 
 @pytest.fixture
-def opened(viewer: Any, qtbot: Any) -> Iterator[Callable[[Any], Any]]:
+def opened(viewer, qtbot):
     """Make a widget of a class, as a session does when its menu is used first."""
     widgets: list[Any] = []
 
-    def make(kind: Any) -> Any:
+    def make(kind):
         widgets.append(kind(viewer))
         qtbot.addWidget(widgets[-1])
         return widgets[-1]
@@ -91,14 +88,15 @@ def opened(viewer: Any, qtbot: Any) -> Iterator[Callable[[Any], Any]]:
     yield make
     # None writes into the settings of the next test.
     for widget in widgets:
-        widget._writing.stop()
+        if hasattr(widget, "_writing"):
+            widget._writing.stop()
 
 
 @pytest.fixture
-def assert_it_fits(window: Any, qtbot: Any) -> Callable[[Any], None]:
+def assert_it_fits(window, qtbot):
     """Check that a widget needs no sideways scrolling in a small and in a large window."""
 
-    def check(tool: Any) -> None:
+    def check(tool):
         for size in ((1280, 800), (2560, 1440)):
             window.window._qt_window.resize(*size)
             qtbot.wait(50)
@@ -109,10 +107,10 @@ def assert_it_fits(window: Any, qtbot: Any) -> Callable[[Any], None]:
 
 
 @pytest.fixture
-def run(qtbot: Any) -> Callable[[Any], None]:
+def run(qtbot):
     """Press Run and wait until the layers are there."""
 
-    def pressed(tool: Any) -> None:
+    def pressed(tool):
         before = getattr(tool, "results", None)
         tool.panel.button.click()
         qtbot.waitUntil(lambda: getattr(tool, "results", None) is not before, timeout=60_000)
@@ -122,12 +120,12 @@ def run(qtbot: Any) -> Callable[[Any], None]:
 
 
 @pytest.fixture
-def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+def choose(monkeypatch):
     """Answer the dialogs for a file with a path and the first filter, and whether to replace it."""
     from qtpy.QtWidgets import QFileDialog, QMessageBox
 
-    def answer(path: Path | str, replace: bool = False) -> None:
-        def ask(parent: Any, title: str, proposal: str, filters: str, **_: Any) -> tuple[str, str]:
+    def answer(path, replace=False):
+        def ask(parent, title, proposal, filters, **_):
             return str(path), filters.split(";;")[0]
 
         button = QMessageBox.StandardButton.Yes if replace else QMessageBox.StandardButton.No
@@ -138,7 +136,7 @@ def choose(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     return answer
 
 
-def running_threads() -> list[Any]:
+def running_threads():
     import threading
 
     return [thread for thread in threading.enumerate() if thread.name == "shadowinv"]

@@ -95,7 +95,7 @@ def show(qtbot: Any) -> Callable[[Any, Fit], None]:
 
     def shown(tool: Any, found: Fit) -> None:
         job = tool.request()
-        result = Result(found, found.setups[0], job.origins)
+        result = Result(found, job.origins)
         layer_data = fit_layers(result, job.frame, job.name)
         tool.show_result(Finished(found, layer_data), job)
         qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
@@ -404,7 +404,7 @@ def test_each_stage_ends_soon_after_cancel(
     for stage in stages:
         tool.options.restore(usual | BEFORE.get(stage, {}))
         tool.panel.button.click()
-        course = tool.panel.tag.progress
+        course = tool.panel.tag
         qtbot.waitUntil(
             lambda: any(reached == stage for reached, _ in course.history),  # noqa: B023
             timeout=PATIENCE,
@@ -412,7 +412,7 @@ def test_each_stage_ends_soon_after_cancel(
         assert course.history[-1][0] == stage
         if stage == "samples":
             qtbot.waitUntil(tool.view.curve.isVisible, timeout=PATIENCE)
-            assert tool.panel.status.text().startswith("Fitting: ")
+            assert tool.panel.status.text().startswith("Fitting: stage 3 of 3")
         traced_images.clear()
         cancel(tool, qtbot)
         assert len(traced_images) <= 8 * len(before)  # a line search of the step under way
@@ -446,7 +446,7 @@ def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
 ) -> None:
     # As if it had been removed: drawing right after a removal crashes Mesa at times.
     job = replace(tool.request(), image=object(), companions=tuple(window.layers))
-    result = Result(fitted, SETUPS[0], job.origins)
+    result = Result(fitted, job.origins)
     tool.show_result(Finished(result.content, fit_layers(result, job.frame, job.name)), job)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     assert messages == ["'14.7 MeV' was deleted during its fit; the result is shown anyway"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,9 +30,7 @@ FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]
 
 
-def test_a_stack_tells_that_it_compiles(
-    shot: Array, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stack_tells_that_it_compiles(shot, tmp_path, monkeypatch):
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     progress: list[Progress] = []
     job = StackJob(shot[None], tmp_path / "a.shadowinv.zarr", Recipe(options=FEW))
@@ -47,7 +44,7 @@ LARGE = np.random.default_rng(0).normal(100, 5, (1024, 1024))
 SLOW = PolynomialEstimate(degree=10)
 
 
-def running(recipe: Recipe) -> Any:
+def running(recipe):
     return lambda hear, stop: run(recipe, LARGE, on_progress=hear, should_stop=stop)
 
 
@@ -63,10 +60,10 @@ def running(recipe: Recipe) -> Any:
     ],
     ids=["source", "shot", "step", "stack"],
 )
-def test_a_megapixel_ends_at_the_look_that_asks(job: Any, tmp_path: Path) -> None:
+def test_a_megapixel_ends_at_the_look_that_asks(job, tmp_path):
     looks: list[bool] = []
 
-    def should_stop() -> bool:
+    def should_stop():
         looks.append(len(looks) >= 8)  # in the middle of the estimate or filter
         return looks[-1]
 
@@ -76,12 +73,12 @@ def test_a_megapixel_ends_at_the_look_that_asks(job: Any, tmp_path: Path) -> Non
     assert looks.count(True) <= 2  # a stack's own, and its worker's
 
 
-def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Path) -> None:
+def test_a_shot_is_looked_at_before_the_books_count_it(shot, tmp_path):
     stack, out = np.stack([shot, shot]), tmp_path / "a.shadowinv.zarr"
     counted: list[tuple[int, int]] = []
 
     class CountingJob(StackJob):
-        def _update(self, status: Any) -> None:
+        def _update(self, status):
             if status.outcome is not None:
                 counted.append((status.outcome.index, self.status.ended))
 
@@ -91,7 +88,7 @@ def test_a_shot_is_looked_at_before_the_books_count_it(shot: Array, tmp_path: Pa
     assert job.status.ended == 2
 
 
-def test_painted_pixels_are_unusable_or_the_only_usable_ones() -> None:
+def test_painted_pixels_are_unusable_or_the_only_usable_ones():
     image, labels = Image(np.ones((10, 12))), Labels(np.zeros((10, 12), int))
     assert mask_of(labels, image, True) is None
     labels.data[2, 3] = 5
@@ -104,7 +101,7 @@ def test_painted_pixels_are_unusable_or_the_only_usable_ones() -> None:
     assert chosen.sum() == 1
 
 
-def test_a_drawn_crop_follows_the_scale_of_its_image() -> None:
+def test_a_drawn_crop_follows_the_scale_of_its_image():
     image = Image(np.ones((20, 30)), scale=(2.0, 2.0), translate=(10.0, 0.0))
     rectangle = Shapes([np.array([[14, 8], [14, 40], [30, 40], [30, 8]])], shape_type="rectangle")
     assert crop_of(rectangle, image) == Crop(y=(2, 11), x=(4, 21))
@@ -113,7 +110,7 @@ def test_a_drawn_crop_follows_the_scale_of_its_image() -> None:
     assert crop_of(Shapes(ndim=2), image) is None
 
 
-def test_a_drawn_mask_covers_the_pixels_under_it() -> None:
+def test_a_drawn_mask_covers_the_pixels_under_it():
     image = Image(np.ones((20, 30)), scale=(2.0, 2.0))
     rectangle = Shapes([np.array([[8, 8], [8, 20], [16, 20], [16, 8]])], shape_type="rectangle")
     usable = mask_of(rectangle, image, True)
@@ -122,7 +119,7 @@ def test_a_drawn_mask_covers_the_pixels_under_it() -> None:
     assert usable[:3].all()
 
 
-def test_layers_that_are_no_single_image_are_refused() -> None:
+def test_layers_that_are_no_single_image_are_refused():
     with pytest.raises(InputError, match="File → Open"):
         image_of(None)
     with pytest.raises(InputError, match="colour"):

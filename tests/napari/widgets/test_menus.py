@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 from qtpy.QtWidgets import QComboBox, QFileDialog
 
-from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, setup_origin_of
 from napari_shadowinv._napari.layers import add_layers, inversion_layers
 from napari_shadowinv._napari.preferences import preference
@@ -18,37 +14,34 @@ from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets.analyse import Analyse
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv._system.machine import available_threads, set_default_threads
-from napari_shadowinv.inversion import Inversion
 
 PATIENCE = 60_000  # ms
 
 
 @pytest.fixture
-def choose(window: Any, in_loop: Any) -> Any:
+def choose(window, in_loop):
     """Choose an entry of a menu."""
     from napari._app_model import get_app_model
 
-    def execute(name: str) -> None:
+    def execute(name):
         in_loop(get_app_model().commands.execute_command, f"napari-shadowinv.{name}")
 
     return execute
 
 
-def add_some(window: Any, inversion: Inversion, *roles: str) -> list[Any]:
+def add_some(window, inversion, *roles):
     """Add the layers of a result with these roles, in their order."""
     described = {role_of(each[1]): each for each in inversion_layers(inversion)}
     return add_layers(window, [described[role] for role in roles])
 
 
-def docked(window: Any, kind: type) -> Any:
+def docked(window, kind):
     """The only widget of a class in the window."""
     (widget,) = [each for each in window.window.dock_widgets.values() if isinstance(each, kind)]
     return widget
 
 
-def test_the_selected_image_is_plotted_along_a_line(
-    window: Any, choose: Any, messages: list[str]
-) -> None:
+def test_the_selected_image_is_plotted_along_a_line(window, choose, messages):
     choose("plot_along_line")
     assert messages == ["No image is selected: select a grey image in the layer list"]
     window.add_image(np.ones((20, 30)), name="other")
@@ -61,9 +54,7 @@ def test_the_selected_image_is_plotted_along_a_line(
     assert analyse.lines.layer.mode == "add_line"
 
 
-def test_products_are_measured_of_the_selected_result(
-    window: Any, choose: Any, solved: Inversion, messages: list[str]
-) -> None:
+def test_products_are_measured_of_the_selected_result(window, choose, solved, messages):
     field, arrows = add_some(window, solved, "field", "arrows")
     add_some(window, solved, "field")
     window.layers.selection.active = arrows
@@ -77,9 +68,7 @@ def test_products_are_measured_of_the_selected_result(
     assert messages[-1].startswith("No result is selected: select a layer of an inversion")
 
 
-def test_an_image_is_predicted_from_the_selected_potential(
-    window: Any, choose: Any, solved: Inversion, messages: list[str]
-) -> None:
+def test_an_image_is_predicted_from_the_selected_potential(window, choose, solved, messages):
     potential, arrows = add_some(window, solved, "potential", "arrows")
     window.layers.selection.active = potential
     choose("predict_image")
@@ -92,9 +81,7 @@ def test_an_image_is_predicted_from_the_selected_potential(
     assert forward.field.layer is potential
 
 
-def test_a_folder_is_chosen_and_watched(
-    opened: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_is_chosen_and_watched(opened, tmp_path, monkeypatch):
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(tmp_path))
     tool = opened(Invert)
     tool.choose_folder()
@@ -102,13 +89,7 @@ def test_a_folder_is_chosen_and_watched(
     assert tool.shots.shots() == tmp_path
 
 
-def test_a_setup_is_stored_with_its_image(
-    window: Any,
-    choose: Any,
-    proton_setup: ProtonSetup,
-    solved: Inversion,
-    messages: list[str],
-) -> None:
+def test_a_setup_is_stored_with_its_image(window, choose, proton_setup, solved, messages):
     stack = window.add_image(np.ones((3, 20, 30)), name="shots")
     mask = window.add_labels(np.zeros((20, 30), int))
     window.layers.selection.active = stack
@@ -136,7 +117,7 @@ def test_a_setup_is_stored_with_its_image(
     assert "is no image of a shot" in messages[-1]
 
 
-def test_an_open_widget_is_not_opened_twice(window: Any, choose: Any, qtbot: Any) -> None:
+def test_an_open_widget_is_not_opened_twice(window, choose, qtbot):
     window.add_image(np.ones((20, 30)))
     choose("analyse")  # in the menu Plugins
     analyse = docked(window, Analyse)
@@ -148,9 +129,7 @@ def test_an_open_widget_is_not_opened_twice(window: Any, choose: Any, qtbot: Any
     assert analyse.isVisible()
 
 
-def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
-    preferences: Any, window: Any, qtbot: Any
-) -> None:
+def test_the_dialog_of_napari_shows_and_keeps_the_preferences(preferences, window, qtbot):
     from napari._qt.dialogs.preferences_dialog import PreferencesDialog
 
     dialog = PreferencesDialog(window.window._qt_window)
@@ -170,7 +149,7 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(
     assert preference("units", "length") == "automatic"
 
 
-def test_runs_have_the_preferred_number_of_threads(preferences: Any, qtbot: Any) -> None:
+def test_runs_have_the_preferred_number_of_threads(preferences, qtbot):
     cores, threads = available_threads(None), []
     panel = Run("Run", "")
     qtbot.addWidget(panel)

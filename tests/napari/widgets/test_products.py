@@ -1,10 +1,9 @@
-"""The tab of *Analyse* that measures products of a result."""
+"""The tab of *Analyse* that measures products of a result, or of a store of shots."""
 
 from __future__ import annotations
 
 import csv
-from pathlib import Path
-from typing import Any
+import threading
 
 import numpy as np
 import pytest
@@ -12,45 +11,99 @@ from qtpy.QtWidgets import QFileDialog
 
 from helpers.forms import enter
 from helpers.reports import texts_of
-from napari_shadowinv import ProtonSetup
+from napari_shadowinv import ProtonSetup, run_stack
 from napari_shadowinv._napari.layers import add_to_viewer
+from napari_shadowinv._napari.widgets import _products
 from napari_shadowinv._napari.widgets._products import shape_fields
-from napari_shadowinv.analysis import PRODUCTS, EnclosedCurrent, analyse, products_in
+from napari_shadowinv._napari.widgets.analyse import Analyse
+from napari_shadowinv.analysis import (
+    PRODUCTS,
+    EnclosedCurrent,
+    Region,
+    analyse,
+    analyse_shots,
+    products_in,
+)
 from napari_shadowinv.inversion import Inversion, invert
-from napari_shadowinv.io import read_dataset
+from napari_shadowinv.io import read_dataset, read_stack
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import toroid
+from napari_shadowinv.preprocessing import Recipe
 
 PATIENCE = 60_000  # ms
+SETUP = ProtonSetup.example()
+RATE, SHOTS = 0.2, 4  # 1/ns, number
+
+
+def image_of(side, peak, radius):
+    return synthetic_image(toroid((side, side), SETUP, peak, radius).displacement)
 
 
 @pytest.fixture(scope="module")
-def inversion() -> Inversion:
-    phantom = toroid((48, 48), ProtonSetup.example(), 30.0, 9e-6)
-    image = np.random.default_rng(0).poisson(400 * synthetic_image(phantom.displacement))
+def inversion():
+    image = np.random.default_rng(0).poisson(400 * image_of(48, 30.0, 9e-6))
     return invert(image, source=np.full(image.shape, 400.0))
 
 
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """A toroid that grows by `RATE`, a shot each ns."""
+    out = tmp_path_factory.mktemp("series") / "night.shadowinv.zarr"
+    images = [300 * image_of(32, 20 * np.exp(RATE * time), 6e-6) for time in range(SHOTS)]
+    run_stack(np.stack(images), out, Recipe(setup=SETUP))
+    return out
+
+
 @pytest.fixture
-def form(window: Any, open_widget: Any, inversion: Inversion) -> Any:
-    add_to_viewer(window, inversion, ProtonSetup.example(), name="ring")
-    form = open_widget("Analyse").products
+def form(viewer, opened, inversion):
+    add_to_viewer(viewer, inversion, SETUP, name="ring")
+    form = opened(Analyse).products
     enter(form.bands.entries["samples"], 20)
     return form
 
 
-def choose(form: Any, name: str) -> None:
+@pytest.fixture
+def series(viewer, opened, store):
+    """The form with the store, a region and a circle."""
+    viewer.open(str(store), plugin="napari-shadowinv")
+    form = opened(Analyse).products
+    draw(form, "region", "ellipse", [[15.5, 15.5], [10.0, 10.0]])
+    return form
+
+
+def choose(form, name):
     form.product.set_kind(name)
     if form.product.kind != name:
         form.product.set_kind("more")
         form.more_products.set_kind(name)
 
 
-def measure(form: Any, qtbot: Any) -> Any:
-    count = len(form.measured)
+def draw(form, product, shape, corners):
+    choose(form, product)
+    form._draw()
+    shapes = form.shapes.layer
+    add = {"ellipse": shapes.add_ellipses, "line": shapes.add_lines}[shape]
+    add(np.array(corners))
+
+
+def press(form, qtbot):
+    """Press the button, wait for the end, and return the line below the button."""
     form.panel.button.click()
-    qtbot.waitUntil(lambda: len(form.measured) > count, timeout=PATIENCE)
+    qtbot.waitUntil(lambda: not form.panel.running, timeout=PATIENCE)
+    return form.panel.status.text()
+
+
+def measure(form, qtbot):
+    assert press(form, qtbot) == ""
     return form.measured[-1]
+
+
+def answer_with(monkeypatch, *names):
+    """Answer the dialogs for a file, one after the other."""
+    answers = iter(names)
+    monkeypatch.setattr(
+        QFileDialog, "getSaveFileName", lambda *_, **__: tuple(map(str, next(answers)))
+    )
 
 
 def test_round_ellipse_becomes_a_circle_and_others_a_polygon():
@@ -62,37 +115,31 @@ def test_round_ellipse_becomes_a_circle_and_others_a_polygon():
     assert area == pytest.approx(np.pi * 5 * 10, rel=2e-3)
 
 
-def test_drawn_circle_measures_the_same_current_as_python(
-    form: Any, qtbot: Any, inversion: Inversion
-) -> None:
-    choose(form, "current")
-    form._draw()
-    shapes, pixel = form.shapes.layer, form.result.layer.scale[0]
-    assert pixel != 1  # the layers are in µm
-    shapes.add_ellipses(np.array([[23.5, 23.5], [8.0, 8.0]]))
+def test_drawn_circle_measures_the_same_current_as_python(form, qtbot, inversion):
+    draw(form, "current", "ellipse", [[23.5, 23.5], [8.0, 8.0]])
+    assert form.result.layer.scale[0] != 1  # the layers are in µm
     measured = measure(form, qtbot)
     circle = EnclosedCurrent(center=(23.5, 23.5), radius=8.0)
     assert measured.product.center == pytest.approx(circle.center)
-    (expected,) = analyse(inversion, measured.product, setup=ProtonSetup.example(), samples=20)
+    (expected,) = analyse(inversion, measured.product, setup=SETUP, samples=20)
     assert measured["current"].value == expected["current"].value
     np.testing.assert_array_equal(measured["current"].samples, expected["current"].samples)
     assert expected.facts[0].text in texts_of(form.report).values()
 
 
-def test_profile_is_drawn_with_its_bands(form: Any, qtbot: Any) -> None:
-    choose(form, "profile")
-    form._draw()
-    form.shapes.layer.add_lines(np.array([[23.5, 5.0], [23.5, 42.0]]))
+def test_profile_is_drawn_with_its_bands(form, qtbot):
+    draw(form, "profile", "line", [[23.5, 5.0], [23.5, 42.0]])
+    enter(form.product.form.entries["width"], "4 px")
     form.unit.setCurrentText("MG µm")
     measured = measure(form, qtbot)
-    assert measured.unit.symbol == "MG µm"
+    assert (measured.unit.symbol, measured.product.width) == ("MG µm", 4)
     (axes,) = form.plot.figure.axes
     assert axes.get_ylabel() == "field (MG µm)"
     assert [line.get_label() for line in axes.lines] == ["along", "normal"]
     assert len(axes.collections) == 4  # two bands each
 
 
-def test_entries_of_a_product_are_those_of_its_model(form: Any, qtbot: Any) -> None:
+def test_entries_of_a_product_are_those_of_its_model(form):
     first = [form.product.choice.itemText(row) for row in range(form.product.choice.count())]
     assert len(first) == 7
     assert first[-1] == "more…"
@@ -103,67 +150,148 @@ def test_entries_of_a_product_are_those_of_its_model(form: Any, qtbot: Any) -> N
         offered |= form._picker.form.entries.keys()
     assert {"width", "find_tilt", "component", "path_length", "smoothing"} <= offered
     assert offered.isdisjoint({"path", "center", "rectangle", "label", "noise_power"})
-    choose(form, "profile")
-    enter(form.product.form.entries["width"], "4 px")
-    form._draw()
-    form.shapes.layer.add_lines(np.array([[23.5, 5.0], [23.5, 42.0]]))
-    assert measure(form, qtbot).product.width == 4
 
 
-def test_centre_of_an_object_along_the_beam_is_that_of_a_circle(form: Any, qtbot: Any) -> None:
-    choose(form, "azimuthal")
-    form._draw()
-    form.shapes.layer.add_ellipses(np.array([[23.5, 23.5], [15.0, 15.0]]))
+def test_centre_of_an_object_along_the_beam_is_that_of_a_circle(form, qtbot):
+    draw(form, "azimuthal", "ellipse", [[23.5, 23.5], [15.0, 15.0]])
     measured = measure(form, qtbot).product
     assert measured.center == pytest.approx((23.5, 23.5))
     assert measured.radius == pytest.approx(15.0)
     form.shapes.layer.add_rectangles(np.array([[5.0, 5.0], [15.0, 25.0]]))
-    form.panel.button.click()
-    assert "is no circle" in form.panel.status.text()
+    assert "is no circle" in press(form, qtbot)
 
 
-def test_map_becomes_a_layer_on_its_result(form: Any, window: Any, qtbot: Any) -> None:
+def test_map_becomes_a_layer_on_its_result(form, viewer, qtbot):
     choose(form, "current-density")
-    field = form.result.layer
-    measured = measure(form, qtbot)
-    layer = window.layers[-1]
+    measured, layer = measure(form, qtbot), viewer.layers[-1]
     assert layer.name.startswith("current density (")
-    np.testing.assert_allclose(layer.scale, field.scale)
+    np.testing.assert_allclose(layer.scale, form.result.layer.scale)
     ratio = layer.data / measured["density"].value
     np.testing.assert_allclose(ratio, ratio[0, 0])
     assert form.plot.isHidden()
 
 
 def test_products_are_exported_and_saved_with_the_result(
-    form: Any, qtbot: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, inversion: Inversion
-) -> None:
+    form, qtbot, tmp_path, monkeypatch, inversion
+):
+    choose(form, "contrast")
     for _ in range(2):
-        choose(form, "contrast")
         measure(form, qtbot)
-    assert [each.name for each in form.measured] == ["contrast", "contrast_2"]
-    names = iter([tmp_path / "products.csv", tmp_path / "both.shadowinv"])
-    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (str(next(names)), ""))
+    names = ["contrast", "contrast_2"]
+    assert [each.name for each in form.measured] == names
+    answer_with(monkeypatch, (tmp_path / "products.csv", ""), (tmp_path / "both.shadowinv", ""))
     form.export.click()
     rows = list(csv.reader((tmp_path / "products.csv").open(encoding="utf-8")))
-    assert {row[0] for row in rows[1:]} == {"contrast", "contrast_2"}
+    assert {row[0] for row in rows[1:]} == set(names)
     form.save.click()
     dataset = read_dataset(tmp_path / "both.shadowinv")
-    assert [each.name for each in products_in(dataset)] == ["contrast", "contrast_2"]
+    assert [each.name for each in products_in(dataset)] == names
     again = Inversion.from_dataset(dataset)
     np.testing.assert_array_equal(again.potential, inversion.potential)
+    assert again.setup == SETUP
 
 
-def test_problems_are_said_in_a_sentence(form: Any, window: Any, messages: list[str]) -> None:
+def test_problems_are_said_in_a_sentence(form, viewer, qtbot, messages):
     choose(form, "flux")
-    form.panel.button.click()
-    assert "There is no shape for the flux across a line" in messages[-1]
-    choose(form, "current")
-    form._draw()
-    form.shapes.layer.add_lines(np.array([[3.0, 3.0], [9.0, 9.0]]))
-    form.panel.button.click()
+    assert "There is no shape for the flux across a line" in press(form, qtbot)
+    draw(form, "current", "line", [[3.0, 3.0], [9.0, 9.0]])
+    assert "expected a closed shape" in press(form, qtbot)
     assert "expected a closed shape" in messages[-1]
-    assert "expected a closed shape" in form.panel.status.text()
-    for layer in list(window.layers):
-        window.layers.remove(layer)
-    form.panel.button.click()
-    assert "There is no result to measure" in messages[-1]
+    for layer in list(viewer.layers):
+        viewer.layers.remove(layer)
+    assert "There is no result to measure" in press(form, qtbot)
+
+
+def test_series_of_a_store_is_that_of_python(series, qtbot, store, tmp_path, monkeypatch):
+    assert series.shots.isVisibleTo(series)
+    enter(series.shots.entries["times"], "1 ns")
+    measured = measure(series, qtbot)
+    region, times = Region(center=(15.5, 15.5), radius=10), 1e-9 * np.arange(SHOTS)
+    (expected,) = analyse_shots(read_stack(store), region, times)
+    for name, quantity in expected.quantities.items():
+        np.testing.assert_allclose(measured[name].value, quantity.value, rtol=1e-12)
+    rows = texts_of(series.report)
+    assert {fact.title: rows[fact.title] for fact in expected.facts} == {
+        fact.title: fact.text for fact in expected.facts
+    }
+    assert float(rows["Growth of rms"].split()[0]) == pytest.approx(RATE, rel=0.05)
+    assert "95 %" in rows["Growth of rms"]
+    answer_with(monkeypatch, (tmp_path / "growth.csv", ""), (tmp_path / "growth", "PDF (*.pdf)"))
+    series.export.click()
+    table = list(csv.DictReader((tmp_path / "growth.csv").open(encoding="utf-8")))
+    places = [float(row["place"]) for row in table if row["quantity"] == "rms"]
+    np.testing.assert_allclose(places, times)
+    series.picture.click()
+    assert (tmp_path / "growth.pdf").read_bytes().startswith(b"%PDF")
+    assert not series.save.isEnabled()
+
+
+def test_numbers_and_centroid_are_drawn_over_time(series, qtbot):
+    enter(series.shots.entries["times"], "0, 1 ns, 2 ns, 4 ns")
+    measured = measure(series, qtbot)
+    numbers, places = series.plot.figure.axes
+    assert places.get_xlabel() == "time (ns)"
+    assert places.get_ylabel() == "µm"
+    lines = {line.get_label(): line for axes in (numbers, places) for line in axes.lines}
+    assert {"peak", "rms", "centroid_y", "centroid_x"} <= lines.keys()
+    np.testing.assert_allclose(lines["rms"].get_xdata(), [0, 1, 2, 4])
+    np.testing.assert_allclose(lines["rms"].get_ydata(), measured["rms"].value)
+    middle = 1e6 * 15.5 * SETUP.object_pixel_size
+    np.testing.assert_allclose(lines["centroid_y"].get_ydata(), middle, rtol=0.02)
+
+
+def test_shots_are_chosen_and_numbered_without_times(series, qtbot):
+    enter(series.shots.entries["shots"], "1:4:2")
+    measured = measure(series, qtbot)
+    np.testing.assert_array_equal(measured.coordinates["shot"].values, [1, 3])
+    assert "per shot" in texts_of(series.report)["Growth of rms"]
+    ticks = series.plot.figure.axes[-1].get_xticks()
+    np.testing.assert_array_equal(ticks, np.round(ticks))
+
+
+MISTAKES = [  # product, shots, times, message
+    ("region", "", "1,2", "Times is '1,2', expected the time between two shots in s, or a"),
+    ("region", "", "soon", "Times is 'soon': expected a number in s"),
+    ("region", "9", "", "Shots are '9': expected numbers from 0 to 3"),
+    ("current-density", "", "", "The current density has no single number to follow"),
+]
+
+
+def test_mistake_with_a_store_is_a_sentence(series, qtbot, messages):
+    for product, shots, times, message in MISTAKES:
+        series.product.set_kind(product)
+        enter(series.shots.entries["shots"], shots)
+        enter(series.shots.entries["times"], times)
+        assert message in press(series, qtbot)
+        assert message in messages[-1]
+        assert series.measured == []
+
+
+def test_cancelled_series_leaves_no_result(series, qtbot, monkeypatch):
+    entered = threading.Event()
+    original = _products.analyse_shots
+
+    def held(*args, should_stop, **choices):
+        entered.set()
+        while not should_stop():
+            threading.Event().wait(0.01)
+        return original(*args, should_stop=should_stop, **choices)
+
+    monkeypatch.setattr(_products, "analyse_shots", held)
+    series.panel.button.click()
+    qtbot.waitUntil(entered.is_set, timeout=PATIENCE)
+    assert press(series, qtbot) == "Cancelled."
+    assert series.measured == []
+
+
+def test_single_result_has_no_times(series, viewer, qtbot, inversion):
+    enter(series.shots.entries["times"], "1 ns")
+    measure(series, qtbot)
+    added = add_to_viewer(viewer, inversion, SETUP, name="single")
+    series.result.layer = next(layer for layer in added if layer in series.result.offered)
+    assert not series.shots.isVisibleTo(series)
+    enter(series.bands.entries["samples"], 20)
+    measure(series, qtbot)
+    (measured,) = series.measured  # those of the store are forgotten
+    assert not measured.is_series
+    assert series.save.isEnabled()

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import tifffile
@@ -17,7 +13,7 @@ PATIENCE = 60_000  # ms
 
 
 @pytest.fixture
-def tool(window: Any, open_widget: Callable[[str], Any], shot: Any) -> Any:
+def tool(window, open_widget, shot):
     window.add_image(shot, name="shot", metadata=metadata_for("shot", "", ProtonSetup.example()))
     widget = open_widget("Invert")
     widget.options.restore({"n_sites": 300})
@@ -25,8 +21,8 @@ def tool(window: Any, open_widget: Callable[[str], Any], shot: Any) -> Any:
 
 
 def test_saved_result_comes_back_and_is_inverted_again(
-    window: Any, tool: Any, run: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
-) -> None:
+    window, tool, run, qtbot, tmp_path, choose, messages
+):
     run(tool)
     verdict, peak = tool.verdict.text(), window.layers.selection.active.data.max()
     choose(tmp_path / "a")
@@ -51,9 +47,7 @@ def test_saved_result_comes_back_and_is_inverted_again(
     assert window.layers.selection.active.data.max() == pytest.approx(peak, rel=1e-6)
 
 
-def test_save_asks_before_it_replaces_a_file(
-    tool: Any, run: Any, tmp_path: Path, choose: Any
-) -> None:
+def test_save_asks_before_it_replaces_a_file(tool, run, tmp_path, choose):
     run(tool)
     path = tmp_path / "a.shadowinv"
     path.write_text("precious")
@@ -65,18 +59,14 @@ def test_save_asks_before_it_replaces_a_file(
     assert read(path)["displacement"].shape == (2, 48, 60)
 
 
-def test_save_without_a_result_says_what_to_do(
-    tool: Any, tmp_path: Path, choose: Any, messages: list[str]
-) -> None:
+def test_save_without_a_result_says_what_to_do(tool, tmp_path, choose, messages):
     choose(tmp_path / "a")
     tool.view.save_result.click()
     assert messages == ["There is no result yet: press Run first, or select a layer of a result"]
     assert not list(tmp_path.glob("a*"))
 
 
-def test_save_that_fails_leaves_no_file(
-    tool: Any, run: Any, tmp_path: Path, choose: Any, messages: list[str]
-) -> None:
+def test_save_that_fails_leaves_no_file(tool, run, tmp_path, choose, messages):
     run(tool)
     choose(tmp_path / "nowhere" / "a")
     tool.view.save_result.click()
@@ -86,9 +76,7 @@ def test_save_that_fails_leaves_no_file(
     assert not (tmp_path / "nowhere").exists()
 
 
-def test_more_layers_adds_those_that_are_missing(
-    tool: Any, window: Any, run: Any, qtbot: Any
-) -> None:
+def test_more_layers_adds_those_that_are_missing(tool, window, run, qtbot):
     run(tool)
     few = [role_of(layer) for layer in window.layers]
     assert few == ["shot", "residual", "field", "caustic", "arrows"]
@@ -109,9 +97,7 @@ def test_more_layers_adds_those_that_are_missing(
     assert len(window.layers) == count
 
 
-def test_forward_image_is_saved_with_its_pixels(
-    window: Any, open_widget: Any, qtbot: Any, tmp_path: Path, choose: Any
-) -> None:
+def test_forward_image_is_saved_with_its_pixels(window, open_widget, qtbot, tmp_path, choose):
     tool = open_widget("Simulate")
     tool.side.setText("40 x 50")
     tool.panel.button.click()
@@ -125,9 +111,8 @@ def test_forward_image_is_saved_with_its_pixels(
 
 
 def test_shot_of_a_store_is_saved_alone(
-    window: Any, open_widget: Any, qtbot: Any, tmp_path: Path, choose: Any, shot: Any,
-    proton_setup: ProtonSetup,
-) -> None:  # fmt: skip
+    window, open_widget, qtbot, tmp_path, choose, shot, proton_setup
+):
     stack = np.stack([shot, shot[:, ::-1]])
     window.add_image(stack, name="run", metadata=metadata_for("shot", "", proton_setup))
     tool = open_widget("Invert")

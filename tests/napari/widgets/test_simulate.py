@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
-from napari.components import ViewerModel
 
 from helpers.forms import enter
 from helpers.jobs import run_job
+from helpers.layers import by_role
 from helpers.reports import texts_of
 from napari_shadowinv import InputError, Instrument, OpticalSetup, ProtonSetup, trace
 from napari_shadowinv._napari.layer_metadata import role_of, source_of, unit_of
 from napari_shadowinv._napari.layers import add_to_viewer
-from napari_shadowinv._napari.simulate import ForwardJob, GridFile, InputField, Simulate
+from napari_shadowinv._napari.simulate import ForwardJob, GridFile, Simulate
 from napari_shadowinv._napari.widgets.invert import Invert
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read_field_grid
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantom_models import BlobRecipe
@@ -26,67 +24,43 @@ from napari_shadowinv.physics.phantoms import coaxial_line, four_toroids, wakefi
 from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
-from napari_shadowinv.pipeline.experiment_object import object_of_field
+from napari_shadowinv.pipeline.experiment_object import object_of_displacement, object_of_field
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 60_000  # ms
 
 
-def test_an_object_makes_its_image_and_caustics_are_warned_of(
-    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str], solved: Inversion,
-    proton_setup: ProtonSetup,
-) -> None:  # fmt: skip
+@pytest.fixture
+def image(run):
+    """Press Run, and return the layer of the image."""
+
+    def pressed(tool):
+        run(tool)
+        (layer,) = tool.results.layers
+        return layer
+
+    return pressed
+
+
+def test_an_object_makes_its_image_and_caustics_are_warned_of(opened, image, messages):
     tool = opened(Simulate)
-
-    def made() -> Any:
-        before = [layer.data for layer in viewer.layers]
-
-        def new() -> list[Any]:
-            return [
-                layer for layer in viewer.layers if not any(layer.data is old for old in before)
-            ]
-
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda: bool(new()), timeout=PATIENCE)
-        return new()[-1]
-
     tool.object.set_kind("four_toroids")
     tool.side.setText("60 x 80")
     strength = tool.object.form.entries["strength"]
     enter(strength, 0.2)
     expected = four_toroids((60, 80), ProtonSetup.example(), 0.2)
-    layer = made()
+    layer = image(tool)
     np.testing.assert_allclose(layer.data, synthetic_image(expected.displacement))
     assert tuple(layer.scale) == pytest.approx((1.5, 1.5))
     assert not tool.warning.isVisibleTo(tool)
     enter(strength, 2.0)
-    made()
+    image(tool)
     assert tool.warning.isVisibleTo(tool)
     assert "Caustics" in tool.warning.text()
-
-    add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True)
-    potential = next(
-        result_layer for result_layer in viewer.layers if role_of(result_layer) == "potential"
-    )
-    assert unit_of(potential) != "px²"
-    tool.object.set_kind("layer")
-    tool.field.layer = potential
-    tool.setup.show_setup(proton_setup.model_dump())
-    again = made().data
-    inner = (slice(3, -3), slice(3, -3))
-    relative = solved.reprojection / solved.source.mean()
-    assert abs(again - relative)[inner].max() < 0.02 * relative.max()
-
-    # It knows its experiment.
-    tool.setup.picker.set_kind("none")
-    np.testing.assert_allclose(made().data, again)
     assert messages == []
 
 
-def test_only_fields_of_results_are_offered(
-    viewer: ViewerModel, opened: Any, messages: list[str], solved: Inversion,
-    proton_setup: ProtonSetup, shot: Array,
-) -> None:  # fmt: skip
+def test_only_fields_of_results_are_offered(viewer, opened, messages, solved, proton_setup, shot):
     tool = opened(Simulate)
     tool.object.set_kind("layer")
     tool.panel.button.click()
@@ -97,54 +71,51 @@ def test_only_fields_of_results_are_offered(
     add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True)
     roles = [role_of(layer) for layer in tool.field.offered]
     assert roles == ["potential", "field y", "field x", "field"]
+    assert tool.panel.status.text() == ""  # the error was of no layer
     assert tool.setup.setup() == proton_setup
 
 
 def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
-    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str], solved: Inversion,
-    proton_setup: ProtonSetup,
-) -> None:  # fmt: skip
-    add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True)
+    viewer, opened, image, messages, solved, proton_setup
+):
+    layers = by_role(add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True))
     tool = opened(Simulate)
     choices = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
     assert choices[1:] == list(deflector_titles().values())
     tool.object.set_kind("layer")
     slow = proton_setup.model_copy(update={"energy": 3.0})
     tool.setup.show_setup(slow.model_dump())
-
-    def image() -> Any:
-        before = tool.results
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda: tool.results is not before, timeout=PATIENCE)
-        qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-        (layer,) = tool.results.layers
-        assert layer.name.startswith("solved image")
-        return layer.data
-
     expected = predict_image(solved.displacement, proton_setup, slow)
-    np.testing.assert_allclose(image(), expected)
+    layer = image(tool)
+    assert layer.name.startswith("solved image")
+    np.testing.assert_allclose(layer.data, expected)
     assert "only a magnetic field deflects the beam" in tool.warning.text()
+    # Its potential stands for the same field.
+    assert unit_of(layers["potential"]) != "px²"
+    tool.field.layer = layers["potential"]
+    tool.setup.show_setup(slow.model_dump())
+    np.testing.assert_allclose(image(tool).data, expected)
     tool.deflector.setCurrentText("electric field")
     expected = predict_image(solved.displacement, proton_setup, slow, deflector="electric field")
-    np.testing.assert_allclose(image(), expected)
-    tool.setup.show_setup(proton_setup.model_dump())
-    np.testing.assert_allclose(image(), synthetic_image(solved.displacement))
-    # Its potential stands for the same field.
-    tool.field.layer = next(layer for layer in viewer.layers if role_of(layer) == "potential")
-    tool.deflector.setCurrentIndex(0)
-    tool.setup.show_setup(slow.model_dump())
-    np.testing.assert_allclose(image(), predict_image(solved.displacement, proton_setup, slow))
+    np.testing.assert_allclose(image(tool).data, expected)
+    # It knows its own experiment.
+    for show_own in (
+        lambda: tool.setup.show_setup(proton_setup.model_dump()),
+        lambda: tool.setup.picker.set_kind("none"),
+    ):
+        show_own()
+        again = image(tool).data
+        np.testing.assert_allclose(again, synthetic_image(solved.displacement))
+    inner = (slice(3, -3), slice(3, -3))
+    relative = solved.reprojection / solved.source.mean()
+    assert abs(again - relative)[inner].max() < 0.02 * relative.max()
     assert messages == []
 
 
-def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
-    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str]
-) -> None:
+def test_conductors_stop_the_beam_and_their_image_can_be_inverted(opened, image, messages):
     tool = opened(Simulate)
     tool.object.set_kind("coaxial")
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
-    (layer,) = viewer.layers
+    layer = image(tool)
     phantom, obstructed = coaxial_line((200, 200), ProtonSetup.example())
     dark = np.where(obstructed, 0.0, 1.0)
     np.testing.assert_allclose(layer.data, synthetic_image(phantom.displacement, dark))
@@ -154,16 +125,12 @@ def test_conductors_stop_the_beam_and_their_image_can_be_inverted(
     assert messages == []
 
 
-def test_an_object_brings_the_beam_that_it_needs(
-    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str]
-) -> None:
+def test_an_object_brings_the_beam_that_it_needs(opened, image, qtbot, messages):
     tool = opened(Simulate)
     tool.object.set_kind("wakefield")
     assert tool.setup.setup() == OpticalSetup.example()
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
     wave = wakefield((200, 200), OpticalSetup.example())
-    np.testing.assert_allclose(viewer.layers[0].data, synthetic_image(wave.displacement))
+    np.testing.assert_allclose(image(tool).data, synthetic_image(wave.displacement))
     enter(tool.object.form.entries["density"], "2e19 cm⁻³")
     assert tool.object.model().density == pytest.approx(2e25)
 
@@ -181,15 +148,16 @@ def test_an_object_brings_the_beam_that_it_needs(
     assert "select the setup 'light'" in messages[0]
 
 
-def test_a_displacement_and_its_object_make_the_same_image() -> None:
+def test_a_displacement_and_its_object_make_the_same_image():
     blob = BlobRecipe(amplitude=20, sigma=8)
     by_object = run_job(ForwardJob(blob, shape=(40, 50)))
-    by_field = run_job(ForwardJob(InputField(blob.phantom((40, 50), None).displacement)))
+    moved = object_of_displacement(blob.phantom((40, 50), None).displacement)
+    by_field = run_job(ForwardJob(moved))
     np.testing.assert_array_equal(by_object.image, by_field.image)
 
 
 @pytest.fixture
-def tool(opened: Any) -> Any:
+def tool(opened):
     """The widget with a small toroid and three draws."""
     tool = opened(Simulate)
     tool.task.set_kind("plan")
@@ -201,20 +169,16 @@ def tool(opened: Any) -> Any:
     return tool
 
 
-def finished(tool: Any, qtbot: Any) -> None:
+def finished(tool, qtbot):
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
 
 
-def test_a_plan_shows_its_verdict_and_the_first_image(
-    tool: Any, viewer: ViewerModel, qtbot: Any
-) -> None:
+def test_a_plan_shows_its_verdict_and_the_first_image(tool, image):
     assert tool.setup.setup() == ProtonSetup.example()
-    finished(tool, qtbot)
+    layer = image(tool)
     assert "would be determined: 3 of 3" in tool.verdict.text()
     assert "Error made" in texts_of(tool.report)
-    qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
-    (layer,) = viewer.layers
     assert role_of(layer) == "shot"
     assert layer.data.mean() == pytest.approx(3000, rel=0.01)
     assert not tool.plot.isHidden()
@@ -224,9 +188,7 @@ def test_a_plan_shows_its_verdict_and_the_first_image(
     ("energies", "size", "message"),
     [("3; 15", "64 x 64", "separated by commas"), ("", "64", "expected height and width")],
 )
-def test_wrong_entries_are_a_sentence_below_the_button(
-    tool: Any, messages: list[str], energies: str, size: str, message: str
-) -> None:
+def test_wrong_entries_are_a_sentence_below_the_button(tool, messages, energies, size, message):
     tool.energies.setText(energies)
     tool.side.setText(size)
     tool.panel.button.click()
@@ -235,7 +197,7 @@ def test_wrong_entries_are_a_sentence_below_the_button(
 
 
 @pytest.fixture
-def cube(tmp_path: Path) -> Path:
+def cube(tmp_path):
     """A ring of B about the axis x, away from the middle of its frame."""
     z, y, x = np.meshgrid(*[np.linspace(-4e-5, 4e-5, 20)] * 3, indexing="ij")
     bell = 8e6 * np.exp(-(x**2 + y**2 + z**2) / (2 * 1.2e-5**2))
@@ -249,7 +211,7 @@ def cube(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def traced(tool: Any, cube: Path) -> Any:
+def traced(tool, cube):
     """The widget with the field of the file, seen along x."""
     tool.object.set_kind("grid")
     tool.object.form.restore({"file": str(cube), "beam": "x", "right": "y", "centre": True})
@@ -257,7 +219,7 @@ def traced(tool: Any, cube: Path) -> Any:
     return tool
 
 
-def test_a_3d_field_of_a_file_is_traced(cube: Path) -> None:
+def test_a_3d_field_of_a_file_is_traced(cube):
     file = GridFile(file=cube, beam="x", right="y", centre=True)
     with pytest.raises(InputError, match="there is no setup"):
         run_job(ForwardJob(file, shape=(40, 50)))
@@ -266,11 +228,8 @@ def test_a_3d_field_of_a_file_is_traced(cube: Path) -> None:
     np.testing.assert_array_equal(traced.image, trace(grid, ProtonSetup.example(), (40, 50)).image)
 
 
-def test_a_3d_field_is_planned_as_in_python(
-    traced: Any, viewer: ViewerModel, cube: Path, qtbot: Any
-) -> None:
-    finished(traced, qtbot)
-    qtbot.waitUntil(lambda: len(viewer.layers) == 1, timeout=PATIENCE)
+def test_a_3d_field_is_planned_as_in_python(traced, cube, image):
+    layer = image(traced)
     grid = read_field_grid(cube).turned("x", "y").centred()
     expected = plan_experiment(
         object_of_field(grid, ProtonSetup.example()),
@@ -278,14 +237,13 @@ def test_a_3d_field_is_planned_as_in_python(
         instrument=Instrument(beam_rms=0.0),
         options=ExperimentOptions(draws=3, counts=3000.0),
     )
-    (layer,) = viewer.layers
     np.testing.assert_array_equal(layer.data, expected.images[0])
     assert layer.name == "cube.nc, planned"
     texts = texts_of(traced.report)
     assert texts["Error made"] == next(f.text for f in expected.facts if f.title == "Error made")
 
 
-def test_file_and_view_are_remembered(traced: Any, cube: Path) -> None:
+def test_file_and_view_are_remembered(traced, cube):
     state = traced.state()
     traced.object.form.restore({})
     traced.object.set_kind("toroid")
@@ -293,9 +251,7 @@ def test_file_and_view_are_remembered(traced: Any, cube: Path) -> None:
     assert traced._object() == GridFile(file=cube, beam="x", right="y", centre=True)
 
 
-def test_wrong_file_is_a_sentence(
-    traced: Any, qtbot: Any, messages: list[str], tmp_path: Path
-) -> None:
+def test_wrong_file_is_a_sentence(traced, qtbot, messages, tmp_path):
     enter(traced.object.form.entries["file"], "")
     finished(traced, qtbot)
     assert "ptions: 'File' is missing" in traced.panel.status.text()

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from napari.components import ViewerModel
 
 from helpers.forms import enter
 from helpers.reports import texts_of
@@ -27,7 +26,6 @@ from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets import _qt
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import PolynomialEstimate
@@ -38,7 +36,7 @@ PLUGIN = "napari-shadowinv"
 
 
 @pytest.fixture
-def of_a_file(viewer: ViewerModel, shot: Array, proton_setup: ProtonSetup) -> Any:
+def of_a_file(viewer, shot, proton_setup):
     """A shot that came with its setup."""
     origin = "came with experiment.h5"
     metadata = metadata_for("shot", "", proton_setup, setup_origin=origin)
@@ -46,12 +44,12 @@ def of_a_file(viewer: ViewerModel, shot: Array, proton_setup: ProtonSetup) -> An
 
 
 @pytest.fixture
-def plain(viewer: ViewerModel, shot: Array) -> Any:
+def plain(viewer, shot):
     """A shot that napari itself has opened."""
     return viewer.add_image(shot, name="plain")
 
 
-def typed(tool: Any, energy: float) -> None:
+def typed(tool, energy):
     """Type a whole setup, field by field."""
     tool.setup.picker.set_kind("proton")
     values = {
@@ -64,9 +62,7 @@ def typed(tool: Any, energy: float) -> None:
         enter(tool.setup.picker.form.entries[name], value)
 
 
-def test_a_setup_stays_with_the_image_that_it_came_with(
-    opened: Any, of_a_file: Any, plain: Any, proton_setup: ProtonSetup
-) -> None:
+def test_a_setup_stays_with_the_image_that_it_came_with(opened, of_a_file, plain, proton_setup):
     tool = opened(Invert)
     for _ in range(2):
         tool.image.layer = of_a_file
@@ -80,9 +76,7 @@ def test_a_setup_stays_with_the_image_that_it_came_with(
     assert tool.setup.picker.form.is_empty
 
 
-def test_the_setup_of_a_file_is_not_there_in_the_next_session(
-    viewer: ViewerModel, opened: Any, of_a_file: Any, shot: Array
-) -> None:
+def test_the_setup_of_a_file_is_not_there_in_the_next_session(viewer, opened, of_a_file, shot):
     tool = opened(Invert)
     assert tool.setup.setup() is not None
     enter(tool.setup.picker.form.entries["energy"], "3 MeV")
@@ -96,9 +90,7 @@ def test_the_setup_of_a_file_is_not_there_in_the_next_session(
     assert later.setup.picker.form.is_empty
 
 
-def test_what_the_user_typed_is_at_hand_and_says_for_what(
-    viewer: ViewerModel, opened: Any, plain: Any, shot: Array
-) -> None:
+def test_what_the_user_typed_is_at_hand_and_says_for_what(viewer, opened, plain, shot):
     tool = opened(Invert)
     typed(tool, 5.0)
     entered = tool.setup.setup()
@@ -133,8 +125,8 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(
 
 
 def test_the_last_setup_is_selected_where_that_is_preferred(
-    viewer: ViewerModel, opened: Any, plain: Any, shot: Array, preferences: Any
-) -> None:
+    viewer, opened, plain, shot, preferences
+):
     preferences.widgets.last_setup = True
     tool = opened(Invert)
     assert tool.setup.setup() is None  # there is no last one
@@ -160,9 +152,7 @@ def test_the_last_setup_is_selected_where_that_is_preferred(
     assert opened(Invert).setup.setup() is None
 
 
-def test_a_setup_from_a_toml_file_says_so(
-    opened: Any, plain: Any, tmp_path: Path, proton_setup: ProtonSetup, monkeypatch: Any
-) -> None:
+def test_a_setup_from_a_toml_file_says_so(opened, plain, tmp_path, proton_setup, monkeypatch):
     from qtpy.QtWidgets import QFileDialog
 
     text = tomli_w.dumps(proton_setup.model_dump(exclude_none=True))
@@ -179,9 +169,7 @@ def test_a_setup_from_a_toml_file_says_so(
     assert setup_origin_of(plain) == "loaded from tcc.toml for 'plain'"
 
 
-def test_a_loaded_setup_goes_with_the_image_until_run(
-    viewer: ViewerModel, opened: Any, plain: Any, proton_setup: ProtonSetup
-) -> None:
+def test_a_loaded_setup_goes_with_the_image_until_run(viewer, opened, plain, proton_setup):
     tool = opened(Invert)
     tool.image.layer = plain
     tool.setup.load(proton_setup.model_dump(exclude_none=True), "tcc.toml")
@@ -198,12 +186,12 @@ def test_a_loaded_setup_goes_with_the_image_until_run(
     assert tool.setup.setup() is None
 
 
-def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) -> None:
+def test_other_files_do_not_inherit_a_setup(viewer, opened):
     tool = opened(Invert)
     tool.shots.set_kind("files")
     typed(tool, 5.0)
 
-    def choose(pattern: str) -> None:
+    def choose(pattern):
         tool.shots.files.edit.setText(pattern)
         tool.shots.files.changed.emit()
 
@@ -216,9 +204,7 @@ def test_other_files_do_not_inherit_a_setup(viewer: ViewerModel, opened: Any) ->
     assert tool.setup.origin == "typed"
 
 
-def test_a_store_lies_beside_the_files_unless_another_is_chosen(
-    viewer: ViewerModel, opened: Any, tmp_path: Path
-) -> None:
+def test_a_store_lies_beside_the_files_unless_another_is_chosen(viewer, opened, tmp_path):
     tool = opened(Invert)
     tool.shots.set_kind("folder")
     tool.shots.folder.edit.setText(str(tmp_path / "night"))
@@ -233,9 +219,7 @@ def test_a_store_lies_beside_the_files_unless_another_is_chosen(
     assert tool.store.path == Path("mine.shadowinv.zarr")
 
 
-def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(
-    viewer: ViewerModel, opened: Any
-) -> None:
+def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(viewer, opened):
     tool = opened(Invert)
     viewer.open_sample(PLUGIN, "toroid")
     shot, source = (
@@ -250,9 +234,7 @@ def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(
     assert tool.source.layers.layer is source
 
 
-def test_no_image_is_its_own_source(
-    viewer: ViewerModel, opened: Any, plain: Any, shot: Array
-) -> None:
+def test_no_image_is_its_own_source(viewer, opened, plain, shot):
     tool = opened(Invert)
     tool.source.set_kind("layer")
     assert tool.source.layers.offered == []
@@ -269,9 +251,7 @@ def test_no_image_is_its_own_source(
     assert tool.source.layers.offered == [plain]
 
 
-def test_results_are_not_offered_as_shots(
-    viewer: ViewerModel, opened: Any, plain: Any, solved: Inversion
-) -> None:
+def test_results_are_not_offered_as_shots(viewer, opened, plain, solved):
     add_to_viewer(viewer, solved, name="solved")
     tool = opened(Invert)
     assert tool.image.offered == [plain]
@@ -286,9 +266,7 @@ def test_results_are_not_offered_as_shots(
             command(field)
 
 
-def test_one_click_takes_the_setup_of_the_layer_and_says_so(
-    of_a_file: Any, plain: Any, proton_setup: ProtonSetup
-) -> None:
+def test_one_click_takes_the_setup_of_the_layer_and_says_so(of_a_file, plain, proton_setup):
     for layer, setup, origin in (
         (of_a_file, proton_setup, "came with experiment.h5"),
         (plain, None, None),
@@ -298,7 +276,7 @@ def test_one_click_takes_the_setup_of_the_layer_and_says_so(
             assert result_of(keywords).origins.get("Setup") == origin  # type: ignore[union-attr]
 
 
-def test_a_source_can_be_filtered_and_stays_one(viewer: ViewerModel, opened: Any) -> None:
+def test_a_source_can_be_filtered_and_stays_one(viewer, opened):
     viewer.open_sample(PLUGIN, "toroid")
     source = next(layer for layer in viewer.layers if role_of(layer) == "source")
     ((_, keywords, _),) = commands.high_pass(source)
@@ -308,9 +286,7 @@ def test_a_source_can_be_filtered_and_stays_one(viewer: ViewerModel, opened: Any
         commands.invert_uniform(source)
 
 
-def test_the_source_that_was_chosen_comes_back_after_a_sample(
-    viewer: ViewerModel, opened: Any, plain: Any
-) -> None:
+def test_the_source_that_was_chosen_comes_back_after_a_sample(viewer, opened, plain):
     tool = opened(Invert)
     tool.source.set_kind("low-pass")
     *_, sample = viewer.open_sample(PLUGIN, "toroid")
@@ -324,7 +300,7 @@ def test_the_source_that_was_chosen_comes_back_after_a_sample(
 
 
 @pytest.fixture(scope="module")
-def hump() -> tuple[Array, Array, Array]:
+def hump():
     """A shot of an object under an uneven beam, its true potential, and the object's pixels."""
     blob = gaussian_blob((64, 72), 30.0, 6.0, (30.0, 40.0))
     y, x = np.mgrid[:64, :72]
@@ -333,20 +309,14 @@ def hump() -> tuple[Array, Array, Array]:
     return synthetic_image(blob.displacement, beam), blob.potential, is_object
 
 
-def the_masks(tool: Any) -> Any:
+def the_masks(tool):
     """Return the object with the masks of a run."""
     job = tool.request()
     return job if tool.shots.is_stack else job.shot
 
 
 @pytest.mark.parametrize("is_stack", [False, True])
-def test_both_masks_can_be_chosen(
-    viewer: ViewerModel,
-    opened: Any,
-    hump: tuple[Array, Array, Array],
-    is_stack: bool,
-    tmp_path: Path,
-) -> None:
+def test_both_masks_can_be_chosen(viewer, opened, hump, is_stack, tmp_path):
     shot, _, is_object = hump
     viewer.add_image(np.stack([shot, shot]) if is_stack else shot, name="shot")
     tool = opened(Invert)
@@ -370,13 +340,7 @@ def test_both_masks_can_be_chosen(
     assert the_masks(tool).source_mask is None
 
 
-def test_a_mask_over_the_object_is_refused(
-    viewer: ViewerModel,
-    opened: Any,
-    hump: tuple[Array, Array, Array],
-    qtbot: Any,
-    messages: list[str],
-) -> None:
+def test_a_mask_over_the_object_is_refused(viewer, opened, hump, qtbot, messages):
     shot, _, is_object = hump
     image = viewer.add_image(shot, name="shot")
     labels = viewer.add_labels(is_object.astype(int), name="object")
@@ -410,9 +374,7 @@ def test_a_mask_over_the_object_is_refused(
 # What is said of a run
 
 
-def test_a_result_says_where_everything_came_from(
-    viewer: ViewerModel, opened: Any, of_a_file: Any, run: Any
-) -> None:
+def test_a_result_says_where_everything_came_from(viewer, opened, of_a_file, run):
     tool = opened(Invert)
     tool.options.restore({"n_sites": 300})
     tool.source.set_kind("polynomial")
@@ -434,12 +396,12 @@ def test_a_result_says_where_everything_came_from(
 
 
 def test_the_report_of_one_run_does_not_stand_beside_another(
-    opened: Any, plain: Any, of_a_file: Any, run: Any, qtbot: Any, messages: list[str]
-) -> None:
+    opened, plain, of_a_file, run, qtbot, messages
+):
     tool = opened(Invert)
     tool.options.restore({"n_sites": 300})
 
-    def rerun() -> None:
+    def rerun():
         run(tool)
         assert texts_of(tool.report)["Flux residual"].endswith("converged")
 
@@ -474,8 +436,8 @@ def test_the_report_of_one_run_does_not_stand_beside_another(
 
 
 def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
-    viewer: ViewerModel, opened: Any, solved: Inversion, proton_setup: ProtonSetup, qtbot: Any
-) -> None:
+    viewer, opened, solved, proton_setup, qtbot
+):
     tool = opened(Simulate)
     assert tool.setup.setup() == ProtonSetup.example()
     assert tool.setup.note.text() == "Example from the paper."
@@ -503,16 +465,14 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
 @pytest.mark.parametrize("kind", [FitImages, Invert, Simulate])
 @pytest.mark.parametrize("value", [7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}])
 def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
-    viewer: ViewerModel, opened: Any, kind: Any, value: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    viewer, opened, kind, value, monkeypatch
+):
     parts = opened(kind).state()
     monkeypatch.setattr(_qt, "saved_state", lambda name: dict.fromkeys(parts, value))
     assert opened(kind).state().keys() == parts.keys()
 
 
-def test_a_part_of_another_form_leaves_the_other_parts_restored(
-    viewer: ViewerModel, opened: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_part_of_another_form_leaves_the_other_parts_restored(viewer, opened, monkeypatch):
     first = opened(Invert)
     first.options.restore({"n_sites": 777})
     saved = {**first.state(), "source": {"values": 5}, "steps": 3}

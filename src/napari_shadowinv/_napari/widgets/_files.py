@@ -92,7 +92,7 @@ class _Repetition(Job):
     def show(self, viewer: Any) -> None:
         """Add the layers of the repeated result, and report the difference."""
         assert self.again is not None
-        repeated = about.Result(self.again.content, self.result.setup, self.result.origins)
+        repeated = about.Result(self.again.content, self.result.origins)
         add_layers(viewer, about.main_layers(layers_of_result(repeated, self.frame, self.name)))
         changes = "; ".join(self.again.changes) or "nothing"
         show_info(f"Difference: {self.again.difference}. Changed: {changes}")
@@ -261,7 +261,7 @@ def result_to_save(viewer: Any, layer: Any) -> Savable:
     if result is not None:
         layers = [each for each in viewer.layers if about.result_of(each) is result]
         content = dataset_to_save([each.as_layer_data_tuple() for each in layers])
-        name, kind, setup = name_of_result(layer), result.content.kind, result.setup
+        name, kind, setup = name_of_result(layer), result.content.kind, result.content.setup
     else:
         index, shots = plane_in_view(viewer, layer), facts.get("shots", ())
         content = shot_of_store(Path(facts["store"]), index)

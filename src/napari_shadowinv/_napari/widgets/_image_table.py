@@ -13,8 +13,8 @@ from qtpy.QtWidgets import QHeaderView, QTableWidget, QTableWidgetItem
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.form import PROBLEM_COLOUR
+from napari_shadowinv._napari.layer_metadata import kind_of
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import number_in_unit, text_in_unit
 from napari_shadowinv.physics.setup import SETUPS

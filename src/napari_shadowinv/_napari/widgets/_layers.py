@@ -14,6 +14,7 @@ from qtpy.QtWidgets import QCheckBox, QWidget
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.form import SteadyComboBox, labelled
 from napari_shadowinv._napari.jobs import name_of_result
+from napari_shadowinv._napari.layer_metadata import data_of, kind_of
 from napari_shadowinv._napari.placement import labels_on, mapped, matrix_between
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._system.arrays import complete_block_means, join_masks
@@ -24,12 +25,6 @@ from napari_shadowinv.facts import percent
 from napari_shadowinv.io.formats import SCAN_SUFFIXES
 from napari_shadowinv.io.images import film_cautions
 from napari_shadowinv.preprocessing import Crop
-
-
-def kind_of(layer: Any) -> str:
-    """Return a layer's type, such as ``"image"`` or ``"labels"``."""
-    # Not by type(): a widget may get a proxy, whose class is its content's only here.
-    return str(layer.__class__.__name__).lower()
 
 
 def image_of(layer: Any, role: str = "image") -> Any:
@@ -61,15 +56,11 @@ def stack_of(layer: Any) -> Any:
 
 def shown_plane(layer: Any, point: Any) -> Any:
     """Return the plane of an image or stack at a viewer's ``dims.point``."""
-    data = _data_of(layer)
+    data = data_of(layer)
     if data.ndim == 2:
         return data
     at = np.round(layer.world_to_data(point[-layer.ndim :])[:-2]).astype(int)
     return data[tuple(np.clip(at, 0, np.array(data.shape[:-2]) - 1))]
-
-
-def _data_of(layer: Any) -> Any:
-    return layer.data[0] if getattr(layer, "multiscale", False) else layer.data
 
 
 def _grey(layer: Any | None, role: str) -> Any:
@@ -85,7 +76,7 @@ def _grey(layer: Any | None, role: str) -> Any:
             "pack); if it is linear in fluence, split it (right click on the layer → Split RGB) "
             "and choose one channel"
         )
-    return _data_of(layer)
+    return data_of(layer)
 
 
 def cautions_of(layer: Any) -> tuple[Caution, ...]:
@@ -132,7 +123,7 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
 
 
 def _pixels_in_shapes(layer: Any, image: Any) -> BoolArray:
-    shape = tuple(_data_of(image).shape[-2:])
+    shape = tuple(data_of(image).shape[-2:])
     if not len(layer.data):
         return np.zeros(shape, np.bool_)
     on_pixels = Shapes(_corners_in_pixels(layer, image), shape_type=list(layer.shape_type))
@@ -279,8 +270,8 @@ class LayerPicker(SteadyComboBox):
         if self.layer is not before:
             self.picked.emit()
 
-    def _on_edit(self, layer: Any) -> None:
-        if layer is self.layer:
+    def _on_edit(self, event: Any) -> None:
+        if event.source is self.layer:
             self.edited.emit()
 
 
@@ -307,7 +298,7 @@ def likely_beam(image: Any, offered: Sequence[Any], *, estimates: bool = False) 
         and not (about.belongs_to_result(layer) or layer.rgb)
         and (estimates or not about.is_estimate(layer))
         and layer.ndim == 2
-        and layer.data.shape == tuple(_data_of(image).shape[-2:])
+        and layer.data.shape == tuple(data_of(image).shape[-2:])
         and not _has_word(layer, _DARK_NAME)
         # 'shot high-pass' is a filtered copy, while napari itself adds ' [1]'.
         and (_is_beam(layer) or not re.match(rf"{re.escape(image.name)} [^\[]", layer.name))

@@ -25,7 +25,6 @@ from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._results import LastResults, ResultLayers, place_inputs
 from napari_shadowinv.cautions import CAUTION_CODES
 from napari_shadowinv.facts import Fact, Headline, Level
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.preprocessing import Recipe
 
 Rows = Sequence[tuple[str, str]]  # of a report: names and values
@@ -320,8 +319,6 @@ class ResultView(QtWidgets.QWidget):
 
     def _show(self, result: Result[Any], facts: Sequence[Fact] | None = None) -> Headline:
         self._result, content, origins = result, result.content, result.origins.items()
-        if isinstance(content, Inversion):
-            content = content.in_units(result.setup)
         facts, said = facts or content.facts, self._said()
         self.verdict.show_headline(content.headline)
         warnings = [row for row in warning_rows(facts) if row not in origins and row[1] not in said]
@@ -340,7 +337,7 @@ class ResultView(QtWidgets.QWidget):
         job = self._tool.panel.tag
         if isinstance(job, FitJob):
             start = time.perf_counter()
-            self.curve.show_steps(list(job.progress.history))
+            self.curve.show_steps(list(job.history))
             # A slow screen must not delay the fit and the window.
             elapsed_ms = 1000 * (time.perf_counter() - start)
             self._redraw_timer.setInterval(max(_REDRAW_MS, round(_MIN_REDRAW_RATIO * elapsed_ms)))
@@ -348,4 +345,4 @@ class ResultView(QtWidgets.QWidget):
     def _on_end(self, outcome: Any) -> None:
         self._redraw_timer.stop()
         if isinstance(outcome.tag, FitJob):
-            self.curve.show_steps(list(outcome.tag.progress.history))
+            self.curve.show_steps(list(outcome.tag.history))

@@ -18,7 +18,6 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job, name_of_result
 from napari_shadowinv._napari.layers import LayerData, add_layers
 from napari_shadowinv._napari.placement import mapped, matrix_between
-from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes
@@ -75,8 +74,7 @@ class ProductJob(Job):
             stack = open_shots(self.origin, self.shots)
             seconds = _seconds(self.times, stack["index"].values.tolist())
             return analyse_shots(stack, self.product, seconds, **common)
-        choices = {"samples": self.samples, "setup": self.origin.setup, **common}
-        return analyse(self.origin.content, self.product, **choices)
+        return analyse(self.origin.content, self.product, samples=self.samples, **common)
 
     def layers(self, content: list[ProductResult]) -> LayerData:
         """Describe the maps, on top of the result."""
@@ -188,7 +186,9 @@ class ProductForm(ToolPanel):
             tip = "Only for a single result; of a store, export a table or save a figure."
         self.save.setToolTip(f"<qt>{tip}</qt>")
         result = None if layer is None else about.result_of(layer)
-        setup = about.setup_of(layer) if is_store else None if result is None else result.setup
+        setup = (
+            about.setup_of(layer) if is_store else None if result is None else result.content.setup
+        )
         fields = {"displacement"} if setup is None else {each.name for each in setup.si_fields}
         symbols = [s for s, unit in FIELD_UNITS.items() if unit.field in fields | {"displacement"}]
         before = self.unit.currentText()
@@ -305,10 +305,7 @@ class ProductForm(ToolPanel):
     def _save(self) -> None:
         result: Any = self._origin
         if path := qt.ask_file(self, "Save with result", "products", qt.RESULT_FILES):
-            content = result.content
-            if result.setup is not None and content.setup is None:
-                content = content.in_units(result.setup)
-            dataset = add_products(content.to_dataset(), self.measured)
+            dataset = add_products(result.content.to_dataset(), self.measured)
             show_info(f"Wrote {write(path, dataset, overwrite=True)}")
 
 
@@ -375,7 +372,7 @@ def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:
     return {"path": [tuple(map(float, point)) for point in points]}
 
 
-_MAP = about.Kind("product", "", "{title} ({unit})", visible=True)
+_MAP = about.Kind("product", "", "{title} ({unit})", colormap="signed", visible=True)
 
 
 def map_layer(measured: ProductResult, name: str, layer: Any) -> Any:
@@ -384,9 +381,6 @@ def map_layer(measured: ProductResult, name: str, layer: Any) -> Any:
     largest = float(np.nanpercentile(np.abs(values), 99.8)) or 1.0
     factor, prefix = prefix_for(largest)
     unit = f"{prefix}{measured.variables[name].unit}"
-    look = {
-        "colormap": colour_map("signed"),
-        "contrast_limits": (-factor * largest, factor * largest),
-    }
+    look = {"contrast_limits": (-factor * largest, factor * largest)}
     words, name = {"title": measured.title, "unit": unit}, name_of_result(layer)
     return _MAP.layer(factor * values, name, about.frame_of(layer), None, look, words=words)

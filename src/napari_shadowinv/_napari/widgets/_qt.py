@@ -28,8 +28,13 @@ from qtpy.QtWidgets import (
     QWidget,
 )
 
-from napari_shadowinv._napari.events import Callback, connect, connect_layers
-from napari_shadowinv._napari.viewer_sync import USER_ERRORS, error_text, show_user_error
+from napari_shadowinv._napari.viewer_sync import (
+    USER_ERRORS,
+    connect,
+    connect_layers,
+    error_text,
+    show_user_error,
+)
 from napari_shadowinv.io import replacing
 from napari_shadowinv.io.formats import RESULT, SITES
 
@@ -39,7 +44,6 @@ COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _WIDTH_PX = 330  # of a panel
 _CURVE_HEIGHT_PX = 210
 _LEGEND_CHARACTERS, _HANDLE_CHARACTERS = 56, 5  # of a row above a plot
-_CONSTANT_STAGES = ("samples",)  # do not change the objective
 # napari's docks, which users expect to see next to a plugin's.
 _NAPARI_DOCKS = {"layer list", "layer controls", "console"}
 # Garbage collection of a widget would clear a function that only the widget holds before Qt
@@ -159,13 +163,15 @@ def when_destroyed(owner: QObject, action: Callable[[], Any]) -> None:
     owner.destroyed.connect(once)
 
 
-def while_alive(owner: QObject, model: Any, names: str | Sequence[str], method: Callback) -> None:
+def while_alive(
+    owner: QObject, model: Any, names: str | Sequence[str], method: Callable[[Any], Any]
+) -> None:
     """Connect a method to events of a layer or viewer during the life of a Qt object."""
     when_destroyed(owner, connect(model, names, method))
 
 
 def layers_while_alive(
-    owner: QObject, layers: Any, names: str | Sequence[str], method: Callback
+    owner: QObject, layers: Any, names: str | Sequence[str], method: Callable[[Any], Any]
 ) -> None:
     """Connect a method to events of all layers, also new ones, during the life of a Qt object."""
     when_destroyed(owner, connect_layers(layers, names, method))
@@ -386,7 +392,7 @@ class ObjectiveCurve(Plot):
 
     def show_steps(self, history: Sequence[tuple[str, float]]) -> None:
         """Draw the objective at each step; do nothing without new steps."""
-        steps = [step for step in history if step[0] not in _CONSTANT_STAGES]
+        steps = [step for step in history if np.isfinite(step[1])]  # samples have no objective
         if len(steps) == self._shown:
             return
         self._shown = len(steps)
@@ -396,7 +402,7 @@ class ObjectiveCurve(Plot):
             return
         self.show_drawing(lambda axes: self._draw(axes[0], steps, drawable))
 
-    def _draw(self, axis: Any, steps: list[tuple[str, float]], drawable: Any) -> None:
+    def _draw(self, axis: Any, steps: Sequence[tuple[str, float]], drawable: Any) -> None:
         colours: dict[str, str] = {}
         begin = 0
         for stage, group in groupby(steps, key=lambda step: step[0]):

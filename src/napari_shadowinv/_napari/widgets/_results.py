@@ -13,8 +13,8 @@ from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import ImageJob
+from napari_shadowinv._napari.layer_metadata import kind_of
 from napari_shadowinv._napari.layers import FullLayerData, LayerData, add_layers
-from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._qt import timer
 from napari_shadowinv.preprocessing import Recipe
 

@@ -86,8 +86,8 @@ class _ShotChoice(layers.LayerPicker):
                 best = layer
         return best
 
-    def _on_insertion(self, new: Any) -> None:
-        current = self.layer
+    def _on_insertion(self, event: Any) -> None:
+        current, new = self.layer, event.value
         if self.is_chosen or current is None or new is current or new not in self.offered:
             return
         if self._is_better(new, current):

@@ -15,13 +15,12 @@ from numpy.typing import ArrayLike
 from qtpy.QtWidgets import QLabel, QWidget
 
 from napari_shadowinv._napari.jobs import Job
-from napari_shadowinv._napari.layer_metadata import layer_key, main_layers, role_of
+from napari_shadowinv._napari.layer_metadata import kind_of, layer_key, main_layers, role_of
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.run import Outcome
 from napari_shadowinv._napari.stores import follow_shots, shot_rows, store_layers
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._layers import kind_of
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together, result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
 from napari_shadowinv._typing import BoolArray

@@ -11,11 +11,11 @@ from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt
 
 from napari_shadowinv._napari import form as forms
-from napari_shadowinv._napari.layer_metadata import role_of, unit_of
+from napari_shadowinv._napari.layer_metadata import kind_of, role_of, unit_of
 from napari_shadowinv._napari.placement import pixel_mapper
 from napari_shadowinv._napari.widgets import _products as products
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._layers import LayerPicker, kind_of, new_shapes, shown_plane
+from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes, shown_plane
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.paths import (
     Profile,
@@ -195,8 +195,8 @@ class Analyse(qt.Docked):
         if not self._timer.isActive():
             self._timer.start()
 
-    def _on_layer(self, changed: Any) -> None:
-        if any(changed is layer for layer in (self.lines.layer, *self.checked())):
+    def _on_layer(self, event: Any) -> None:
+        if any(event.source is layer for layer in (self.lines.layer, *self.checked())):
             self._schedule_plot()
 
     def _fill(self, _: Any = None) -> None:

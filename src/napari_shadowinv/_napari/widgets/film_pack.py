@@ -28,10 +28,11 @@ from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import checked_corners
-from napari_shadowinv.film_doses import FilmDoses
+from napari_shadowinv.film_doses import FilmDoses, Spectrum
 from napari_shadowinv.io import write
 from napari_shadowinv.io.images import read_scan
 from napari_shadowinv.pipeline import read_pack, write_layers
+from napari_shadowinv.pipeline.film_files import copy_corrections
 
 _SETTLE_MS = 60
 _MIN_MOVE_PX = 0.01  # napari rounds coordinates
@@ -165,7 +166,7 @@ _PLOT_HEIGHT_PX = 260
 _BRUSH_PX = 10
 
 
-def draw_spectrum(axes: Any, spectrum: packs.Spectrum, where: str, ink: str) -> None:
+def draw_spectrum(axes: Any, spectrum: Spectrum, where: str, ink: str) -> None:
     """Draw the mean fluence against energy."""
     style = {"fmt": "o-", "color": qt.COLOURS[0], "markersize": 4, "capsize": 2}
     axes.errorbar(spectrum.energies, spectrum.fluence, spectrum.error, **style)
@@ -221,7 +222,7 @@ class FilmPack(panels.ToolPanel):
             about.may_be_mask,
             kinds=("shapes", "labels"),
         )
-        self.spectrum: packs.Spectrum | None = None  # shown
+        self.spectrum: Spectrum | None = None  # shown
         self.plot = qt.Plot(_PLOT_HEIGHT_PX, fixed=True)
         self.plot.setToolTip(
             "<qt>Mean fluence of each film. Error bars are the median standard deviation of a "
@@ -349,7 +350,7 @@ class FilmPack(panels.ToolPanel):
             self.show_problem(str(error))
             return
         where = "of the whole film" if region is None else "in the region"
-        spectrum = self.spectrum = packs.spectrum_in(doses, region)
+        spectrum = self.spectrum = doses.spectrum(region)
         self.plot.show_drawing(lambda axes: draw_spectrum(axes[0], spectrum, where, self.plot.ink))
 
     @qt.notify_errors
@@ -405,8 +406,8 @@ class FilmPack(panels.ToolPanel):
         layer, doses = self._selected()
         if path := qt.ask_file(self, "Save the result", "pack", qt.RESULT_FILES):
             result: Any = about.result_of(layer)
-            doses = packs.copy_edits(doses, self._scratch, path)
-            saved = about.Result(doses, result.setup, result.origins)
+            doses = copy_corrections(doses, self._scratch, path)
+            saved = about.Result(doses, result.origins)
             layers = about.layers_of(self.viewer, layer)
             dataset = dataset_of_layers([each.as_layer_data_tuple() for each in layers], saved)
             show_info(f"Wrote {write(path, dataset, overwrite=True)}")

@@ -11,7 +11,6 @@ import numpy as np
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.costs import fit_cost
 from napari_shadowinv._napari.jobs import Finished, FitJob, name_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.run import Run
@@ -33,6 +32,7 @@ from napari_shadowinv.fitting import Fit, point_spread
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
+from napari_shadowinv.pipeline.costs import fit_cost
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.preprocessing import FIT_STEPS, MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.shot import Shot

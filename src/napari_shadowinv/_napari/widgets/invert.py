@@ -12,7 +12,6 @@ from qtpy.QtWidgets import QCheckBox
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.costs import inversion_cost
 from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.run import Outcome, Run
 from napari_shadowinv._napari.shots import shot_of_layer
@@ -37,6 +36,7 @@ from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.pipeline import Cache
+from napari_shadowinv.pipeline.costs import inversion_cost
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 from napari_shadowinv.preprocessing import Crop, Estimate, Recipe, Step
 from napari_shadowinv.preprocessing.estimates import LowPassEstimate, TotalVariationEstimate

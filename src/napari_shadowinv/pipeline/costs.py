@@ -1,7 +1,6 @@
-"""Time and memory of a run, estimated before it, and the stages of a fit as they pass.
+"""Time and memory of a run, estimated before it.
 
 - the cost of an inversion: `inversion_cost`; of a fit: `fit_cost`
-- the course of a fit: `FitProgress`
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from napari_shadowinv._system.machine import physical_memory
-from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.options import MAX_DEFAULT_SITES, FitChoices, Instrument, InversionOptions
 
 # Twice what two fast cores take for two to four images of 64² to 400² px without crossing rays.
@@ -30,11 +28,6 @@ _SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
 _BYTES, _BYTES_PER_PIXEL, _BYTES_PER_SITE = 200e6, 280.0, 1700.0
 _MIN_PIXELS_FOR_ESTIMATE = 1_000_000
 _MINUTE_S, _HOUR_S = 60, 3600
-
-_STAGES = ("starts", "smoothness", "full size and error bars")
-_STAGE_NUMBERS = {"smoothness": 1} | dict.fromkeys(
-    ("other starts", "full size", "point spread", "rivals", "samples", "evidence"), 2
-)
 
 
 @dataclass(frozen=True)
@@ -102,24 +95,3 @@ def _in_words(seconds: float) -> str:
     if seconds < 2 * _HOUR_S:
         return f"{seconds / _MINUTE_S:.0f} min"
     return f"{seconds / _HOUR_S:.1f} h"
-
-
-class FitProgress:
-    """Converts messages of a fit to its stages, and records its objectives."""
-
-    def __init__(self) -> None:
-        self.history: list[tuple[str, float]] = []
-        self._stage, self._objective = 0, float("nan")
-
-    def update(self, progress: Progress) -> Progress:
-        """Return the progress of the fit, with the number of its stage and its name."""
-        if progress.stage != "fit" or progress.objective is None:
-            return progress
-        name, value = progress.message, progress.objective
-        self.history.append((name, value))
-        if name != "samples":  # drawn in larger pixels, whose objective is another
-            self._objective = value
-        self._stage = max(self._stage, _STAGE_NUMBERS.get(name, 0))
-        title = _STAGES[self._stage] + (f" ({name})" if self._stage == 0 else "")
-        message = f"stage {self._stage + 1} of {len(_STAGES)}, {title}"
-        return Progress(progress.stage, self._stage, len(_STAGES), message, self._objective)

@@ -1,56 +1,12 @@
-"""Time and memory of runs, estimated before them, and the stages of a fit while it runs."""
+"""Time and memory of runs, estimated before them."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from napari_shadowinv import InversionOptions, fit
-from napari_shadowinv._napari.costs import FitProgress, fit_cost, inversion_cost
-from napari_shadowinv._system.progress import Progress
+from napari_shadowinv import InversionOptions
 from napari_shadowinv.options import FitChoices, FitOptions, Instrument
-from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.shot import shots_of
-
-
-def test_the_bar_never_goes_back_and_names_the_stages() -> None:
-    truth = gaussian_blob((48, 48), 15.0, 8.0).displacement
-    progress = FitProgress()
-    reports: list[Progress] = []
-    fit(
-        shots_of(
-            [synthetic_image(truth), synthetic_image(0.6 * truth)], strength=[1, 0.6], noise=0.02
-        ),
-        options=FitOptions(samples=2),
-        on_progress=lambda report: reports.append(progress.update(report)),
-    )
-    reports = [report for report in reports if report.stage != "compile"]
-    shares = [report.step / report.total for report in reports if report.total]
-    assert len(shares) == len(reports)
-    assert shares == sorted(shares)
-    stages = dict.fromkeys(report.message.partition(" (")[0] for report in reports)
-    assert list(stages) == [
-        "stage 1 of 3, starts",
-        "stage 2 of 3, smoothness",
-        "stage 3 of 3, full size and error bars",
-    ]
-    assert "starts (transport)" in reports[0].message
-    assert not any("nan" in report.text for report in reports)
-
-
-def test_other_progress_is_passed_on() -> None:
-    progress = FitProgress()
-    compiling = Progress("compile", 1, None, "once")
-    assert progress.update(compiling) is compiling
-    assert progress.history == []
-
-
-def test_samples_beside_the_fit_do_not_change_the_objective_shown() -> None:
-    progress = FitProgress()
-    steps = [("smoothness", 20.0), ("samples", 20.0), ("full size", 81.0), ("samples", 20.0)]
-    shown = [progress.update(Progress("fit", 1, None, *step)).objective for step in steps]
-    assert shown == [20, 20, 81, 81]
-    assert progress.history == steps
+from napari_shadowinv.pipeline.costs import fit_cost, inversion_cost
 
 
 def test_a_forecast_grows_with_what_is_asked_for() -> None:
