@@ -143,13 +143,19 @@ def add_layers(
     for layer in added:
         index = len(viewer.layers) if below is None else viewer.layers.index(below)
         viewer.layers.insert(index, layer)
-    for layer in added:
-        if role_of(layer) in ("field", "fluence"):
-            # The status line then shows the value below the mouse.
-            viewer.layers.selection.active = layer
+    present(viewer, added)
+    return added
+
+
+def present(viewer: Any, layers: Sequence[Any]) -> None:
+    """Show the scale bar and the colour bar for new layers, and select a visible field of them."""
+    fields = [layer for layer in layers if role_of(layer) in ("field", "fluence")]
+    if fields:
+        # The status line then shows the value below the mouse.
+        topmost = reversed(fields)
+        viewer.layers.selection.active = max(topmost, key=lambda layer: bool(layer.visible))
     show_scale_bar(viewer)
     connect_viewer(viewer)
-    return added
 
 
 def field_layers(result: Result[RetrievedField], frame: Frame, name: str = "") -> LayerData:

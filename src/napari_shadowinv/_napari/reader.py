@@ -12,7 +12,6 @@ from napari_shadowinv._napari.viewer_sync import (
     notify_errors,
     once_added,
     show_caution,
-    show_scale_bar,
 )
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
@@ -121,6 +120,7 @@ def _read_content(path: Path, array: str) -> list[Any]:
 
 def _show_in_window(layers: Sequence[Any]) -> None:
     """In a window, show an opened result with its bars, and select its field."""
+    from napari_shadowinv._napari.layers import present
     from napari_shadowinv._napari.stores import follow_shots, viewer_in_window
 
     viewer = viewer_in_window()
@@ -128,15 +128,11 @@ def _show_in_window(layers: Sequence[Any]) -> None:
         return
 
     def show(added: list[Any]) -> None:
-        show_scale_bar(viewer)
-        present = [layer for layer in added if layer in viewer.layers]
-        fields = [layer for layer in present if role_of(layer) == "field"]
-        for layer in present:
+        kept = [layer for layer in added if layer in viewer.layers]
+        for layer in kept:
             if role_of(layer) == "arrows" and "store" in metadata_of(layer):
                 follow_shots(viewer, layer)
-        if fields:
-            shown = [layer for layer in fields if layer.visible]
-            viewer.layers.selection.active = (shown or fields)[-1]
+        present(viewer, kept)
 
     connect_viewer(viewer)
     once_added(viewer, len(layers), show)

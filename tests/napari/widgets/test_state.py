@@ -463,13 +463,11 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
 
 
 @pytest.mark.parametrize("kind", [FitImages, Invert, Simulate])
-@pytest.mark.parametrize("value", [7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}])
-def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(
-    viewer, opened, kind, value, monkeypatch
-):
+def test_a_saved_state_of_another_form_keeps_no_widget_from_opening(opened, kind, monkeypatch):
     parts = opened(kind).state()
-    monkeypatch.setattr(_qt, "saved_state", lambda name: dict.fromkeys(parts, value))
-    assert opened(kind).state().keys() == parts.keys()
+    for value in (7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}):
+        monkeypatch.setattr(_qt, "saved_state", lambda _: dict.fromkeys(parts, value))  # noqa: B023
+        assert opened(kind).state().keys() == parts.keys()
 
 
 def test_a_part_of_another_form_leaves_the_other_parts_restored(viewer, opened, monkeypatch):
