@@ -256,7 +256,8 @@ def _error_clause(mistake: _Mistake, names: Mapping[str, str]) -> str:
         key, words = _BOUNDS[kind]
         return f"{received}: {title} must be {words} {context[key]:g}"
     if message.startswith(opening := "Input should be "):
-        return f"{received}: {title} must be {message.removeprefix(opening)}"
+        kinds = message.removeprefix(opening).partition(", unable to")[0]
+        return f"{received}: {title} must be {kinds}"
     return f"{received}: {lower_first(message)}"
 
 
