@@ -159,12 +159,11 @@ def stack_window(folder: Path) -> None:
     viewer.add_image(reference, name="reference", visible=False)
     viewer.add_image(np.stack(shots), name="burner", axis_labels=("shot", "y", "x"))
     widget = open_widget(viewer, "Invert")
-    widget.source.set_kind("layer")
-    widget.source.layers.layer = viewer.layers["reference"]
+    widget.source.layer = viewer.layers["reference"]
     widget.steps.add("hot-pixels")
     widget.steps.folded.expand()
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
-        widget.store.folder.edit.setText("burner.shadowinv.zarr")
+        widget.store.folder.restore({"path": "burner.shadowinv.zarr"})
         press_run(widget)
         viewer.dims.set_current_step(0, SHOWN)
         photograph(viewer, "napari-stack.png")
@@ -200,10 +199,10 @@ def proton_windows() -> None:
         viewer = new_window("proton radiograph")
         viewer.open(["shot.tif", "reference.tif"])
         tool = open_widget(viewer, "Invert")
-        tool.setup.picker.set_kind("proton")
-        fields = tool.setup.picker.form
+        tool.setup.set_kind("proton")
+        fields = tool.setup.form
         fields.restore(PROTON_FIELDS)
-        tool.setup.picker.changed.emit()
+        tool.setup.changed.emit()
         photograph(viewer, "tutorial-proton-setup.png", close=False)
         press_run(tool)
         viewer.layers["✓ caustics – shot"].visible = True
@@ -234,7 +233,7 @@ def night_window() -> None:
     tool = open_widget(viewer, "Invert")
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
         tool.steps.add("high-pass")
-        tool.store.folder.edit.setText("night.shadowinv.zarr")
+        tool.store.folder.restore({"path": "night.shadowinv.zarr"})
         press_run(tool)
         print(tool.panel.status.text(), [layer.name for layer in viewer.layers])
         viewer.dims.set_current_step(0, 10)
@@ -282,7 +281,7 @@ def fit_window() -> None:
         viewer.add_image(counts.astype(float), name=name, metadata=metadata)
     widget = open_widget(viewer, "Fit several images")
     widget.source.set_kind("unknown")
-    widget.noise.set_kind("poisson")
+    widget.choices.restore({"noise": "poisson"})
     press_run(widget)
     print(widget.view.verdict.text())
     photograph(viewer, "napari-fit.png")
@@ -297,7 +296,7 @@ def film_window() -> None:
         truth = simulate(Path("eight-films"))
         viewer = new_window("film pack", height=840)
         widget = open_widget(viewer, "Film pack")
-        widget.path.edit.setText(str(truth.pack))
+        widget.file.restore({"file": str(truth.pack)})
         press_run(widget)
         viewer.dims.set_current_step(0, 4)
         widget._draw_region()
@@ -317,7 +316,7 @@ def real_film_windows(data: Path) -> None:
         pack = pack_of_page(folder, data)
         viewer = new_window("seventeen films", height=840)
         widget = open_widget(viewer, "Film pack")
-        widget.path.edit.setText(str(pack))
+        widget.file.restore({"file": str(pack)})
         press_run(widget)
         viewer.dims.set_current_step(0, 6)
         viewer.layers.selection.active = widget.packs.layer
@@ -333,7 +332,7 @@ def two_energies_window() -> None:
     viewer.open_sample(PLUGIN, "two_energies")
     widget = open_widget(viewer, "Fit several images")
     widget.source.set_kind("unknown")
-    widget.noise.set_kind("poisson")
+    widget.choices.restore({"noise": "poisson"})
     press_run(widget)
     print(widget.view.verdict.text())
     widget.area.verticalScrollBar().setValue(0)

@@ -98,7 +98,7 @@ def test_the_recipe_of_the_first_shadowgram_repeats_its_report(make_napari_viewe
     viewer = make_napari_viewer()
     viewer.open_sample("napari-shadowinv", "toroid")
     tool = Invert(viewer)
-    assert tool.source.choice.currentText() == "supplied with the shot"
+    assert tool.source.choice.current_choice == "supplied with the shot"
     tool.recipes.save(Path("recipe.toml"))
     viewer.layers["toroid"].save("toroid.tif")
     page = text_of("docs/tutorials/first-shadowgram.md")

@@ -4,7 +4,6 @@ A form holds what the user stated, and the model reads it; grey text shows the d
 
 - the entry of a field: `Entry`; the entries of a model: `ModelForm`
 - one of several models: `ModelPicker`; a list of them: `StepsSection`
-- the path of a file: `PathEdit`
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from magicgui import widgets as magic
 from pydantic import BaseModel
@@ -137,45 +136,15 @@ class SavedLine(QtWidgets.QLineEdit):
         self.setText(str(text))
 
 
-def _ask_for_file(edit: PathEdit) -> str:
-    return str(QtWidgets.QFileDialog.getOpenFileName(edit, edit.title, "", edit.files)[0])
-
-
-class PathEdit(QtWidgets.QWidget):
-    """An entry of a path; `ask` opens its dialog, and returns an empty string if cancelled."""
-
-    changed = Signal()
-
-    def __init__(
-        self,
-        title: str,
-        example: str = "path of a file",
-        tip: str = "",
-        files: str = "",
-        ask: Callable[[PathEdit], str] = _ask_for_file,
-    ) -> None:
-        super().__init__()
-        self.title, self.files, self._ask = title, files, ask
-        self.edit = SavedLine(example, tip)
-        self.edit.setMinimumWidth(60)
-        qt.side_by_side((qt.with_button(self.edit, "…", title, self.choose), 0), holder=self)
-        self.edit.editingFinished.connect(self.changed)
-
-    @property
-    def path(self) -> str:
-        return str(self.edit.text()).strip()
-
-    def state(self) -> str:
-        return self.path
-
-    def restore(self, path: Any) -> None:
-        self.edit.setText(str(path))
-
-    def choose(self) -> None:
-        path = self._ask(self)
-        if path:
-            self.edit.setText(path)
-            self.changed.emit()
+# Dialogs of Qt for the path of a field, by the field's ``path``.
+_DIALOGS = {
+    "file": "getOpenFileName",
+    "files": "getOpenFileNames",
+    "folder": "getExistingDirectory",
+    "new": "getSaveFileName",
+}
+PATH_SEPARATOR = "; "
+"""Between several files in one entry."""
 
 
 class Entry:
@@ -189,6 +158,9 @@ class Entry:
         self._unit = unit_in_title(field.title)
         self._default = self._plain(default)
         self._kinds = _kinds_in(field.annotation)
+        extra = field.json_schema_extra
+        self._extra: Mapping[str, Any] = extra if isinstance(extra, dict) else {}
+        self._dialog = str(self._extra.get("path", "file" if Path in self._kinds else ""))
         self.widget = self._make(str(field.title))
         self._stated: Any = None
         self._entry = self.line.value
@@ -245,8 +217,7 @@ class Entry:
         return isinstance(self.line, magic.LineEdit)
 
     def _make(self, title: str) -> Any:
-        extra = self._field.json_schema_extra
-        ends = extra.get("slider") if isinstance(extra, dict) else None
+        ends = self._extra.get("slider")
         # Qt wraps rich text only.
         tip = f"<qt>{self._field.description}</qt>" if self._field.description else ""
         texts = {"label": title, "tooltip": tip}
@@ -267,34 +238,39 @@ class Entry:
         return widget
 
     def _make_line(self, texts: dict[str, str]) -> Any:
-        is_file, is_number = Path in self._kinds, bool(self._kinds & {int, float})
-        content = " or ".join(["a number"] * is_number + ["a file"] * is_file)
+        is_number = bool(self._kinds & {int, float})
+        words = ", ".join(_words_in(self._field.annotation))
+        kinds = {words: words, "a number": is_number, "a file": Path in self._kinds}
+        content = " or ".join(title for title, is_kind in kinds.items() if is_kind)
         content = f"in {self._unit}" if self._unit else content
         hint = content if self._field.is_required() else f"not set ({content})"
         if tuple in self._kinds:
             hint = "all, or a range such as 10:200"
         elif self._default is not None:
             hint = _text_of(self._default, self._unit) if is_number else str(self._default)
+        elif self._field.examples:
+            hint = str(self._field.examples[0])
         elif not content:
             hint = "default"
         line = magic.LineEdit(**texts)
         line.native.setPlaceholderText(hint)
         line.native.setMinimumWidth(_ENTRY_WIDTH_PX)
-        if not is_file:
+        if not self._dialog:
             return line
-        button = magic.PushButton(text="…", tooltip="Choose a file.")
+        button = magic.PushButton(text="…", tooltip="Choose a file or folder.")
         button.native.setMaximumWidth(30)
-        button.changed.connect(self._choose_file)
+        button.changed.connect(self.choose_path)
         row = magic.Container(widgets=[line, button], layout="horizontal", labels=False, **texts)
         row.margins = (0, 0, 0, 0)
         return row
 
-    def _choose_file(self) -> None:
-        path, _ = QtWidgets.QFileDialog.getOpenFileName(
-            self.line.native, self._field.title or "Choose a file"
-        )
-        if path:
-            self.line.value = path
+    def choose_path(self) -> None:
+        """Ask for the path of a file, of several or of a folder."""
+        ask = getattr(QtWidgets.QFileDialog, _DIALOGS[self._dialog])
+        answer = ask(self.line.native, str(self._field.title))
+        chosen = answer if isinstance(answer, str) else answer[0]
+        if chosen:
+            self.line.value = chosen if isinstance(chosen, str) else PATH_SEPARATOR.join(chosen)
             self._read()
 
     def _show_on_slider(self, value: Any) -> None:
@@ -321,9 +297,18 @@ class Entry:
 
 def _kinds_in(annotation: Any) -> set[Any]:
     """Return the types of a field without None."""
+    if get_origin(annotation) is Annotated:
+        return _kinds_in(get_args(annotation)[0])
     if get_origin(annotation) in (Union, types.UnionType):
         return set().union(*(_kinds_in(each) for each in get_args(annotation)))
     return set() if annotation is type(None) else {get_origin(annotation) or annotation}
+
+
+def _words_in(annotation: Any) -> tuple[str, ...]:
+    """Return the words among the types of a field."""
+    if get_origin(annotation) is Literal:
+        return get_args(annotation)
+    return tuple(word for each in get_args(annotation) for word in _words_in(each))
 
 
 def _choices_in(annotation: Any) -> tuple[Any, ...]:
@@ -435,46 +420,76 @@ def kinds_of(models: Mapping[str, Any]) -> Kinds:
     return {name: (model.title, model) for name, model in models.items()}
 
 
-class ModelPicker(QtWidgets.QWidget):
-    """A choice between kinds, each with its form or widget below, or with none."""
+class ModelPicker(QWidget):
+    """A choice between kinds, each with its form or widget below, or with none.
 
-    changed = Signal()
+    What the user has `chosen` stays selected while it is offered.
+    """
 
-    def __init__(self, label: str, kinds: Kinds, tip: str = "") -> None:
+    picked = Signal()  # another kind
+    changed = Signal()  # the kind, or an entry of its form
+
+    def __init__(self, label: str | None, kinds: Kinds, tip: str = "") -> None:
         super().__init__()
+        self._kinds = dict(kinds)
         self._rows = {kind: row for kind, (_, row) in kinds.items() if isinstance(row, QWidget)}
         self._forms: dict[str, ModelForm] = {}
-        self._wanted: str | None = None  # perhaps not offered at present
-        self.choice = SteadyComboBox(tip=tip)
-        qt.column(self, labelled(label, self.choice), *self._rows.values())
-        self.offer(kinds)
-        self.choice.currentIndexChanged.connect(self._on_choice)
-        self.choice.activated.connect(self._on_activation)
-        self._on_choice()
+        self.chosen: Any = None
+        tooltip = f"<qt>{tip}</qt>" if tip else ""
+        self.choice = magic.ComboBox(choices=(), tooltip=tooltip)
+        box = self.choice.native
+        steady(box)
+        self._line = qt.side_by_side((box, 1)) if label is None else labelled(label, box)
+        self._forms_column = qt.column(holder := QWidget(), *self._rows.values())
+        qt.column(self, self._line, holder)
+        self.fill()
+        self.choice.changed.connect(self._on_choice)
 
     @property
     def kind(self) -> str:
-        return str(self.choice.currentData())
-
-    def offer(self, kinds: Kinds) -> None:
-        """Replace the kinds; the chosen one stays, or comes back once it is offered again."""
-        self._kinds = dict(kinds)
-        with QSignalBlocker(self.choice):
-            self.choice.clear()
-            for key, (title, _) in kinds.items():
-                self.choice.addItem(title, key)
-            self.choice.setCurrentIndex(max(self.choice.findData(self._wanted), 0))
-
-    def set_kind(self, kind: str) -> None:
-        """Select a kind, now or once it is offered."""
-        self._wanted = kind
-        index = self.choice.findData(kind)
-        if index >= 0:
-            self.choice.setCurrentIndex(index)
+        return str(self.choice.value)
 
     @property
     def form(self) -> ModelForm | None:
         return self._forms.get(self.kind)
+
+    def add_button(self, text: str, tip: str, action: Callable[[], Any]) -> None:
+        """Put a small button on the right of the choice."""
+        self._line.layout().addWidget(qt.small_button(text, tip, action))
+
+    def offer(self, kinds: Kinds) -> None:
+        """Replace the kinds; the chosen one stays, or comes back once it is offered again."""
+        self._kinds = dict(kinds)
+        self.fill()
+
+    def fill(self, _: Any = None) -> None:
+        """Offer what there is now, and select what is preferred."""
+        before = self.choice.value
+        with self.choice.changed.blocked():
+            self.choice.choices = ()  # new entries would otherwise come last
+            self.choice.choices = self._choices
+            offered = self.choice.choices
+            preferred = [value for value in self._preferred(before) if value in offered]
+            if preferred:
+                self.choice.value = preferred[0]
+        if self.choice.value != before:
+            self._show()
+
+    def _choices(self, _: Any) -> list[tuple[str, Any]]:
+        return [entry for kind in self._kinds for entry in self._entries(kind)]
+
+    def _entries(self, kind: str) -> list[tuple[str, Any]]:
+        """Return titles and values of the entries that stand for a kind."""
+        return [(self._kinds[kind][0], kind)]
+
+    def _preferred(self, before: Any) -> Sequence[Any]:
+        """Return the values to select if they are offered, the best first."""
+        return self.chosen, before, *self._kinds
+
+    def set_kind(self, kind: Any) -> None:
+        """Choose a kind, now or once it is offered."""
+        self._remember(kind)
+        self.fill()
 
     def model(self) -> BaseModel | None:
         """Return the validated model of the selected kind; None without a form."""
@@ -491,13 +506,22 @@ class ModelPicker(QtWidgets.QWidget):
                 form.restore(values)
         self.set_kind(str(state.get("kind", self.kind)))
 
-    def _on_activation(self) -> None:
-        self._wanted = self.kind
+    def _remember(self, choice: Any) -> None:
+        self.chosen = choice
 
-    def _on_choice(self) -> None:
+    def _on_choice(self, value: Any) -> None:
+        self._remember(value)
+        self._show()
+
+    def _show(self) -> None:
+        """Show the form of another kind."""
         self._form_of(self.kind)
         for kind, widget in (*self._rows.items(), *self._forms.items()):
             widget.setVisible(kind == self.kind)
+        self.picked.emit()
+        self._on_entry()
+
+    def _on_entry(self) -> None:
         self.changed.emit()
 
     def _form_of(self, kind: str) -> ModelForm | None:
@@ -506,9 +530,9 @@ class ModelPicker(QtWidgets.QWidget):
             form = ModelForm(model_class)
             form.layout().setContentsMargins(INDENT, 0, 0, 0)
             form.setVisible(False)
-            form.changed.connect(self.changed)
+            form.changed.connect(self._on_entry)
             self._forms[kind] = form
-            self.layout().addWidget(form)
+            self._forms_column.addWidget(form)
         return self._forms.get(kind)
 
 

@@ -227,7 +227,7 @@ class Simulate(panels.ToolPanel):
         )
 
     def _connect(self) -> None:
-        self.object.choice.currentIndexChanged.connect(lambda _: self._on_object())
+        self.object.picked.connect(self._on_object)
         self.field.picked.connect(self._follow_layer)
         parts = (self.object, self.task, self.setup, self.instrument, self.options)
         for part in parts:
@@ -259,7 +259,7 @@ class Simulate(panels.ToolPanel):
         }
 
     def state(self) -> dict[str, Any]:
-        return {**super().state(), "setup": {**self.setup.state(), "kind": self.setup.picker.kind}}
+        return {**super().state(), "setup": {**self.setup.state(), "kind": self.setup.kind}}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)

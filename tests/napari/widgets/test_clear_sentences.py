@@ -87,10 +87,10 @@ def test_a_file_that_fails_is_not_shown_in_place_of_the_last_shot(
 ) -> None:
     tool = open_widget("Invert")
     tool.options.restore({"n_sites": 100})
-    tool.shots.set_kind("folder")
-    tool.shots.folder.edit.setText(str(tmp_path))
+    tool.image.set_kind("folder")
+    tool.image.form.restore({"path": str(tmp_path)})
     tool.store.watch.restore({"pattern": "*.npy"})
-    tool.store.folder.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+    tool.store.folder.restore({"path": str(tmp_path / "a.shadowinv.zarr")})
     image = synthetic_image(ellipse_pair((40, 52)).displacement)
     (tmp_path / "a0.npy").write_bytes(b"")
     for number in (1, 2):

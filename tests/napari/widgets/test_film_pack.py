@@ -68,7 +68,7 @@ def test_a_run_shows_the_fluences_of_the_films(
     window: Any, open_widget: Any, film_pack: Truth, pack_doses: Any, wait: Callable[[Any], None]
 ) -> None:
     tool = open_widget("Film pack")
-    tool.path.edit.setText(str(film_pack.pack))
+    tool.file.restore({"file": str(film_pack.pack)})
     tool.panel.button.click()
     wait(tool)
     assert [layer.name for layer in window.layers] == [
@@ -125,7 +125,7 @@ def test_the_spectrum_follows_the_region(evaluated: Any, pack_doses: Any, qtbot:
 def test_corners_are_shown_dragged_and_used(
     viewer: ViewerModel, evaluated: Any, pack_doses: Any, wait: Callable[[Any], None], qtbot: Any
 ) -> None:
-    tool = evaluated
+    tool, names = evaluated, {layer.name for layer in viewer.layers}
     layer_of(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
     viewer.dims.set_current_step(0, 1)
     tool.show_corners.click()
@@ -156,7 +156,7 @@ def test_corners_are_shown_dragged_and_used(
     marks = tool._partner(tool.packs.layer, "unusable")
     assert (marks.data[0, 38:46, 48:57][~spot] == BY_HAND).all()
     assert not tool.corners.shown
-    assert not any(role_of(layer) in ("scan", "corners") for layer in viewer.layers)
+    assert {layer.name for layer in viewer.layers} == names  # those of the file, updated
 
 
 def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluated: Any) -> None:
@@ -180,9 +180,9 @@ def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluate
 def test_an_opened_result_does_not_keep_the_file_of_another_one(
     viewer: ViewerModel, tool: Any, pack_doses: Any, tmp_path: Path
 ) -> None:
-    tool.path.edit.setText(str(tmp_path / "another.toml"))
+    tool.file.restore({"file": str(tmp_path / "another.toml")})
     viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
-    assert tool.path.path == ""
+    assert tool.file.state() == {}
     assert tool.request().pack == pack_doses.pack
 
 
@@ -271,7 +271,7 @@ def test_mistakes_are_one_sentence_in_the_widget(
         ("", "No pack is selected"),
         (lost, "film_01.tif does not exist"),
     ):
-        tool.path.edit.setText(str(path))
+        tool.file.restore({"file": str(path)})
         tool.panel.button.click()
         wait(tool)
         text = tool.panel.status.text()

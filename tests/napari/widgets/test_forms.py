@@ -177,7 +177,7 @@ def test_buttons_save_and_load_what_the_command_reads(
     picker.show_setup(setup.model_dump())
     picker.save_button.click()
     assert setup_from(path) == setup
-    picker.picker.set_kind("none")
+    picker.set_kind("none")
     picker.load_button.click()
     assert picker.setup() == setup
     path.write_text("kind = 'proton'\nenergie = 3")

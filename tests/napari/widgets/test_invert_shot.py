@@ -142,7 +142,7 @@ def test_the_source_of_a_shot_a_layer_or_a_file_is_used(
     window.add_image(beam, name="beam")
     metadata = metadata_for("shot", "", proton_setup, source=beam)
     window.add_image(shot, name="measured", metadata=metadata)
-    tool.source.layers.layer = window.layers["beam"]
+    tool.source.layer = window.layers["beam"]
     tool.image.layer = window.layers["measured"]
     assert tool.setup.setup() == proton_setup
     assert tool.source.kind == "own"
@@ -470,14 +470,13 @@ def test_a_layer_of_an_estimated_source_was_not_measured(
     name = "shot source: fitted polynomial"
     qtbot.waitUntil(lambda: name in window.layers, timeout=PATIENCE)
     source = window.layers[name]
-    tool.source.set_kind("layer")
-    tool.source.layers.layer = source
+    tool.source.layer = source
     assert tool.recipe().instrument == Instrument(beam_rms=0.05)
     enter(tool.instrument.entries["beam_source"], "laser")
     enter(tool.instrument.entries["beam_rms"], 0.01)
     assert tool.recipe().instrument == Instrument.of(source="laser", beam_rms=0.01)
     tool.instrument.restore({})
-    tool.source.layers.layer = window.add_image(source.data, name="recorded")
+    tool.source.layer = window.add_image(source.data, name="recorded")
     assert tool.recipe().instrument == Instrument()
 
 
@@ -489,7 +488,7 @@ def test_the_beam_under_a_painted_mask_is_predicted_with_its_error(
     tool = open_widget("Invert")
     tool.options.restore(FEW)
     tool.source.set_kind("kriged")
-    assert tool.source.choice.currentText() == "estimate: predicted under the mask"
+    assert tool.source.choice.current_choice == "estimate: predicted under the mask"
     tool.source_masks.paint()
     tool.source_masks.layer.data = (np.hypot(*(np.indices((64, 64)) - 31.5)) < 20).astype(int)
     run(tool)

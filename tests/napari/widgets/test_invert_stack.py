@@ -47,7 +47,7 @@ def tool(window: Any, open_widget: Callable[[str], Any], stack: Array, out: Path
 
 def prepared(widget: Any, out: Path) -> Any:
     widget.options.restore(FEW)
-    widget.store.folder.edit.setText(str(out))
+    widget.store.folder.restore({"path": str(out)})
     widget.store.run.restore({"workers": 1})
     return widget
 
@@ -138,8 +138,8 @@ def test_a_corrupt_file_is_listed_and_the_others_are_done(
         np.save(tmp_path / f"shot_{index}.npy", image)
     content = (tmp_path / "shot_1.npy").read_bytes()
     (tmp_path / "shot_1.npy").write_bytes(content[:200])
-    tool.shots.set_kind("files")
-    tool.shots.files.edit.setText(str(tmp_path / "shot_*.npy"))
+    tool.image.set_kind("files")
+    tool.image.form.restore({"path": str(tmp_path / "shot_*.npy")})
     run(tool)
     assert messages == []
     assert StackStore(out).statuses().tolist() == [DONE, FAILED, DONE, DONE]
@@ -263,10 +263,10 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     tool.source.set_kind("uniform")
     assert written(out) == before
 
-    tool.store.folder.edit.setText("")
+    tool.store.folder.restore({"path": ""})
     expect("o store is selected")
-    tool.store.folder.edit.setText(str(tmp_path / "other.shadowinv.zarr"))
-    tool.shots.set_kind("files")
+    tool.store.folder.restore({"path": str(tmp_path / "other.shadowinv.zarr")})
+    tool.image.set_kind("files")
     expect("o files are selected")
     assert sorted(path.name for path in tmp_path.glob("*.zarr")) == [out.name]
 

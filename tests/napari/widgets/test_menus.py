@@ -85,8 +85,8 @@ def test_a_folder_is_chosen_and_watched(opened, tmp_path, monkeypatch):
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(tmp_path))
     tool = opened(Invert)
     tool.choose_folder()
-    assert tool.shots.kind == "folder"
-    assert tool.shots.shots() == tmp_path
+    assert tool.image.kind == "folder"
+    assert tool.image.shots() == tmp_path
 
 
 def test_a_setup_is_stored_with_its_image(window, choose, proton_setup, solved, messages):
@@ -95,11 +95,11 @@ def test_a_setup_is_stored_with_its_image(window, choose, proton_setup, solved, 
     window.layers.selection.active = stack
     choose("edit_setup")
     widget = docked(window, Invert)
-    widget.setup.picker.set_kind("proton")
+    widget.setup.set_kind("proton")
     widget.setup.scale_button.click()
     assert "'Kinetic energy (MeV)' is missing" in messages[-1]
     assert widget.panel.status.text() == messages[-1]
-    widget.setup.picker.form.restore(proton_setup.model_dump())
+    widget.setup.form.restore(proton_setup.model_dump())
     assert widget.area.horizontalScrollBar().maximum() == 0
     widget.setup.scale_button.click()
     assert setup_of(stack) == proton_setup

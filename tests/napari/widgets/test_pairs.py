@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from napari.components import ViewerModel
 
-from napari_shadowinv import FitOptions, fit, read, write
+from napari_shadowinv import FitOptions, Recipe, read, write
 from napari_shadowinv._napari.layer_metadata import is_estimate, metadata_for, role_of
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import layers_of_dataset
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
+from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair
+from napari_shadowinv.pipeline import run_fit
 from napari_shadowinv.preprocessing import PolynomialEstimate
 from napari_shadowinv.shot import shots_of
 
@@ -110,8 +112,7 @@ def test_an_estimate_is_not_taken_before_it_is_chosen(viewer: ViewerModel, opene
         BEAM, name="shot source", metadata=metadata_for("source", "", made_from=made_from)
     )
     assert boxes(tool) == ("shot", "uniform")
-    tool.source.choice.setCurrentIndex(tool.source.choice.findData("layer"))
-    assert tool.source.layer is estimate
+    assert estimate in tool.source.offered
 
 
 def test_a_stack_is_taken_with_its_beam(viewer: ViewerModel, opened: Any) -> None:
@@ -130,7 +131,7 @@ def test_a_fit_from_a_file_has_its_beam(
     strength = [1.0, 0.5][:images]
     recorded = [OBJECT * BEAM * noise for noise in NOISE[:images]]
     shots = shots_of(recorded, source=BEAM, noise=0.01, strength=strength)
-    found = fit(shots, options=options)
+    found = run_fit(Recipe(fit=FitChoices(options=options)), shots)
     path = write(tmp_path / "fit.shadowinv", found.to_dataset())
     add_layers(viewer, layers_of_dataset(read(path), "fit"))
     tool = opened(kind)
@@ -140,9 +141,7 @@ def test_a_fit_from_a_file_has_its_beam(
         np.testing.assert_array_equal(source.measured(image_of(viewer)).image, found.source[0])
     else:
         assert len(tool.images.used) == images
-        # A fit may have found it, which is no measurement: it is there to be chosen.
-        assert source.layer is None
-        assert "source" in [role_of(layer) for layer in viewer.layers]
+        assert role_of(source.layer) == "source"
     marks = {layer.name[:2] for layer in viewer.layers if role_of(layer) in ("field", "residual")}
     assert len(marks) == 1
 

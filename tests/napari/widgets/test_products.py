@@ -140,7 +140,8 @@ def test_profile_is_drawn_with_its_bands(form, qtbot):
 
 
 def test_entries_of_a_product_are_those_of_its_model(form):
-    first = [form.product.choice.itemText(row) for row in range(form.product.choice.count())]
+    box = form.product.choice.native
+    first = [box.itemText(row) for row in range(box.count())]
     assert len(first) == 7
     assert first[-1] == "more…"
     offered = set()

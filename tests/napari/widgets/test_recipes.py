@@ -341,10 +341,7 @@ def test_a_source_that_is_no_file_is_written_beside_the_recipe(
 ) -> None:
     beam = 300 + np.random.default_rng(0).random(shot.shape)
     tool = opened()
-    tool.source.layers.layer = viewer.add_image(
-        beam, name="beam", metadata=metadata_for("source", "")
-    )
-    tool.source.set_kind("layer")
+    tool.source.layer = viewer.add_image(beam, name="beam", metadata=metadata_for("source", ""))
     tool.recipes.save(tmp_path / "how.toml")
     np.testing.assert_array_equal(np.load(tmp_path / "how_source.npy"), beam)
     out = tmp_path / "a.shadowinv"
@@ -368,7 +365,7 @@ def test_a_stack_is_inverted_by_a_saved_recipe(
     tool = opened()
     tool.recipes.load(tmp_path / "how.toml")
     assert tool.steps.steps() == recipe.steps
-    tool.store.folder.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+    tool.store.folder.restore({"path": str(tmp_path / "a.shadowinv.zarr")})
     tool.panel.button.click()
     qtbot.waitUntil(
         lambda: any(role_of(layer) == "field" for layer in viewer.layers), timeout=PATIENCE

@@ -117,7 +117,7 @@ def test_shot_of_a_store_is_saved_alone(
     window.add_image(stack, name="run", metadata=metadata_for("shot", "", proton_setup))
     tool = open_widget("Invert")
     tool.options.restore({"n_sites": 300})
-    tool.store.folder.edit.setText(str(tmp_path / "run.shadowinv.zarr"))
+    tool.store.folder.restore({"path": str(tmp_path / "run.shadowinv.zarr")})
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
     qtbot.waitUntil(lambda: not tool.panel.running and not tool.results.busy, timeout=PATIENCE)

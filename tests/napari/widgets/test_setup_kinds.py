@@ -15,7 +15,7 @@ def test_form_reads_a_new_kind(xray_setup: Any, qtbot: Any) -> None:
     qtbot.addWidget(picker)
     soft = xray_setup.example()
     picker.show_setup(soft.model_dump())
-    assert picker.picker.kind == "x-ray"
+    assert picker.kind == "x-ray"
     assert picker.setup() == soft
 
 

@@ -37,8 +37,8 @@ def test_sizes_in_the_file_begin_a_setup(tmp_path, qtbot, is_by_us):
     picker = SetupPicker()
     qtbot.addWidget(picker)
     picker.follow(layer)
-    picker.picker.set_kind("proton")
-    values = picker.picker.form.state()
+    picker.set_kind("proton")
+    values = picker.form.state()
     assert values["detector_pixel_size"] == 2.5e-5
     assert values["object_image_distance"] == 0.1
     assert "energy" not in values

@@ -44,10 +44,9 @@ def tool(window: Any, open_widget: Callable[[str], Any], pack: Path) -> Any:
     tool = open_widget("Invert")
     tool.options.restore({"tolerance": 1e-3})
     tool.store.run.restore({"workers": 1})
-    tool.store.folder.edit.setText(str(pack.with_name("run.shadowinv.zarr")))
-    tool.shots.set_kind("table")
-    tool.shots.table.edit.setText(str(pack))
-    tool.shots.table.changed.emit()
+    tool.store.folder.restore({"path": str(pack.with_name("run.shadowinv.zarr"))})
+    tool.image.set_kind("table")
+    tool.image.form.restore({"path": str(pack)})
     tool.setup.show_setup(SETUP.model_dump())
     return tool
 
@@ -88,12 +87,12 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str], pack: Pat
         assert words in messages[before]
 
     pack.write_text("file,energy\nfilm0.npy,9\n")
-    tool.setup.picker.set_kind("none")
+    tool.setup.set_kind("none")
     expect("has an energy of 9 MeV and no setup")
-    tool.shots.table.edit.setText("")
+    tool.image.form.restore({"path": ""})
     expect("o table is selected")
-    tool.shots.table.edit.setText("/no/pack.csv")
+    tool.image.form.restore({"path": "/no/pack.csv"})
     expect("/no/pack.csv does not exist: expected a .csv file")
-    tool.shots.table.edit.setText(str(pack.with_name("film0.npy")))
+    tool.image.form.restore({"path": str(pack.with_name("film0.npy"))})
     expect("film0.npy is no table: expected a .csv file")
     assert not tool.store.path.exists()

@@ -141,7 +141,7 @@ def test_an_object_brings_the_beam_that_it_needs(opened, image, qtbot, messages)
     assert tool.setup.setup() == ProtonSetup.example()
     tool.object.set_kind("wakefield")
     assert tool.setup.setup() == entered
-    tool.setup.picker.set_kind("none")
+    tool.setup.set_kind("none")
     tool.panel.button.click()
     qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
     assert len(messages) == 1
@@ -257,6 +257,6 @@ def test_wrong_file_is_a_sentence(traced, qtbot, messages, tmp_path):
     assert "ptions: 'File' is missing" in traced.panel.status.text()
     assert "'File' is missing" in messages[-1]
     traced.object.form.restore({"file": str(tmp_path / "cube.nc"), "beam": "x", "right": "y"})
-    traced.setup.picker.set_kind("none")
+    traced.setup.set_kind("none")
     finished(traced, qtbot)
     assert "There is no setup: expected one of charged particles" in messages[-1]

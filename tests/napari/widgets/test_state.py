@@ -51,7 +51,7 @@ def plain(viewer, shot):
 
 def typed(tool, energy):
     """Type a whole setup, field by field."""
-    tool.setup.picker.set_kind("proton")
+    tool.setup.set_kind("proton")
     values = {
         "energy": energy,
         "source_object_distance": 0.01,
@@ -59,7 +59,7 @@ def typed(tool, energy):
         "pixel_size": 2e-6,
     }
     for name, value in values.items():
-        enter(tool.setup.picker.form.entries[name], value)
+        enter(tool.setup.form.entries[name], value)
 
 
 def test_a_setup_stays_with_the_image_that_it_came_with(opened, of_a_file, plain, proton_setup):
@@ -72,22 +72,22 @@ def test_a_setup_stays_with_the_image_that_it_came_with(opened, of_a_file, plain
         assert tool.setup.setup() is None
         assert tool.setup.note.text() == ""
     # Nor is it at hand in the form.
-    tool.setup.picker.set_kind("proton")
-    assert tool.setup.picker.form.is_empty
+    tool.setup.set_kind("proton")
+    assert tool.setup.form.is_empty
 
 
 def test_the_setup_of_a_file_is_not_there_in_the_next_session(viewer, opened, of_a_file, shot):
     tool = opened(Invert)
     assert tool.setup.setup() is not None
-    enter(tool.setup.picker.form.entries["energy"], "3 MeV")
+    enter(tool.setup.form.entries["energy"], "3 MeV")
     assert setup_origin_of(of_a_file) == "came with experiment.h5, changed by hand"
     tool.write_state()
     viewer.layers.clear()
     viewer.add_image(shot, name="another")
     later = opened(Invert)
     assert later.setup.setup() is None
-    later.setup.picker.set_kind("proton")
-    assert later.setup.picker.form.is_empty
+    later.setup.set_kind("proton")
+    assert later.setup.form.is_empty
 
 
 def test_what_the_user_typed_is_at_hand_and_says_for_what(viewer, opened, plain, shot):
@@ -100,13 +100,13 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(viewer, opened, plain,
     tool.image.layer = image
     assert tool.setup.setup() is None
     assert setup_of(image) is None
-    tool.setup.picker.set_kind("proton")
+    tool.setup.set_kind("proton")
     assert tool.setup.setup() == entered
     assert tool.setup.note.text() == "Typed for 'plain'."
     assert setup_origin_of(image) == "typed for 'plain'"
     # An image keeps what was chosen for it, none too.
     tool.image.layer = plain
-    tool.setup.picker.set_kind("none")
+    tool.setup.set_kind("none")
     tool.image.layer = image
     assert tool.setup.setup() == entered
     tool.image.layer = plain
@@ -117,7 +117,7 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(viewer, opened, plain,
     new = viewer.add_image(shot, name="new")
     later = opened(Invert)
     assert later.setup.setup() is None
-    later.setup.picker.set_kind("proton")
+    later.setup.set_kind("proton")
     assert later.setup.setup() == entered
     assert setup_origin_of(new) == "typed for 'plain', in an earlier session"
     typed(later, 6.0)
@@ -141,10 +141,10 @@ def test_the_last_setup_is_selected_where_that_is_preferred(
     # The image has no setup of its own before it is edited.
     assert setup_of(new) is None
     # None is a choice, too.
-    later.setup.picker.set_kind("none")
+    later.setup.set_kind("none")
     later.write_state()
     assert opened(Invert).setup.setup() is None
-    later.setup.picker.set_kind("proton")
+    later.setup.set_kind("proton")
     later.write_state()
     preferences.widgets.last_setup = False
     viewer.layers.clear()
@@ -173,7 +173,7 @@ def test_a_loaded_setup_goes_with_the_image_until_run(viewer, opened, plain, pro
     tool = opened(Invert)
     tool.image.layer = plain
     tool.setup.load(proton_setup.model_dump(exclude_none=True), "tcc.toml")
-    enter(tool.setup.picker.form.entries["energy"], 5.0)
+    enter(tool.setup.form.entries["energy"], 5.0)
     other = viewer.add_image(np.ones((20, 30)), name="other")
     tool.image.layer = other
     assert tool.setup.setup().energy == 5.0
@@ -188,34 +188,31 @@ def test_a_loaded_setup_goes_with_the_image_until_run(viewer, opened, plain, pro
 
 def test_other_files_do_not_inherit_a_setup(viewer, opened):
     tool = opened(Invert)
-    tool.shots.set_kind("files")
+    tool.image.set_kind("files")
     typed(tool, 5.0)
 
     def choose(pattern):
-        tool.shots.files.edit.setText(pattern)
-        tool.shots.files.changed.emit()
+        tool.image.form.restore({"path": pattern})
 
     choose("monday/*.tif")
     assert tool.setup.setup() is not None
     choose("tuesday/*.tif")
     assert tool.setup.setup() is None
-    tool.setup.picker.set_kind("proton")
+    tool.setup.set_kind("proton")
     assert tool.setup.setup() is not None
     assert tool.setup.origin == "typed"
 
 
 def test_a_store_lies_beside_the_files_unless_another_is_chosen(viewer, opened, tmp_path):
     tool = opened(Invert)
-    tool.shots.set_kind("folder")
-    tool.shots.folder.edit.setText(str(tmp_path / "night"))
-    tool.shots.folder.changed.emit()
+    tool.image.set_kind("folder")
+    tool.image.form.restore({"path": str(tmp_path / "night")})
     assert tool.store.path == tmp_path / "night.shadowinv.zarr"
-    tool.shots.set_kind("files")
-    tool.shots.files.edit.setText(str(tmp_path / "day" / "*.tif"))
-    tool.shots.files.changed.emit()
+    tool.image.set_kind("files")
+    tool.image.form.restore({"path": str(tmp_path / "day" / "*.tif")})
     assert tool.store.path == tmp_path / "day.shadowinv.zarr"
-    tool.store.folder.edit.setText("mine.shadowinv.zarr")
-    tool.shots.set_kind("folder")
+    tool.store.folder.restore({"path": "mine.shadowinv.zarr"})
+    tool.image.set_kind("folder")
     assert tool.store.path == Path("mine.shadowinv.zarr")
 
 
@@ -230,35 +227,30 @@ def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(viewer, ope
     assert tool.image.layer is shot
     assert tool.source.kind == "own"
     assert tool.setup.note.text() == "Came with the sample 'toroid'."
-    tool.source.set_kind("layer")
-    assert tool.source.layers.layer is source
+    tool.source.layer = source
+    assert tool.source.kind == "layer"
 
 
 def test_no_image_is_its_own_source(viewer, opened, plain, shot):
     tool = opened(Invert)
-    tool.source.set_kind("layer")
-    assert tool.source.layers.offered == []
-    with pytest.raises(InputError, match="no source layer is selected"):
-        tool.request()
+    assert tool.source.offered == []
     # Which of two unknown images is the beam, nobody but the user can tell.
-    reference = viewer.add_image(shot, name="reference")
+    other = viewer.add_image(shot, name="other")
     assert tool.image.layer is plain
-    assert tool.source.layers.offered == [reference]
-    assert tool.source.layers.layer is None
-    tool.source.layers.layer = reference
-    tool.image.layer = reference
-    assert tool.source.layers.layer is None
-    assert tool.source.layers.offered == [plain]
+    assert tool.source.offered == [other]
+    assert tool.source.layer is None
+    tool.source.layer = other
+    tool.image.layer = other
+    assert tool.source.layer is None
+    assert tool.source.offered == [plain]
 
 
 def test_results_are_not_offered_as_shots(viewer, opened, plain, solved):
     add_to_viewer(viewer, solved, name="solved")
     tool = opened(Invert)
     assert tool.image.offered == [plain]
-    assert [role_of(layer) for layer in tool.masks.layers.offered] == []
-    assert all(role_of(layer) in (None, "source") for layer in tool.source.layers.offered)
-    tool.source.set_kind("layer")
-    assert tool.source.layers.layer is None
+    assert [role_of(layer) for layer in tool.masks.offered] == []
+    assert all(role_of(layer) in (None, "source") for layer in tool.source.offered)
     assert {role_of(layer) for layer in opened(Simulate).field.offered} == {"field"}
     field = next(layer for layer in viewer.layers if role_of(layer) == "field")
     for command in (commands.invert_uniform, commands.high_pass):
@@ -312,7 +304,7 @@ def hump():
 def the_masks(tool):
     """Return the object with the masks of a run."""
     job = tool.request()
-    return job if tool.shots.is_stack else job.shot
+    return job if tool.image.is_stack else job.shot
 
 
 @pytest.mark.parametrize("is_stack", [False, True])
@@ -321,7 +313,7 @@ def test_both_masks_can_be_chosen(viewer, opened, hump, is_stack, tmp_path):
     viewer.add_image(np.stack([shot, shot]) if is_stack else shot, name="shot")
     tool = opened(Invert)
     if is_stack:
-        tool.store.folder.edit.setText(str(tmp_path / "a.shadowinv.zarr"))
+        tool.store.folder.restore({"path": str(tmp_path / "a.shadowinv.zarr")})
     assert tool.source_masks.isHidden()
     tool.source.set_kind("polynomial")
     assert not tool.source_masks.isHidden()
@@ -359,11 +351,10 @@ def test_a_mask_over_the_object_is_refused(viewer, opened, hump, qtbot, messages
         later = opened(Invert)
         if data is not None:
             later.image.layer = viewer.add_image(data, name="stack")
-            later.store.folder.edit.setText("a.shadowinv.zarr")
+            later.store.folder.restore({"path": "a.shadowinv.zarr"})
         else:
             later.image.layer = image
-        later.source.set_kind("layer")
-        assert later.source.layers.layer.name == "shot source: fitted polynomial"
+        later.source.layer = viewer.layers["shot source: fitted polynomial"]
         later.masks.layer = labels
         with pytest.raises(InputError, match=words):
             later.request()

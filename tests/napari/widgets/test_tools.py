@@ -54,21 +54,22 @@ def test_nothing_is_orange_before_something_is_typed(window, open_widget, shot, 
     for name, tool in tools.items():
         assert orange_texts(tool) == [], name
         for picker in tool.findChildren(ModelPicker):
-            before = picker.choice.currentIndex()
-            for index in range(picker.choice.count()):
-                picker.choice.setCurrentIndex(index)
-                assert orange_texts(tool) == [], (name, picker.choice.currentText())
+            before = picker.choice.value
+            for value in picker.choice.choices:
+                picker.choice.value = value
+                assert orange_texts(tool) == [], (name, picker.choice.current_choice)
                 chosen += 1
-            picker.choice.setCurrentIndex(before)
+            if before is not None:
+                picker.choice.value = before
     assert chosen > 20
     window.add_image(shot, name="shot")
     qtbot.wait(50)
     for name, tool in tools.items():
         assert orange_texts(tool) == [], name
-    setup = tools["Invert"].setup.picker
-    for index in range(setup.choice.count()):
-        setup.choice.setCurrentIndex(index)
-        assert orange_texts(tools["Invert"]) == [], setup.choice.currentText()
+    setup = tools["Invert"].setup
+    for kind in setup.choice.choices:
+        setup.set_kind(kind)
+        assert orange_texts(tools["Invert"]) == [], setup.choice.current_choice
     setup.set_kind("proton")
     enter(setup.form.entries["energy"], 14.7)
     assert any("Source" in text for text in orange_texts(tools["Invert"]))

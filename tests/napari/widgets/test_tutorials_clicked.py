@@ -358,10 +358,10 @@ def test_two_energies_are_clicked_to_their_end(
     assert table.horizontalHeaderItem(1).text() == "Energy (MeV)"
     assert {table.item(row, 0).checkState() for row in range(2)} == {Qt.CheckState.Checked}
     source, noise = re.findall(
-        r"Set \*\*Source\*\* to \*(.*?)\* and \*\*Noise\*\* to \*(.*?)\*", text
+        r"Set \*\*Source\*\* to \*(.*?)\*, type \*(.*?)\* as \*\*Noise\*\*", text
     )[0]
     select(tool, source, label="Source")
-    select(tool, noise, label="Noise")
+    enter(tool, "Noise", noise)
     press(tool, "Run")
     wait_for_layers(tool, qtbot)
     assert "Determined" in tool.view.verdict.text()
@@ -455,8 +455,7 @@ def test_stack_is_clicked_to_its_end(
     choose(f"Plugins > {PLUGIN} > Invert")
     tool = tool_of(window, "Invert")
     select(tool, "high-pass")
-    tool.store.folder.edit.setText(str(tmp_path / "night.shadowinv.zarr"))
-    tool.store.folder.edit.editingFinished.emit()
+    tool.store.folder.restore({"path": str(tmp_path / "night.shadowinv.zarr")})
     press(tool, "Run")
     wait_for_layers(tool, qtbot)
     field = layer_of(window, "field")

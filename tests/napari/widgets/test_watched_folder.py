@@ -40,10 +40,10 @@ def out(tmp_path: Path) -> Path:
 def tool(open_widget: Any, folder: Path, out: Path) -> Any:
     tool = open_widget("Invert")
     tool.options.restore({"n_sites": 100})
-    tool.shots.set_kind("folder")
-    tool.shots.folder.edit.setText(str(folder))
+    tool.image.set_kind("folder")
+    tool.image.form.restore({"path": str(folder)})
     tool.store.watch.restore({"pattern": "*.npy"})
-    tool.store.folder.edit.setText(str(out))
+    tool.store.folder.restore({"path": str(out)})
     return tool
 
 
@@ -115,7 +115,7 @@ def test_it_fits_and_a_refused_watch_has_its_reason_under_the_button(
     }
     for folder, reason in reasons.items():
         messages.clear()
-        tool.shots.folder.edit.setText(folder)
+        tool.image.form.restore({"path": folder})
         tool.panel.button.click()
         qtbot.waitUntil(lambda: bool(messages), timeout=PATIENCE)
         qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)

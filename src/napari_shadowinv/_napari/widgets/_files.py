@@ -133,7 +133,7 @@ class RecipeButton(QPushButton):
         tool = self._tool
         image = tool.chosen_image()
         path = None if image is None else about.metadata_of(image).get("path") or image.source.path
-        if not path or tool.shots.is_stack:
+        if not path or tool.image.is_stack:
             raise InputError("Python reads a single image from its file: open one, or save it")
         recipe = tool.recipe_to_save()
         masks = (each.usable(image) for each in tool.mask_pickers.values() if not each.isHidden())

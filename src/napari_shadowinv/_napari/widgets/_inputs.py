@@ -10,7 +10,7 @@ from typing import Any
 
 import tomli_w
 from pydantic import BaseModel
-from qtpy.QtCore import QSignalBlocker, Signal
+from qtpy.QtCore import QSignalBlocker
 from qtpy.QtWidgets import QFileDialog, QWidget
 
 from napari_shadowinv import preprocessing
@@ -22,6 +22,7 @@ from napari_shadowinv._napari.shots import shot_of_layer, source_of_shot
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import RecipeButton
+from napari_shadowinv._napari.widgets._layers import LAYER
 from napari_shadowinv._napari.widgets._panels import ResultView, ToolPanel
 from napari_shadowinv._napari.widgets._results import place_together
 from napari_shadowinv._typing import BoolArray
@@ -50,14 +51,14 @@ _UNSTATED = {
 }
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
-UNIFORM, LAYER, FILE, SUPPLIED, UNKNOWN = "uniform", "layer", "file", "own", "unknown"
+UNIFORM, FILE, SUPPLIED, UNKNOWN = "uniform", "file", "own", "unknown"
 """Kinds of sources; all other kinds are estimates."""
 SHOT_SOURCES = tuple(dict.fromkeys((UNIFORM, LAYER, FILE, SUPPLIED, *preprocessing.ESTIMATES)))
 FIT_SOURCES = (UNIFORM, LAYER, UNKNOWN)
 _SOURCE_TITLES = {
     **{kind: f"estimate: {each.title}" for kind, each in preprocessing.ESTIMATES.items()},
     UNIFORM: preprocessing.ESTIMATES[UNIFORM].title,
-    LAYER: "a layer",
+    LAYER: "",
     FILE: "a file",
     SUPPLIED: "supplied with the shot",
     UNKNOWN: "unknown (fit it)",
@@ -72,31 +73,29 @@ class _Entry:
     origin: str
 
 
-class SetupPicker(QWidget):
+class SetupPicker(forms.ModelPicker):
     """A setup, stored with its image; the user's setups are offered to the next image.
 
     With a viewer, a loaded setup goes with whatever image is chosen until `keep` is called, and the
     image can be shown at its scale.
     """
 
-    changed = Signal()
-
     def __init__(self, viewer: Any = None) -> None:
-        super().__init__()
-        self._viewer, self._until_run, self._is_loaded = viewer, viewer is not None, False
+        self._viewer, self._is_loaded = viewer, False
         self._layer: Any = None
         self._name, self._stores = "", True
         self._last = _NONE  # the kind that the user chose last
-        self._entered: dict[str, _Entry] = {}
-        self._shown: dict[str, _Entry] = {}
-        self.picker = forms.ModelPicker(
+        self._entered: dict[str, _Entry] = {}  # by the user
+        self._origins: dict[str, str] = {}  # of what the forms show
+        self._before: Any = None  # kind and values before an edit
+        self.geometry_label = forms.WrappingLabel()
+        self.warning_label = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
+        self.note = forms.WrappingLabel()
+        super().__init__(
             "Setup",
             {_NONE: ("none: results in pixels", None), **forms.kinds_of(SETUPS)},
             "With a setup, results are in SI units. Lengths can be entered as 1.3 mm or 0.0013.",
         )
-        self.geometry_label = forms.WrappingLabel()
-        self.warning_label = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
-        self.note = forms.WrappingLabel()
         self.load_button = qt.push_button(
             "Load setup…", "Read setup from a TOML file.", self._ask_and_load
         )
@@ -108,15 +107,16 @@ class SetupPicker(QWidget):
             "Store the setup with the image, and show the image at its scale, without a run.",
             self.show_at_scale,
         )
-        self.scale_button.setVisible(self._until_run)
+        self.scale_button.setVisible(viewer is not None)
         buttons = (self.load_button, 0), (self.save_button, 0), (self.scale_button, 0)
-        files = qt.side_by_side(*buttons, (QWidget(), 1))
-        qt.column(self, self.picker, self.geometry_label, self.warning_label, self.note, files)
-        self._state = self.picker.state()
-        self.picker.changed.connect(self._on_edit)
+        below = QWidget()
+        row = qt.side_by_side(*buttons, (QWidget(), 1))
+        qt.column(below, self.geometry_label, self.warning_label, self.note, row)
+        self.layout().addWidget(below)
+        self._show_notes()
 
     def setup(self) -> Setup | None:
-        return self.picker.model()  # type: ignore[return-value]
+        return self.model()  # type: ignore[return-value]
 
     def complete_setup(self) -> Setup | None:
         """Return the setup; None without one, or while it is incomplete."""
@@ -128,14 +128,11 @@ class SetupPicker(QWidget):
     @property
     def origin(self) -> str:
         """Where the setup comes from, such as ``"typed for 'shot'"``; empty without a setup."""
-        if self.picker.kind == _NONE:
-            return ""
-        entry = self._shown.get(self.picker.kind)
-        return self._typed_origin() if entry is None else entry.origin
+        return self._origins.get(self.kind, self._typed_origin()) if self.form else ""
 
     @property
     def summary(self) -> str:
-        kind = self.picker.choice.currentText()
+        kind = self.choice.current_choice
         return f"{kind}, {self.origin}" if self.origin else kind
 
     def state(self) -> dict[str, Any]:
@@ -158,12 +155,11 @@ class SetupPicker(QWidget):
         # The setup may be typed before the files are chosen.
         is_typed_before = layer is None and self._layer is None and not self._name
         self._layer, self._name, self._stores = layer, name, store
+        setup = None if layer is None else about.setup_of(layer)
         if self._is_loaded:
             self._show_notes()
             self.changed.emit()
-            return
-        setup = None if layer is None else about.setup_of(layer)
-        if setup is not None:
+        elif setup is not None:
             self.suggest(setup, about.setup_origin_of(layer) or f"{about.CAME_WITH} '{layer.name}'")
         elif not is_typed_before:
             self._show_default()
@@ -171,14 +167,13 @@ class SetupPicker(QWidget):
 
     def suggest(self, setup: Setup, origin: str) -> None:
         """Show a setup that the user did not enter; editing it makes it the user's."""
-        self._show(setup.kind, _Entry(setup.model_dump(), origin))
+        self._show_setups(setup.kind, _Entry(setup.model_dump(), origin))
         self.changed.emit()
 
     def choose_kind(self, kind: str) -> None:
         """Show the user's setup of a kind, or else the paper's."""
-        self.picker.set_kind(kind)
-        form = self.picker.form
-        if form is not None and form.is_empty:
+        self.set_kind(kind)
+        if self.form is not None and self.form.is_empty:
             self.suggest(SETUPS[kind].example(), "example from the paper")
 
     def show_setup(self, values: Mapping[str, Any], origin: str = "") -> None:
@@ -186,20 +181,16 @@ class SetupPicker(QWidget):
         kind = str(values["kind"])
         entry = _Entry(dict(values), origin or self._typed_origin())
         self._last = kind
-        self._is_loaded = bool(origin) and self._until_run
-        self._show(kind, entry)
-        self._remember(kind, entry)
-        self._store_with_image()
+        self._is_loaded = bool(origin) and self._viewer is not None
+        self._show_setups(kind, entry)
+        self._enter(entry.origin)
         self.changed.emit()
 
     def keep(self) -> None:
         """Store a loaded setup with the image that is chosen now."""
         if self._is_loaded:
-            self._is_loaded, kind = False, self.picker.kind
-            origin = self.origin + self._typed_origin().removeprefix("typed")
-            self._remember(kind, _Entry(self.picker.state()["values"][kind], origin))
-            self._show_notes()
-            self._store_with_image()
+            self._is_loaded = False
+            self._enter(self.origin + self._typed_origin().removeprefix("typed"))
 
     @qt.notify_errors
     def show_at_scale(self) -> None:
@@ -215,42 +206,48 @@ class SetupPicker(QWidget):
     def _show_default(self) -> None:
         """Show the setup of images without one of their own: none, or the user's last."""
         is_last = preference("widgets", "last_setup") and self._last in self._entered
-        self._show(self._last if is_last else _NONE)
+        self._show_setups(self._last if is_last else _NONE)
 
-    def _show(self, kind: str, entry: _Entry | None = None) -> None:
-        """Show a setup or none; the forms of other kinds keep the last entries."""
-        self._shown = {**self._entered} | ({} if entry is None else {kind: entry})
-        blank: dict[str, Any] = {name: {} for name in self.picker.state()["values"]}
-        values = blank | {name: state.values for name, state in self._shown.items()}
-        with QSignalBlocker(self.picker):
-            self.picker.restore({"kind": kind, "values": values})
+    def _show_setups(self, kind: str, entry: _Entry | None = None) -> None:
+        """Show a setup or none; the forms of other kinds get the user's entries."""
+        shown = self._entered | ({} if entry is None else {kind: entry})
+        self._origins = {each: setup.origin for each, setup in shown.items()}
+        values = {each: setup.values for each, setup in shown.items()}
+        with QSignalBlocker(self):
+            super().restore({"kind": kind, "values": {each: {} for each in self._forms} | values})
         self._show_notes()
+
+    def _on_entry(self) -> None:
+        if self._before is not None and not self.signalsBlocked():
+            self._on_edit()
+            self.changed.emit()
 
     def _on_edit(self) -> None:
-        kind, before, form = self.picker.kind, self._state, self.picker.form
-        if kind != before["kind"] and form is not None and form.is_empty and self._fill_in(form):
-            name = self._layer.name
-            self._shown[kind] = _Entry(form.state(), f"begun with the file of '{name}'")
-        values = self.picker.state()["values"].get(kind, {})
-        # Selecting another form, or leaving a field as it was, changes no values.
-        if kind == before["kind"] and values != before["values"].get(kind):
-            old_entry = self._shown.get(kind)
-            if old_entry is None or old_entry.origin.startswith("typed"):
-                origin = self._typed_origin()
-            else:
-                origin = old_entry.origin.removesuffix(_CHANGED) + _CHANGED
-            self._remember(kind, _Entry(values, origin))
-        self._is_loaded &= kind == before["kind"]
+        """Store what the user has chosen or typed."""
+        kind, (earlier_kind, earlier_values) = self.kind, self._before
         self._last = kind
+        if kind != earlier_kind:
+            self._is_loaded = False
+            self._begin_with_file()
+        # Leaving a field as it was changes no values.
+        elif self.form is not None and self.form.state() != earlier_values:
+            origin = self._origins.get(kind, "typed")
+            is_typed = origin.startswith("typed")
+            self._enter(
+                self._typed_origin() if is_typed else origin.removesuffix(_CHANGED) + _CHANGED
+            )
+            return
         self._show_notes()
         self._store_with_image()
-        self.changed.emit()
 
-    def _remember(self, kind: str, entry: _Entry) -> None:
-        """Offer a setup that the user entered to other images, too."""
-        self._shown[kind] = entry
-        if not entry.origin.startswith(about.CAME_WITH):
-            self._entered[kind] = entry
+    def _enter(self, origin: str) -> None:
+        """Offer the setup shown, which the user entered, to other images, too."""
+        assert self.form is not None
+        self._origins[self.kind] = origin
+        if not origin.startswith(about.CAME_WITH):
+            self._entered[self.kind] = _Entry(self.form.state(), origin)
+        self._show_notes()
+        self._store_with_image()
 
     def _store_with_image(self) -> None:
         if self._layer is not None and self._stores and not self._is_loaded:
@@ -263,8 +260,8 @@ class SetupPicker(QWidget):
 
     def _show_notes(self) -> None:
         """Show where the values come from, field of view, magnification and warnings."""
-        self._state = self.picker.state()
-        form = self.picker.form
+        form = self.form
+        self._before = self.kind, None if form is None else form.state()
         is_filled = form is not None and not form.is_empty
         origin = f"{self.origin[:1].upper()}{self.origin[1:]}."
         self.note.show_text(origin if is_filled else "")
@@ -288,13 +285,17 @@ class SetupPicker(QWidget):
                 metadata = read_shot(path).metadata
         return dict((metadata or {}).get("geometry", {}))
 
-    def _fill_in(self, form: forms.ModelForm) -> bool:
-        """Begin an empty form with what the image's file says; return whether that is anything."""
+    def _begin_with_file(self) -> None:
+        """Begin an empty form with what the image's file says."""
+        form = self.form
+        if form is None or not form.is_empty:
+            return
         geometry = self._file_geometry()
         values = {name: geometry[name] for name in form.entries if name in geometry}
-        with QSignalBlocker(self.picker):
-            form.restore(form.state() | values)
-        return bool(values)
+        if values:
+            with QSignalBlocker(self):
+                form.restore(form.state() | values)
+            self._origins[self.kind] = f"begun with the file of '{self._layer.name}'"
 
     @qt.notify_errors
     def _save(self) -> None:
@@ -312,33 +313,19 @@ class SetupPicker(QWidget):
 
     def load(self, entries: dict[str, Any], path: str) -> None:
         values = complete_setup(entries, self._file_geometry(), path).model_dump()
-        owner = "" if self._until_run else self._typed_origin().removeprefix("typed")
+        owner = "" if self._viewer is not None else self._typed_origin().removeprefix("typed")
         self.show_setup(values, f"loaded from {Path(path).name}{owner}")
 
 
-class SourcePicker(forms.ModelPicker):
-    """The undisturbed beam, of the kinds that a window offers."""
+class SourcePicker(layers.LayerPicker):
+    """The undisturbed beam: a layer, or of other kinds that a window offers."""
 
     def __init__(self, viewer: Any, kinds: Sequence[str], tip: str) -> None:
         self._image: Any = None
-        self._own_kind = UNIFORM  # without a source that came with the image or is likely
-        self._proposes = True
-        layer_tip = "Image layer of the undisturbed beam."
-        self.layers = layers.LayerPicker(viewer, layer_tip, "choose a layer", self._offers)
-        rows = {LAYER: forms.labelled("", self.layers), FILE: preprocessing.MeasuredSource}
-        below = preprocessing.ESTIMATES | rows
-        described = {kind: (_SOURCE_TITLES[kind], below.get(kind)) for kind in kinds}
-        super().__init__("Source", described, tip)
-        self.layers.picked.connect(self.changed)
-        self._proposes = self.is_chosen = False
-        for box in (self.choice, self.layers):
-            box.activated.connect(lambda _: self._choose(self.kind))
-        qt.while_alive(self, viewer.layers, ("inserted", "removed"), self._on_layers)
-
-    @property
-    def layer(self) -> Any | None:
-        """The selected layer; None for another kind of source."""
-        return self.layers.layer if self.kind == LAYER else None
+        self._own: str | None = None  # the kind, if the image has a source and uses it
+        models = {**preprocessing.ESTIMATES, FILE: preprocessing.MeasuredSource}
+        entries = {kind: (_SOURCE_TITLES[kind], models.get(kind)) for kind in kinds}
+        super().__init__(viewer, tip, suits=self._suits_image, label="Source", entries=entries)
 
     @property
     def is_made(self) -> bool:
@@ -374,7 +361,7 @@ class SourcePicker(forms.ModelPicker):
             return ""
         return f"{self.kind} source" if self.kind in preprocessing.ESTIMATES else ""
 
-    def chosen(self) -> preprocessing.Estimate | preprocessing.MeasuredSource | None:
+    def recipe_source(self) -> preprocessing.Estimate | preprocessing.MeasuredSource | None:
         """Return the source as a recipe describes it, None if it is fitted; or an `InputError`."""
         model: Any = self.model()
         if self.kind == FILE and model.file is None:
@@ -391,7 +378,7 @@ class SourcePicker(forms.ModelPicker):
         elif source is None:
             self.set_kind(UNIFORM)
         elif FILE not in self._kinds:
-            self.set_kind(LAYER)
+            self.layer = self.layer or self.likely_layer
         elif source.file is None:
             self.set_kind(SUPPLIED)
         else:
@@ -399,12 +386,7 @@ class SourcePicker(forms.ModelPicker):
 
     def measured(self, image: Any) -> Shot | None:
         """Return the measured source of an image layer; None for estimates and files."""
-        if self.kind == LAYER:
-            if self.layer is None:
-                raise InputError(
-                    "no source layer is selected: choose a layer below 'a layer', or another kind "
-                    "of source"
-                )
+        if self.layer is not None:
             data = layers.image_of(self.layer, "source image")
             beam = source_of_shot(self.layer, data, image)
             return replace(beam, cautions=layers.cautions_of(self.layer))
@@ -459,59 +441,45 @@ class SourcePicker(forms.ModelPicker):
 
     def state(self) -> dict[str, Any]:
         """Return the choice without layers and files, which belong to a session."""
-        kind = self._own_kind
         values = {
             name: stated for name, stated in super().state()["values"].items() if name != FILE
         }
-        return {"kind": UNIFORM if kind in (LAYER, FILE) else kind, "values": values}
+        lasts = self.chosen in (UNKNOWN, *preprocessing.ESTIMATES)
+        return {"kind": self.chosen if lasts else UNIFORM, "values": values}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         super().restore(state)
-        self.is_chosen = self.kind != UNIFORM
+        if self.chosen == UNIFORM:
+            self.chosen = None
 
-    def set_kind(self, kind: str) -> None:
-        self._choose(kind)
-        super().set_kind(kind)
-
-    def _choose(self, kind: str) -> None:
-        self.is_chosen = True
-        self._own_kind = UNIFORM if kind == SUPPLIED else kind
-
-    def follow(self, image_layer: Any) -> None:
-        """Select the source supplied with an image, or a likely one; else the last one."""
-        self._image = image_layer
-        self.layers.fill()
-        self._propose()
-
-    def _on_layers(self, _: Any = None) -> None:
-        if not (self.is_chosen or self.is_supplied):
-            self._propose()
-
-    def _propose(self) -> None:
-        """Select the image's own source, or else its only likely beam unless one was chosen."""
-        image, kind = self._image, self._own_kind
+    def follow(self, image: Any) -> None:
+        """Select the source supplied with an image, or a likely one; else the chosen one."""
+        self._image = image
         has_own = image is not None and about.source_of(image) is not None
-        if has_own and SUPPLIED in self._kinds:
-            kind = SUPPLIED
-        elif image is not None and not self.is_chosen:
-            beam = layers.likely_beam(image, self.layers.offered)
-            if beam is not None:
-                self.layers.layer, kind = beam, LAYER
-        self._proposes = True
-        super().set_kind(kind)
-        self._proposes = False
+        self._own = SUPPLIED if has_own and SUPPLIED in self._kinds else None
+        self.fill()
 
-    def _offers(self, layer: Any) -> bool:
+    @property
+    def likely_layer(self) -> Any | None:
+        """The layer that is probably the image's beam, perhaps an estimate, or None."""
+        image = self._image
+        return None if image is None else layers.likely_beam(image, self.offered, estimates=True)
+
+    def _remember(self, choice: Any) -> None:
+        # The source supplied with a shot is not that of the next one.
+        self._own = SUPPLIED if choice == SUPPLIED else None
+        self.chosen = UNIFORM if choice == SUPPLIED else choice
+
+    def _preferred(self, before: Any) -> Sequence[Any]:
+        """Return the image's own source, the chosen one, or else its only likely beam."""
+        image, likely = self._image, None
+        if image is not None and self.chosen is None:
+            likely = layers.likely_beam(image, self.offered)
+        return self._own, self.chosen, likely, UNIFORM
+
+    def _suits_image(self, layer: Any) -> bool:
         # An image cannot be its own source.
-        return layer != self._image and about.may_be_source(layer)
-
-    def _on_choice(self) -> None:
-        if not self._proposes:
-            self._choose(self.kind)
-        if self.kind == LAYER and self.layers.layer is None and self._image is not None:
-            offered = self.layers.offered
-            self.layers.layer = layers.likely_beam(self._image, offered, estimates=True)
-        super()._on_choice()
+        return layer is not self._image and about.may_be_source(layer)
 
 
 class InstrumentForm(forms.ModelForm):
@@ -571,7 +539,7 @@ class ImagePanel(ToolPanel):
             "steps": self.steps,
             "instrument": self.instrument,
             "options": self.options,
-            "painted_is_unusable": self.masks,
+            "mask": self.masks,
         }
 
     def chosen_image(self) -> Any | None:
@@ -599,7 +567,7 @@ class ImagePanel(ToolPanel):
     def input_recipe(self, **parts: Any) -> preprocessing.Recipe:
         """Return the recipe of the common controls and other parts."""
         return preprocessing.Recipe(
-            source=self.source.chosen(),
+            source=self.source.recipe_source(),
             setup=self.setup.setup(),
             instrument=self._instrument(),
             **parts,
@@ -640,7 +608,7 @@ class ImagePanel(ToolPanel):
             "Setup": self.setup.summary,
             "Steps": rows.get("steps", ""),
         }
-        companions = (*on_image, self.source.layers.layer)
+        companions = (*on_image, self.source.layer)
         return {
             "recipe": recipe,
             "origins": {title: text for title, text in origins.items() if text},
@@ -650,15 +618,6 @@ class ImagePanel(ToolPanel):
 
 
 BOTH = " and "
-BRIGHTNESSES: forms.Kinds = {
-    "known": ("known (in the table)", None),
-    "free": ("unknown (fit it)", None),
-}
-NOISES: forms.Kinds = {
-    "": ("estimated from each image", None),
-    "poisson": ("Poisson counts", None),
-    "proportional": ("proportional to each pixel (film)", None),
-}
 
 
 def fields_of(kind: str) -> forms.Kinds:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from napari.layers import Layer, Shapes
-from qtpy.QtCore import QSignalBlocker, Signal
-from qtpy.QtWidgets import QCheckBox, QWidget
+from qtpy.QtCore import Signal
+from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.form import SteadyComboBox, labelled
+from napari_shadowinv._napari.events import without_proxy
+from napari_shadowinv._napari.form import Kinds, ModelPicker, labelled
 from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.layer_metadata import data_of, kind_of
 from napari_shadowinv._napari.placement import labels_on, mapped, matrix_between
@@ -198,10 +199,16 @@ BLOCK_PX = 8
 _MIN_STRUCTURE_RATIO, _MIN_RATIO_OF_PAIR = 2.0, 1.2
 
 
-class LayerPicker(SteadyComboBox):
-    """A combo box of layers; `none` is the entry for no layer, else the latest is selected."""
+LAYER = "layer"
+"""The kind of a choice that is a layer."""
 
-    picked = Signal()
+
+class LayerPicker(ModelPicker):
+    """A choice of a viewer's layers, of the types `kinds` and if they suit, or of other `entries`.
+
+    `none` is the entry for no layer. Without it, the latest layer is selected until one is chosen.
+    """
+
     edited = Signal()  # the data of the selected layer have changed
 
     def __init__(
@@ -212,63 +219,45 @@ class LayerPicker(SteadyComboBox):
         suits: Callable[[Any], bool] = lambda _: True,
         *,
         kinds: tuple[str, ...] = ("image",),
+        label: str | None = None,
+        entries: Kinds | None = None,
     ) -> None:
-        super().__init__()
-        self._viewer, self._kinds, self._none, self._suits = viewer, kinds, none, suits
-        self.is_chosen = False
-        self.offered: list[Any] = []
-        self.setToolTip(tip)
-        self.fill()
-        self.currentIndexChanged.connect(lambda _: self.picked.emit())
-        self.activated.connect(self._choose)
+        self._viewer, self._types, self._none = without_proxy(viewer), kinds, none
+        self._suits = suits
+        entries = entries or {"": (none or "none yet", None), LAYER: ("", None)}
+        super().__init__(label, entries, tip)
         qt.while_alive(self, viewer.layers, ("inserted", "removed"), self.fill)
         qt.layers_while_alive(self, viewer.layers, "name", self.fill)
         qt.layers_while_alive(self, viewer.layers, ("data", "paint"), self._on_edit)
 
     @property
+    def offered(self) -> list[Any]:
+        """The layers to choose from."""
+        layers = [layer for layer in self._viewer.layers if kind_of(layer) in self._types]
+        return [layer for layer in layers if self._suits(layer)]
+
+    @property
     def layer(self) -> Any | None:
-        index = self.currentIndex() - bool(self._none)
-        return self.offered[index] if 0 <= index < len(self.offered) else None
+        """The selected layer; None for no layer, or for another kind."""
+        value = self.choice.value
+        return None if isinstance(value, str) else value
 
     @layer.setter
     def layer(self, layer: Any | None) -> None:
-        self._choose()
-        self._select(layer)
+        self.set_kind("" if layer is None else layer)
 
-    def _choose(self, _: int = 0) -> None:
-        self.is_chosen = True
+    @property
+    def kind(self) -> str:
+        return super().kind if self.layer is None else LAYER
 
-    def _default(self) -> Any:
-        """Return the offered layer to begin with."""
-        return self.offered[-1]
+    def _entries(self, kind: str) -> list[tuple[str, Any]]:
+        if kind == LAYER:
+            return [(layer.name, layer) for layer in self.offered]
+        return super()._entries(kind) if kind or self._none or not self.offered else []
 
-    def _select(self, layer: Any | None) -> None:
-        if layer is None:
-            self.setCurrentIndex(0 if self._none else -1)
-        elif layer in self.offered:
-            self.setCurrentIndex(self.offered.index(layer) + bool(self._none))
-
-    def fill(self, _: Any = None) -> None:
-        """Offer the viewer's current layers; the selection stays while its layer exists."""
-        before = self.layer
-        offered = [
-            layer
-            for layer in self._viewer.layers
-            if kind_of(layer) in self._kinds and self._suits(layer)
-        ]
-        with QSignalBlocker(self):
-            self.clear()
-            self.offered = offered
-            if self._none:
-                self.addItem(self._none)
-            for layer in offered:
-                self.addItem(layer.name)
-            if before in offered:
-                self._select(before)
-            elif not self._none and offered:
-                self._select(self._default())
-        if self.layer is not before:
-            self.picked.emit()
+    def _preferred(self, before: Any) -> Sequence[Any]:
+        default = () if self._none else reversed(self.offered)
+        return self.chosen, before, *default, *self._kinds
 
     def _on_edit(self, event: Any) -> None:
         if event.source is self.layer:
@@ -366,37 +355,21 @@ _PAINT = {
 }
 
 
-class MaskPicker(QWidget):
+class MaskPicker(LayerPicker):
     """A layer of painted pixels, and their meaning, for the image that `image` returns."""
 
-    changed = Signal()
-
     def __init__(
-        self,
-        viewer: Any,
-        image: Callable[[], Any],
-        tip: str,
-        title: str = "Mask",
-        kinds: tuple[str, ...] = ("labels", "shapes"),
+        self, viewer: Any, image: Callable[[], Any], tip: str, title: str = "Mask"
     ) -> None:
-        super().__init__()
-        self._viewer, self._image, self.title = viewer, image, title
-        self.layers = LayerPicker(viewer, f"<qt>{tip}</qt>", "none", about.may_be_mask, kinds=kinds)
+        kinds = "labels", "shapes"
+        super().__init__(viewer, tip, "none", about.may_be_mask, kinds=kinds, label=title)
+        self._image, self.title = image, title
         target, meaning = _PAINT[title]
         tip = f"<qt>{meaning}</qt>"
         self.painted_is_unusable = QCheckBox(f"painted = {target}", checked=True, toolTip=tip)
-        row = qt.with_button(self.layers, "✎", f"Paint a {title.lower()}.", self.paint)
-        qt.column(self, labelled(title, row), labelled("", self.painted_is_unusable))
-        self.layers.picked.connect(self.changed)
+        self.add_button("✎", f"Paint a {title.lower()}.", self.paint)
+        self.layout().addWidget(labelled("", self.painted_is_unusable))
         self.painted_is_unusable.toggled.connect(self.changed)
-
-    @property
-    def layer(self) -> Any | None:
-        return self.layers.layer
-
-    @layer.setter
-    def layer(self, layer: Any | None) -> None:
-        self.layers.layer = layer
 
     def usable(self, image: Any) -> BoolArray | None:
         """Return the usable pixels of an image layer, of a stack's planes, or of files (None)."""
@@ -422,12 +395,12 @@ class MaskPicker(QWidget):
                 self.layer = layer
                 self.painted_is_unusable.setChecked(True)
 
-    def state(self) -> bool:
+    def state(self) -> dict[str, Any]:
         """Return the check box; layers belong to a session."""
-        return bool(self.painted_is_unusable.isChecked())
+        return {"painted_is_unusable": self.painted_is_unusable.isChecked()}
 
-    def restore(self, state: Any) -> None:
-        self.painted_is_unusable.setChecked(bool(state))
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self.painted_is_unusable.setChecked(bool(state["painted_is_unusable"]))
 
     @qt.notify_errors
     def paint(self) -> None:

@@ -151,6 +151,10 @@ class ResultLayers(QObject):
         earlier._timer.stop()
         self._layers, earlier._layers = earlier._layers, {}
 
+    def adopt(self, layers: Sequence[Any]) -> None:
+        """Update layers of an opened result with the next one."""
+        self._layers = {about.layer_key(layer): layer for layer in layers}
+
     def hide(self) -> None:
         for layer in self.layers:
             layer.visible = False

@@ -1,6 +1,6 @@
 """Where the shots of a window come from, and the store that their results go to.
 
-- a layer, files, a table of them, or a folder to watch: `ShotsPicker`
+- a layer, files, a table of them, or a folder to watch: `ShotPicker`
 - the store, and the choices of a run of many shots: `StoreSection`
 """
 
@@ -10,26 +10,27 @@ import os
 from pathlib import Path
 from typing import Any
 
-from qtpy.QtCore import QSignalBlocker, Signal
-from qtpy.QtWidgets import QFileDialog, QWidget
+from pydantic import Field, create_model
+from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
+from napari_shadowinv._napari.widgets._layers import LAYER
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.store import STORE_SUFFIX
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.pipeline.shot_table import is_table
 
-LAYER, FILES, TABLE, FOLDER = "layer", "files", "table", "folder"
-_PLACES = {FILES: "Files…", TABLE: "Table (.csv)…", FOLDER: "Watched folder…"}
+FILES, TABLE, FOLDER = "files", "table", "folder"
 _MISSING = {
+    FILES: "no files are selected: enter a pattern such as shots/*.tif, or choose files",
     TABLE: "no table is selected: choose a .csv file with a row for each shot, with the columns "
     "file and energy or wavelength",
     FOLDER: "no folder is selected: choose the folder in which the shots appear",
 }
-_SEPARATOR = "; "
 ONCE = {"overwrite", "redo_failed"}
 """Choices that count for one run."""
 
@@ -39,31 +40,55 @@ def lasting(values: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in values.items() if key not in ONCE}
 
 
-def _ask_for_files(edit: forms.PathEdit) -> str:
-    return _SEPARATOR.join(QFileDialog.getOpenFileNames(edit, edit.title)[0])
-
-
-def _ask_for_folder(edit: forms.PathEdit) -> str:
-    return str(QFileDialog.getExistingDirectory(edit, edit.title, edit.path))
-
-
-def _ask_for_store(edit: forms.PathEdit) -> str:
-    # Choosing an existing store is safe: it is resumed unless 'Overwrite' is checked.
-    path, _ = QFileDialog.getSaveFileName(
-        edit,
-        edit.title,
-        edit.path or f"results{STORE_SUFFIX}",
-        f"stores (*{STORE_SUFFIX})",
-        options=QFileDialog.Option.DontConfirmOverwrite,
+def _place(title: str, dialog: str, example: str, description: str) -> type[CheckedModel]:
+    """Return the model of a path."""
+    extra: Any = {"path": dialog}
+    words: Any = {"title": title, "description": description, "examples": [example]}
+    return create_model(
+        title, __base__=CheckedModel, path=(str, Field("", json_schema_extra=extra, **words))
     )
-    # A store is a folder, which the dialog enters.
-    for folder in (Path(path), *Path(path).parents) if path else ():
-        if folder.name.endswith(STORE_SUFFIX):
-            return str(folder)
-    return path + STORE_SUFFIX if path else ""
 
 
-class _ShotChoice(layers.LayerPicker):
+_PLACES: forms.Kinds = {
+    FILES: (
+        "Files…",
+        _place(
+            "Files",
+            "files",
+            "shots/*.tif",
+            "A pattern such as shots/*.tif, files separated by ;, or a file of frames.",
+        ),
+    ),
+    TABLE: (
+        "Table (.csv)…",
+        _place(
+            "Table",
+            "file",
+            "shots.csv",
+            "A table (.csv) with a row for each shot and the columns file, setup, energy or "
+            "wavelength, brightness, mask, source, exclude.",
+        ),
+    ),
+    FOLDER: (
+        "Watched folder…",
+        _place(
+            "Folder",
+            "folder",
+            "folder",
+            "Each new file in this folder is inverted as soon as it is complete, until you press "
+            "Cancel.",
+        ),
+    ),
+}
+_STORE = _place(
+    "Store",
+    "new",
+    f"results{STORE_SUFFIX}",
+    f"Folder for the results, named …{STORE_SUFFIX}. If it exists, the run is resumed.",
+)
+
+
+class ShotPicker(layers.LayerPicker):
     """A layer, or another place that shots come from.
 
     Until one is chosen, it is the image of an object rather than that of a beam, by names or
@@ -71,147 +96,75 @@ class _ShotChoice(layers.LayerPicker):
     """
 
     def __init__(self, viewer: Any) -> None:
+        entries: forms.Kinds = {"": ("no image is open", None), LAYER: ("", None), **_PLACES}
         tip = (
-            "<qt>Layer of a shot, or of a stack of shots; or shots in files, which are inverted "
-            "into one store.</qt>"
+            "Layer of a shot, or of a stack of shots; or shots in files, which are inverted into "
+            "one store."
         )
-        super().__init__(viewer, tip, suits=about.may_be_shot)
-        self.setPlaceholderText("no image is open")
-        qt.while_alive(self, viewer.layers, "inserted", self._on_insertion)
+        self._compared: list[Any] = []
+        super().__init__(viewer, tip, suits=about.may_be_shot, label="Image", entries=entries)
 
-    def _default(self) -> Any:
-        *earlier, best = self._recorded or self.offered
-        for layer in reversed(earlier):
-            if self._is_better(layer, best):
+    def _preferred(self, before: Any) -> Any:
+        recorded = [layer for layer in self.offered if not about.belongs_to_result(layer)]
+        candidates, best = [*recorded], before
+        if before in recorded:
+            candidates = [layer for layer in recorded if layer not in self._compared]
+        elif candidates:
+            best = candidates.pop()
+        for layer in reversed(candidates):
+            if layers.is_rather_shot(layer, best, is_pair=len(recorded) == 2):
                 best = layer
-        return best
-
-    def _on_insertion(self, event: Any) -> None:
-        current, new = self.layer, event.value
-        if self.is_chosen or current is None or new is current or new not in self.offered:
-            return
-        if self._is_better(new, current):
-            self._select(new)
-
-    @property
-    def _recorded(self) -> list[Any]:
-        return [layer for layer in self.offered if not about.belongs_to_result(layer)]
-
-    def _is_better(self, layer: Any, other: Any) -> bool:
-        return layers.is_rather_shot(layer, other, is_pair=len(self._recorded) == 2)
-
-    @property
-    def kind(self) -> str:
-        return str(self.currentData() or LAYER)
-
-    def fill(self, _: Any = None) -> None:
-        layer, kind = self.layer, self.kind
-        with QSignalBlocker(self):
-            super().fill()
-            if self.offered:
-                self.insertSeparator(self.count())
-            for key, title in _PLACES.items():
-                self.addItem(title, key)
-            if kind != LAYER:
-                self.setCurrentIndex(self.findData(kind))
-            elif not self.offered:
-                self.setCurrentIndex(-1)
-        if self.layer is not layer:
-            self.picked.emit()
-
-
-class ShotsPicker(QWidget):
-    """Where shots come from: a layer, files, a table of them, or a folder to watch."""
-
-    changed = Signal()
-
-    def __init__(self, viewer: Any) -> None:
-        super().__init__()
-        self.layers = _ShotChoice(viewer)
-        self.files = forms.PathEdit(
-            "Files of the shots",
-            "shots/*.tif",
-            "A pattern such as shots/*.tif, files separated by ;, or a file of frames.",
-            ask=_ask_for_files,
-        )
-        self.table = forms.PathEdit(
-            "Table of the shots",
-            "shots.csv",
-            "A table (.csv) with a row for each shot and the columns file, setup, energy or "
-            "wavelength, brightness, mask, source, exclude.",
-            qt.TABLES,
-        )
-        self.folder = forms.PathEdit(
-            "Folder to watch",
-            "folder",
-            "Each new file in this folder is inverted as soon as it is complete, until you press "
-            "Cancel.",
-            ask=_ask_for_folder,
-        )
-        self.paths = {FILES: self.files, TABLE: self.table, FOLDER: self.folder}
-        self._rows = {kind: forms.labelled("", path) for kind, path in self.paths.items()}
-        qt.column(self, forms.labelled("Image", self.layers), *self._rows.values())
-        self.layers.picked.connect(self._on_choice)
-        for path in self.paths.values():
-            path.changed.connect(self.changed)
-        self._on_choice()
-
-    @property
-    def kind(self) -> str:
-        return self.layers.kind
-
-    def set_kind(self, kind: str) -> None:
-        """Take the shots from files, a table or a folder."""
-        self.layers.setCurrentIndex(self.layers.findData(kind))
-
-    def _on_choice(self) -> None:
-        for kind, row in self._rows.items():
-            row.setVisible(kind == self.kind)
-        self.changed.emit()
+        self._compared = recorded
+        return self.chosen, best, *super()._preferred(before)
 
     @property
     def is_stack(self) -> bool:
-        layer = self.layers.layer
-        return self.kind != LAYER or (layer is not None and layer.ndim > 2)
+        return self.kind in _MISSING or (self.layer is not None and self.layer.ndim > 2)
 
     @property
     def name(self) -> str:
         """The name of the shots, such as a path."""
-        if self.kind in self.paths:
-            return self.paths[self.kind].path
-        return "" if self.layers.layer is None else str(self.layers.layer.name)
+        if self.form is not None:
+            return str(self.form.state().get("path", "")).strip()
+        return "" if self.layer is None else str(self.layer.name)
+
+    @property
+    def _paths(self) -> list[str]:
+        parts = [part.strip() for part in self.name.split(forms.PATH_SEPARATOR.strip())]
+        return [os.path.expanduser(part) for part in parts if part]
 
     @property
     def default_store(self) -> str:
         """The store beside the files; empty for a layer, or without files."""
-        path = Path(self.name.split(_SEPARATOR.strip())[0].strip()).expanduser()
+        if self.form is None or not self._paths:
+            return ""
+        path = Path(self._paths[0])
         if self.kind == FILES:
             path = path.parent  # shots/*.tif
-        has_name = self.kind != LAYER and path.name
-        return str(path.with_name(path.stem + STORE_SUFFIX)) if has_name else ""
+        return str(path.with_name(path.stem + STORE_SUFFIX)) if path.name else ""
+
+    def choose_path(self) -> None:
+        """Ask for the files, the table or the folder."""
+        if self.form is not None:
+            self.form.entries["path"].choose_path()
 
     def shots(self) -> Any:
         """Return the shots of a stack for a run, or raise an `InputError`."""
-        if self.kind == LAYER:
-            return layers.stack_of(self.layers.layer)
-        if self.kind in _MISSING:
-            if not self.name:
-                raise InputError(_MISSING[self.kind])
-            path = Path(self.name).expanduser()
-            if self.kind == TABLE and not (path.is_file() and is_table(path)):
-                found = "is no table" if path.is_file() else "does not exist"
-                raise InputError(
-                    f"{path} {found}: expected a .csv file that begins with names of "
-                    "columns, such as file and energy"
-                )
-            return path
-        parts = [part.strip() for part in self.files.path.split(_SEPARATOR.strip())]
-        paths = [os.path.expanduser(part) for part in parts if part]
+        if self.form is None:
+            return layers.stack_of(self.layer)
+        paths = self._paths
         if not paths:
+            raise InputError(_MISSING[self.kind])
+        if self.kind == FILES:
+            return paths[0] if len(paths) == 1 else paths
+        path = Path(self.name).expanduser()
+        if self.kind == TABLE and not (path.is_file() and is_table(path)):
+            found = "is no table" if path.is_file() else "does not exist"
             raise InputError(
-                "no files are selected: enter a pattern such as shots/*.tif, or choose files"
+                f"{path} {found}: expected a .csv file that begins with names of columns, such as "
+                "file and energy"
             )
-        return paths[0] if len(paths) == 1 else paths
+        return path
 
 
 class StoreSection(QWidget):
@@ -219,33 +172,32 @@ class StoreSection(QWidget):
 
     def __init__(self) -> None:
         super().__init__()
-        tip = f"Folder for the results, named …{STORE_SUFFIX}. If it exists, the run is resumed."
-        self.folder = forms.PathEdit(
-            "Store of the results", f"results{STORE_SUFFIX}", tip, ask=_ask_for_store
-        )
+        self.folder = forms.ModelForm(_STORE)
         self.run, self.watch = forms.ModelForm(RunOptions), forms.ModelForm(WatchOptions)
-        run = forms.section("Run of many shots", self.run, self.watch)
         self._proposed = ""
-        qt.column(self, forms.labelled("Store", self.folder), run)
+        qt.column(self, self.folder, forms.section("Run of many shots", self.run, self.watch))
 
     @property
     def path(self) -> Path:
-        if not self.folder.path:
+        """The store, also if the dialog entered it; an `InputError` without one."""
+        stated = str(self.folder.state().get("path", "")).strip()
+        if not stated:
             raise InputError(
                 "no store is selected for the results: choose a folder whose name ends with "
                 f"{STORE_SUFFIX}"
             )
-        return Path(self.folder.path).expanduser()
+        path = Path(stated).expanduser()
+        stores = [each for each in (path, *path.parents) if each.name.endswith(STORE_SUFFIX)]
+        return stores[0] if stores else path
 
-    def follow(self, shots: ShotsPicker) -> None:
+    def follow(self, shots: ShotPicker) -> None:
         """Show the choices for a kind of shots, and their store unless the user chose another."""
-        kind = shots.kind
-        if self.folder.path in ("", self._proposed):
+        if self.folder.state().get("path", "") in ("", self._proposed):
             self._proposed = shots.default_store
-            self.folder.restore(self._proposed)
+            self.folder.restore({"path": self._proposed})
         # Watched shots are inverted one by one, as they arrive.
-        self.run.setVisible(kind != FOLDER)
-        self.watch.setVisible(kind == FOLDER)
+        self.run.setVisible(shots.kind != FOLDER)
+        self.watch.setVisible(shots.kind == FOLDER)
 
     def options(self, kind: str) -> Any:
         """Return the options of a run, or raise an `InputError`."""

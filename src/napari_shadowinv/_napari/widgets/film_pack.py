@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from napari.utils.notifications import show_info
+from pydantic import Field
 from qtpy import QtWidgets
 from qtpy.QtCore import QObject, Qt
 
@@ -25,6 +26,7 @@ from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, mask_of, new_shapes
 from napari_shadowinv._napari.widgets._results import ResultLayers
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import checked_corners
@@ -184,6 +186,16 @@ def draw_spectrum(axes: Any, spectrum: Spectrum, where: str, ink: str) -> None:
     axes.set_ylabel(f"fluence ({packs.PER_AREA})")
 
 
+class _PackFile(CheckedModel):
+    file: Path | None = Field(
+        default=None,
+        title="Pack",
+        description="TOML file with films, filters, scans and calibrations, as for the command "
+        "<code>shadowinv film</code>.",
+        examples=["pack.toml"],
+    )
+
+
 class FilmPack(panels.ToolPanel):
     """Choose a pack file, then press Run; correct corners and masks, and press it again."""
 
@@ -203,25 +215,23 @@ class FilmPack(panels.ToolPanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.path = forms.PathEdit(
-            "Pack file",
-            "pack.toml",
-            "TOML file with films, filters, scans and calibrations, as for the command "
-            "<code>shadowinv film</code>.",
-        )
+        self.file = forms.ModelForm(_PackFile)
         self.report = panels.ReportView()
         self.packs = LayerPicker(
             self.viewer,
-            "<qt>Fluence of a pack, from a run or from a .shadowinv file.</qt>",
+            "Fluence of a pack, from a run or from a .shadowinv file.",
             suits=lambda layer: about.role_of(layer) == packs.FLUENCE,
+            label="Result",
         )
         self.regions = LayerPicker(
             self.viewer,
-            "<qt>Shapes or labels. The spectrum is the mean over the usable pixels inside.</qt>",
+            "Shapes or labels. The spectrum is the mean over the usable pixels inside.",
             "whole film",
             about.may_be_mask,
             kinds=("shapes", "labels"),
+            label="Region",
         )
+        self.regions.add_button("✎", "Draw a region.", self._draw_region)
         self.spectrum: Spectrum | None = None  # shown
         self.plot = qt.Plot(_PLOT_HEIGHT_PX, fixed=True)
         self.plot.setToolTip(
@@ -251,18 +261,17 @@ class FilmPack(panels.ToolPanel):
         )
         self.save = qt.push_button("Save…", "Save the result as a .shadowinv file.", self._save)
         self.actions = QtWidgets.QWidget()
-        region = qt.with_button(self.regions, "✎", "Draw a region.", self._draw_region)
         column = qt.column(
             self.actions,
-            forms.labelled("Result", self.packs),
+            self.packs,
             self.report,
-            forms.labelled("Region", region),
+            self.regions,
             self.plot,
             qt.side_by_side((self.show_corners, 1), (self.paint, 1)),
             qt.side_by_side((self.to_fit, 1), (self.write, 1), (self.save, 1)),
         )
         column.setAlignment(Qt.AlignmentFlag.AlignTop)
-        self.add(forms.labelled("Pack", self.path), self.keep_earlier, self.panel, self.actions)
+        self.add(self.file, self.keep_earlier, self.panel, self.actions)
         self.corners = CornerEditor(self.viewer, self)
 
     def request(self) -> PackJob:
@@ -270,7 +279,8 @@ class FilmPack(panels.ToolPanel):
 
         Another file than the result's has none of them.
         """
-        file = str(Path(self.path.path).expanduser().absolute()) if self.path.path else ""
+        stated = self.file.state().get("file", "").strip()
+        file = str(Path(stated).expanduser().absolute()) if stated else ""
         layer = self.packs.layer
         corrections: tuple[Any, ...] = ()
         metadata = {} if layer is None else about.metadata_of(layer)
@@ -300,8 +310,15 @@ class FilmPack(panels.ToolPanel):
     def show_result(self, finished: Finished, job: PackJob) -> None:
         self.corners.close()
         self.results = self._last.layers_for_next(job.path or job.name)
+        if not (self.results.layers or self.keep_earlier.isChecked()):
+            self.results.adopt(self._opened(job.name))
         self.results.complete.connect(self._follow_result)
         self.results.show(finished.layer_data, fit=not self.viewer.layers)
+
+    def _opened(self, name: str) -> list[Any]:
+        """Return the layers of a pack's result that was opened from a file."""
+        of_pack = [layer for layer in self.viewer.layers if about.metadata_of(layer).get("films")]
+        return [layer for layer in of_pack if name_of_result(layer) == name]
 
     def _follow_result(self) -> None:
         for layer in self.results.layers:
@@ -329,7 +346,7 @@ class FilmPack(panels.ToolPanel):
         self.actions.setVisible(has_result)
         if has_result:
             # The file of an opened result is unknown: Run then uses the pack in the result.
-            self.path.restore(about.metadata_of(self.packs.layer).get("path", ""))
+            self.file.restore({"file": about.metadata_of(self.packs.layer).get("path") or None})
             facts = self._selected()[1].facts
             self.report.show_rows([*panels.fact_rows(facts), *panels.warning_rows(facts)])
         self.update_plot()

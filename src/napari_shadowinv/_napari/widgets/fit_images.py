@@ -37,6 +37,9 @@ from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.preprocessing import FIT_STEPS, MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.shot import Shot
 
+# Choices of a fit that other controls of the window make.
+_ELSEWHERE = {"fields", "beam", "psf", "source_size", "resolution", "options"}
+
 
 def _cautions_of(images: Sequence[Any]) -> dict[str, str]:
     """Return the warnings of the images' readers as a row of the report."""
@@ -46,6 +49,14 @@ def _cautions_of(images: Sequence[Any]) -> dict[str, str]:
         for caution in layers.cautions_of(image)
     ]
     return {"Warning": "; ".join(texts)} if texts else {}
+
+
+def _has_recorded_beam(image: Any | None) -> bool:
+    """Whether an image belongs to a result with its beam, which no fit has found."""
+    result = None if image is None else about.result_of(image)
+    provenance = None if result is None else result.content.provenance
+    origins = () if provenance is None else provenance.images
+    return bool(origins) and all(origin.source is not None for origin in origins)
 
 
 class FitImages(inputs.ImagePanel):
@@ -79,18 +90,8 @@ class FitImages(inputs.ImagePanel):
         self.fields = forms.ModelPicker(
             "Fields", {}, "Field that deflects the beam. Two fields require images at two energies."
         )
-        self.brightness = forms.ModelPicker(
-            "Brightness",
-            inputs.BRIGHTNESSES,
-            "Brightness of each image relative to the source: known, or fitted. With an unknown "
-            "source, it is always fitted.",
-        )
-        self.noise = forms.ModelPicker(
-            "Noise",
-            inputs.NOISES,
-            "Noise model for χ² and error bars. Poisson counts: the images are numbers of "
-            "particles or photons.",
-        )
+        others = FitChoices.model_fields.keys() - _ELSEWHERE
+        self.choices = forms.ModelForm(FitChoices, sorted(others))
         self.setup_section = forms.titled_section(self.setup)
         self.cost = forms.WrappingLabel()
         tip = (
@@ -98,7 +99,7 @@ class FitImages(inputs.ImagePanel):
             "for other programs (.h5)."
         )
         self.view = ResultView(self, self._last, Fit, tip)
-        self.add(self.images, self.fields, self.source, self.masks, self.brightness, self.noise)
+        self.add(self.images, self.fields, self.source, self.masks, self.choices)
         self.add(self.setup_section, *self.settings)
         self.add(side_by_side((self.keep_earlier, 1), (self.recipes, 0)), self.cost, self.panel)
         self.add(self.view)
@@ -108,7 +109,7 @@ class FitImages(inputs.ImagePanel):
         self.images.changed.connect(self._show_beams)
         self.source.changed.connect(self.images.fill)
         self.setup.changed.connect(self._on_setup)
-        self.brightness.changed.connect(self._show_beams)
+        self.choices.changed.connect(self._show_beams)
         for part in self.parts().values():
             part.changed.connect(lambda *_: self.keep())
             part.changed.connect(lambda *_: self._show_cost())
@@ -116,18 +117,16 @@ class FitImages(inputs.ImagePanel):
             signal.connect(self._show_cost)
 
     def parts(self) -> dict[str, Any]:
-        choices = {"fields": self.fields, "brightness": self.brightness, "noise": self.noise}
-        return {**super().parts(), **choices}
+        return {**super().parts(), "fields": self.fields, "choices": self.choices}
 
     def recipe(self) -> Recipe:
         """Return the recipe of the controls, without table and layers; or raise an `InputError`."""
-        fields = tuple(self.fields.kind.split(inputs.BOTH))
-        choices = FitChoices(
-            fields=fields,
-            beam="unknown" if self.source.kind == inputs.UNKNOWN else "known",
-            brightness=self.brightness.kind,
-            noise=self.noise.kind or None,
-            options=self.options.model(),
+        choices = self.choices.model().model_copy(
+            update={
+                "fields": tuple(self.fields.kind.split(inputs.BOTH)),
+                "beam": "unknown" if self.source.kind == inputs.UNKNOWN else "known",
+                "options": self.options.model(),
+            }
         )
         return self.input_recipe(steps=self.steps.steps(), fit=choices)
 
@@ -156,7 +155,7 @@ class FitImages(inputs.ImagePanel):
         self.show_inputs(recipe, path)
         self.show_choices(choices)
         if beam is not None:
-            (self.source.layers.layer,) = add_layers(self.viewer, layers_of_shot(beam)[-1:])
+            (self.source.layer,) = add_layers(self.viewer, layers_of_shot(beam)[-1:])
         self.source.show(recipe.source, choices.beam)
 
     def chosen_image(self) -> Any | None:
@@ -171,7 +170,7 @@ class FitImages(inputs.ImagePanel):
     def check_choices(self, choices: FitChoices, setup: Setup | None, path: Path) -> None:
         """Refuse choices that do not match a setup, or else the shown setup."""
         fields = choices.fields
-        available = inputs.fields_of(self.setup.picker.kind if setup is None else setup.kind)
+        available = inputs.fields_of(self.setup.kind if setup is None else setup.kind)
         in_metres = choices.source_size is not None or choices.resolution is not None
         if in_metres and setup is None and self.setup.complete_setup() is None:
             raise InputError(
@@ -188,11 +187,7 @@ class FitImages(inputs.ImagePanel):
         """Show the choices of a recipe."""
         if choices.fields is not None:
             self.fields.set_kind(inputs.field_key(choices.fields))
-        self.brightness.set_kind(choices.brightness)
-        noise = "" if choices.noise is None else str(choices.noise)
-        level = f"σ = {noise} in each pixel", None
-        self.noise.offer(inputs.NOISES | {noise: inputs.NOISES.get(noise, level)})
-        self.noise.set_kind(noise)
+        self.choices.restore(choices.model_dump(exclude=_ELSEWHERE))
         self.options.restore(choices.options.model_dump())
         for image in self.images.used:
             width = self._spread(choices, image)
@@ -224,7 +219,7 @@ class FitImages(inputs.ImagePanel):
         """Return the images, lazy if their layers are, with all their settings."""
         rows = [self.images.values(image) for image in images]
         # One that is 1 for all need not be said.
-        is_known = self.brightness.kind != "free" and any(row["brightness"] != 1 for row in rows)
+        is_known = self._is_brightness_known and any(row["brightness"] != 1 for row in rows)
         return tuple(
             replace(
                 shot_of_layer(image, layers.image_of(image)),
@@ -300,11 +295,8 @@ class FitImages(inputs.ImagePanel):
     def _on_reference(self) -> None:
         """Show the setup of a new reference; without a setup it gets the last one."""
         image, old_setup = self.images.reference, self.setup.complete_setup()
-        # Other images show the same object: none of them is the beam of another, and the beam that
-        # a fit has found was not measured.
-        has_beam = image is not None and about.result_of(image) is not None
-        has_beam = has_beam and about.source_of(image) is not None
-        self.source.follow(image if has_beam else None)
+        # Other images show the same object: none of them is the beam of another.
+        self.source.follow(image if _has_recorded_beam(image) else None)
         self.setup.follow(image)
         if image is not None:
             self.masks.follow(image)
@@ -326,7 +318,7 @@ class FitImages(inputs.ImagePanel):
             self.setup_section.collapse(animate=False)
 
     def _on_setup(self) -> None:
-        self.fields.offer(inputs.fields_of(self.setup.picker.kind))
+        self.fields.offer(inputs.fields_of(self.setup.kind))
         setup = self.setup.complete_setup()
         summary = "none" if setup is None else f"{setup.probe}, {self.setup.origin}"
         self.setup_section.setText(f"Setup: {summary}")
@@ -334,6 +326,10 @@ class FitImages(inputs.ImagePanel):
         self._show_beams()
 
     def _show_beams(self) -> None:
-        form = self.setup.picker.form
+        form = self.setup.form
         beam = None if form is None else form.state().get(self.images.beam.name)
-        self.images.show_beams(self.setup.picker.kind, beam, self.brightness.kind == "known")
+        self.images.show_beams(self.setup.kind, beam, self._is_brightness_known)
+
+    @property
+    def _is_brightness_known(self) -> bool:
+        return self.choices.state().get("brightness") != "free"

@@ -26,7 +26,7 @@ from napari_shadowinv._napari.widgets._inputs import (
 )
 from napari_shadowinv._napari.widgets._panels import ResultView
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
-from napari_shadowinv._napari.widgets._shot_inputs import FOLDER, ShotsPicker, StoreSection, lasting
+from napari_shadowinv._napari.widgets._shot_inputs import FOLDER, ShotPicker, StoreSection, lasting
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob, StackView, placement_on
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._typing import FloatArray
@@ -74,8 +74,7 @@ class Invert(ImagePanel):
         self._ready = True
 
     def _build(self) -> None:
-        self.shots = ShotsPicker(self.viewer)
-        self.image = self.shots.layers
+        self.image = ShotPicker(self.viewer)
         self.make_inputs(
             SHOT_SOURCES,
             "The beam without the object: ideally a measured reference image, otherwise uniform "
@@ -91,9 +90,10 @@ class Invert(ImagePanel):
             "Source mask",
         )
         self.mask_pickers["source_mask"] = self.source_masks
-        tip = "<qt>Shapes layer with a rectangle; only the image inside is inverted.</qt>"
-        self.crop = layers.LayerPicker(self.viewer, tip, "none", kinds=("shapes",))
-        crop = qt.with_button(self.crop, "✎", "Draw a rectangle.", self._draw_crop)
+        tip = "Shapes layer with a rectangle; only the image inside is inverted."
+        kinds: Any = ("shapes",)
+        self.crop = layers.LayerPicker(self.viewer, tip, "none", kinds=kinds, label="Crop")
+        self.crop.add_button("✎", "Draw a rectangle.", self._draw_crop)
         tip = f"<qt>Update the field after each change, with at most {PREVIEW_SITES:,} sites.</qt>"
         self.live = QCheckBox("Live preview", toolTip=tip)
         self.store = StoreSection()
@@ -110,26 +110,25 @@ class Invert(ImagePanel):
             "Show source", "Add the estimated beam as an image layer.", self._show_source
         )
         self._source_row = forms.labelled("", self.show_source)
-        self._crop_row = forms.labelled("Crop", crop)
-        self.add(self.shots, self.source, self._source_row, self.source_masks, self.setup)
+        self.add(self.image, self.source, self._source_row, self.source_masks, self.setup)
         self.add(self.store, self.cost, self.panel, self.view, self.stack_view)
         self.add(self.refine_section)
-        self.add(forms.section("Mask and crop", self.masks, self._crop_row), *self.settings)
+        self.add(forms.section("Mask and crop", self.masks, self.crop), *self.settings)
         self.add(self.keep_earlier, qt.side_by_side((self.live, 1), (self.recipes, 0)))
 
     def _connect(self) -> None:
-        self.shots.changed.connect(self._on_shots)
+        self.image.changed.connect(self._on_shots)
         self.image.edited.connect(self._forget_report)
         self.panel.progressed.connect(self._on_progress)
         changes = [control.changed for control in self.parts().values()]
-        masks = self.masks.layers, self.source_masks.layers
-        edits = [each.edited for each in (self.image, *masks, self.crop, self.source.layers)]
+        picked = self.image, self.masks, self.source_masks, self.crop, self.source
+        edits = [picker.edited for picker in picked]
         for signal in (*changes, self.live.toggled, self.crop.picked, *edits):
             signal.connect(self.on_change)
 
     def parts(self) -> dict[str, Any]:
         choices = {"run": self.store.run, "watch": self.store.watch}
-        return {**super().parts(), "painted_is_object": self.source_masks, **choices}
+        return {**super().parts(), "source_mask": self.source_masks, **choices}
 
     def state(self) -> dict[str, Any]:
         state = super().state()
@@ -143,8 +142,8 @@ class Invert(ImagePanel):
 
     def choose_folder(self) -> None:
         """Take the shots from a watched folder, and ask which."""
-        self.shots.set_kind(FOLDER)
-        self.shots.folder.choose()
+        self.image.set_kind(FOLDER)
+        self.image.choose_path()
 
     @qt.notify_errors
     def edit_setup(self, layer: Any) -> None:
@@ -161,7 +160,7 @@ class Invert(ImagePanel):
 
     def all_steps(self) -> tuple[Step, ...]:
         """Return the preprocessing steps, the crop first, or raise an `InputError`."""
-        has_crop = not self.shots.is_stack
+        has_crop = not self.image.is_stack
         crop = layers.crop_of(self.crop.layer, self.chosen_image()) if has_crop else None
         steps = self.steps.steps()
         return steps if crop is None else (crop, *steps)
@@ -169,7 +168,7 @@ class Invert(ImagePanel):
     def show_recipe(self, recipe: Recipe, path: Path) -> None:
         image: Any = self.chosen_image()
         crop, steps = None, recipe.steps
-        can_crop = image is not None and not self.shots.is_stack
+        can_crop = image is not None and not self.image.is_stack
         if can_crop and steps and isinstance(steps[0], Crop):
             height, width = image.data.shape[-2:]
             crop, steps = steps[0].slices((height, width)), steps[1:]
@@ -188,7 +187,7 @@ class Invert(ImagePanel):
         return self.input_recipe(steps=self.all_steps(), options=self.options.model())
 
     def request(self, preview: bool = False) -> jobs.InversionJob | StackJob:
-        layer, is_stack = self.image.layer, self.shots.is_stack
+        layer, is_stack = self.image.layer, self.image.is_stack
         image = None if is_stack else layers.image_of(layer)
         if not preview:
             self.setup.keep()
@@ -200,17 +199,17 @@ class Invert(ImagePanel):
         chosen = (self.masks.layer, self.source_masks.layer, self.crop.layer)
         source_mask = self.source_masks.summary(layer) if self.source.is_estimated else ""
         described = self.describe(
-            layer, recipe, chosen, name=self.shots.name, source_mask=source_mask
+            layer, recipe, chosen, name=self.image.name, source_mask=source_mask
         )
         if is_stack:
             return StackJob(
-                shots=self.shots.shots(),
+                shots=self.image.shots(),
                 out=self.store.path,
                 source=source,
                 mask=mask,
                 source_mask=hidden,
                 placement={} if layer is None else placement_on(layer, recipe),
-                options=self.store.options(self.shots.kind),
+                options=self.store.options(self.image.kind),
                 **described,
             )
         shot = replace(
@@ -258,7 +257,7 @@ class Invert(ImagePanel):
         if self.is_busy:
             return
         layer: Any = self.image.layer
-        image, source = layers.image_of(layer), self.source.chosen()
+        image, source = layers.image_of(layer), self.source.recipe_source()
         assert isinstance(source, Estimate)  # without one the button is hidden
         estimate = source.adapt_to(self.setup.setup(), image.shape)
         hidden = self._hidden_from_source(layer)
@@ -329,7 +328,7 @@ class Invert(ImagePanel):
         self.keep()
         self._start_preview()
         self.source_masks.setVisible(self.source.is_estimated)
-        self._source_row.setVisible(self.source.is_made and not self.shots.is_stack)
+        self._source_row.setVisible(self.source.is_made and not self.image.is_stack)
         self._show_cost()
 
     def showEvent(self, event: Any) -> None:
@@ -337,7 +336,7 @@ class Invert(ImagePanel):
         self._start_preview()
 
     def _start_preview(self) -> None:
-        if self._ready and self.live.isChecked() and not self.shots.is_stack:
+        if self._ready and self.live.isChecked() and not self.image.is_stack:
             self._preview_timer.start()
 
     def _preview(self) -> None:
@@ -365,14 +364,14 @@ class Invert(ImagePanel):
 
     def _on_shots(self) -> None:
         """Show the source, setup and choices of another image or of other files."""
-        layer, is_stack = self.image.layer, self.shots.is_stack
-        self.store.follow(self.shots)
+        layer, is_stack = self.image.layer, self.image.is_stack
+        self.store.follow(self.image)
         for row in (self.store, self.stack_view):
             row.setVisible(is_stack)
-        for row in (self._crop_row, self.live, self.keep_earlier, self.refine_section):
+        for row in (self.crop, self.live, self.keep_earlier, self.refine_section):
             row.setVisible(not is_stack)
         self.source.follow(layer)
-        self.setup.follow(layer, self.shots.name if layer is None else "")
+        self.setup.follow(layer, self.image.name if layer is None else "")
         if layer is not None:
             self.masks.follow(layer)
         self._forget_report()
