@@ -456,7 +456,7 @@ def test_closing_the_dock_ends_the_fit(
     tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.restore({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.panel.tag.progress.history), timeout=PATIENCE)
+    qtbot.waitUntil(lambda: bool(tool.panel.tag.history), timeout=PATIENCE)
     stop = tool.panel._box.stop
     window.window.remove_dock_widget(tool)
     tool.deleteLater()

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import html
+import math
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -41,6 +42,7 @@ _WRITE_DELAY_MS = 300  # a moving slider is written once
 # Errors that a saved state causes which another version wrote in another form.
 _UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
 _REDRAW_MS = 500
+_CURVE_HEIGHT_PX = 210
 _MIN_REDRAW_RATIO = 10  # interval over the time of a drawing
 
 
@@ -243,7 +245,7 @@ class ResultView(QtWidgets.QWidget):
         self._result: Result[Any] | None = None
         self._recipe: Recipe | None = None  # that was run for the result, if it is the form's
         self.changes = forms.WrappingLabel()
-        self.curve = qt.ObjectiveCurve()
+        self.curve = qt.Plot(_CURVE_HEIGHT_PX, fixed=True)
         self.verdict = VerdictLine()
         self.save_result = qt.push_button("Save result…", save_tip, self.save)
         tip = "Add potential, components of the field, re-projection, sites and other layers."
@@ -263,7 +265,8 @@ class ResultView(QtWidgets.QWidget):
         """Clear the report of the last result; its layers stay."""
         self._result = self._recipe = None
         self.changes.show_text("")
-        self.curve.empty()
+        self._drawn_steps = 0
+        self.curve.setVisible(False)
         self.verdict.show_text("")
         self.report.empty()
 
@@ -334,15 +337,20 @@ class ResultView(QtWidgets.QWidget):
             self._redraw_timer.start()
 
     def _draw(self) -> None:
-        job = self._tool.panel.tag
-        if isinstance(job, FitJob):
-            start = time.perf_counter()
-            self.curve.show_steps(list(job.history))
-            # A slow screen must not delay the fit and the window.
-            elapsed_ms = 1000 * (time.perf_counter() - start)
-            self._redraw_timer.setInterval(max(_REDRAW_MS, round(_MIN_REDRAW_RATIO * elapsed_ms)))
+        start = time.perf_counter()
+        self._draw_steps(self._tool.panel.tag)
+        # A slow screen must not delay the fit and the window.
+        elapsed_ms = 1000 * (time.perf_counter() - start)
+        self._redraw_timer.setInterval(max(_REDRAW_MS, round(_MIN_REDRAW_RATIO * elapsed_ms)))
+
+    def _draw_steps(self, job: Any) -> None:
+        """Draw the objective of a fit, if there are new steps."""
+        history = list(job.history) if isinstance(job, FitJob) else []
+        steps = [step for step in history if math.isfinite(step[1])]  # samples have no objective
+        if sum(value > 0 for _, value in steps) > 1 and len(steps) != self._drawn_steps:
+            self._drawn_steps = len(steps)
+            self.curve.show_drawing(lambda axes: qt.draw_objective(axes[0], steps))
 
     def _on_end(self, outcome: Any) -> None:
         self._redraw_timer.stop()
-        if isinstance(outcome.tag, FitJob):
-            self.curve.show_steps(list(outcome.tag.history))
+        self._draw_steps(outcome.tag)

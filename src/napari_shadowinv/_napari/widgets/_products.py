@@ -127,16 +127,15 @@ class ProductForm(ToolPanel):
         super().__init__(viewer, "products", run)
         self.measured: list[ProductResult] = []
         self._origin: about.Result[Any] | Path | None = None
-        tip = "<qt>Layer of the result of an inversion or a fit, or of a store of shots.</qt>"
-        self.result = LayerPicker(
-            viewer, tip, suits=lambda layer: bool(about.result_of(layer) or _store_of(layer))
-        )
+        tip = "Layer of the result of an inversion or a fit, or of a store of shots."
+        self.result = LayerPicker(viewer, tip, suits=_has_products, label="Result")
         kinds = _forms_of(PRODUCTS)
         usual = {name: kinds.pop(name) for name in _USUAL}
         self.more_products = forms.ModelPicker("", kinds)
         self.product = forms.ModelPicker("Product", {**usual, _MORE: ("more…", self.more_products)})
-        tip = "<qt>Shapes layer with the line or outline. Of several, the selected is used.</qt>"
-        self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",))
+        tip = "Shapes layer with the line or outline. Of several, the selected is used."
+        self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",), label="Shape")
+        self.shapes.add_button("✎", "Draw a new shape for the product.", self._draw)
         self.unit = forms.SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
         self.bands, self.shots = forms.ModelForm(_Bands), forms.ModelForm(_Shots)
         self.plot, self.report = qt.Plot(_PANEL_HEIGHT_PX, fixed=True), ReportView()
@@ -146,13 +145,11 @@ class ProductForm(ToolPanel):
             "Save figure…", "Save a figure of all measured products.", self._save_figure
         )
         self.clear = qt.push_button("Clear", "Forget all measured products.", self._clear)
-        shapes = qt.with_button(self.shapes, "✎", "Draw a new shape for the product.", self._draw)
-        self._shape_row = forms.labelled("Shape", shapes)
         self.add(
-            forms.labelled("Result", self.result),
+            self.result,
             self.shots,
             self.product,
-            self._shape_row,
+            self.shapes,
             forms.labelled("Unit", self.unit),
             self.bands,
             self.panel,
@@ -163,7 +160,7 @@ class ProductForm(ToolPanel):
         )
         self.result.picked.connect(self._on_result)
         for picker in (self.product, self.more_products):
-            picker.changed.connect(lambda: self._shape_row.setVisible(_is_drawn(self.kind)))
+            picker.changed.connect(lambda: self.shapes.setVisible(_is_drawn(self.kind)))
         self._on_result()
         self._clear()
 
@@ -327,6 +324,10 @@ def _forms_of(products: Mapping[str, type[Product]]) -> forms.Kinds:
         title = f"{kind.title[:1].upper()}{kind.title[1:]}"
         kinds[name] = title, create_model(kind.title, __base__=CheckedModel, **fields)
     return kinds
+
+
+def _has_products(layer: Any) -> bool:
+    return about.result_of(layer) is not None or _store_of(layer) is not None
 
 
 def _store_of(layer: Any) -> Path | None:

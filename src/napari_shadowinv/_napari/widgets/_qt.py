@@ -42,7 +42,6 @@ Method = TypeVar("Method", bound=Callable[..., Any])
 
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
 _WIDTH_PX = 330  # of a panel
-_CURVE_HEIGHT_PX = 210
 _LEGEND_CHARACTERS, _HANDLE_CHARACTERS = 56, 5  # of a row above a plot
 # napari's docks, which users expect to see next to a plugin's.
 _NAPARI_DOCKS = {"layer list", "layer controls", "console"}
@@ -81,11 +80,6 @@ def side_by_side(*widgets: tuple[QWidget, int], holder: QWidget | None = None) -
     for widget, share in widgets:
         layout.addWidget(widget, share)
     return holder
-
-
-def with_button(widget: QWidget, text: str, tip: str, action: Callable[[], Any]) -> QWidget:
-    """Put a small button on the right of a widget."""
-    return side_by_side((widget, 1), (small_button(text, tip, action), 0))
 
 
 def small_button(text: str, tip: str, action: Callable[[], Any]) -> QToolButton:
@@ -379,41 +373,19 @@ class Plot(QWidget):
             return palette.windowText().color().name(), palette.window().color().name()
 
 
-class ObjectiveCurve(Plot):
-    """The objective of a fit at each step, with a colour for each stage."""
-
-    def __init__(self) -> None:
-        super().__init__(_CURVE_HEIGHT_PX, fixed=True)
-        self._shown = 0
-
-    def empty(self) -> None:
-        self._shown = 0
-        self.setVisible(False)
-
-    def show_steps(self, history: Sequence[tuple[str, float]]) -> None:
-        """Draw the objective at each step; do nothing without new steps."""
-        steps = [step for step in history if np.isfinite(step[1])]  # samples have no objective
-        if len(steps) == self._shown:
-            return
-        self._shown = len(steps)
-        values = np.array([value for _, value in steps])
-        drawable = np.where(values > 0, values, np.nan)
-        if np.isfinite(drawable).sum() < 2:
-            return
-        self.show_drawing(lambda axes: self._draw(axes[0], steps, drawable))
-
-    def _draw(self, axis: Any, steps: Sequence[tuple[str, float]], drawable: Any) -> None:
-        colours: dict[str, str] = {}
-        begin = 0
-        for stage, group in groupby(steps, key=lambda step: step[0]):
-            end = begin + len(list(group))
-            numbers, objectives = np.arange(begin, end) + 1, drawable[begin:end]
-            begin = end
-            if np.isnan(objectives).all():
-                continue
-            label = "" if stage in colours else stage
-            colour = colours.setdefault(stage, COLOURS[len(colours) % len(COLOURS)])
-            axis.plot(numbers, objectives, "-", color=colour, label=label)
-        axis.set_yscale("log")
-        axis.set_ylabel("objective")
-        axis.set_xlabel("step")
+def draw_objective(axis: Any, history: Sequence[tuple[str, float]]) -> None:
+    """Draw the objective of a fit at each step, with a colour for each stage."""
+    colours: dict[str, str] = {}
+    begin = 0
+    for stage, group in groupby(history, key=lambda step: step[0]):
+        values = np.array([value for _, value in group])
+        numbers = begin + 1 + np.arange(len(values))
+        begin += len(values)
+        if not (values > 0).any():
+            continue
+        label = "" if stage in colours else stage
+        colour = colours.setdefault(stage, COLOURS[len(colours) % len(COLOURS)])
+        axis.plot(numbers, np.where(values > 0, values, np.nan), color=colour, label=label)
+    axis.set_yscale("log")
+    axis.set_ylabel("objective")
+    axis.set_xlabel("step")

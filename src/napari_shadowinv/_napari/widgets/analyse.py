@@ -61,8 +61,10 @@ class Analyse(qt.Docked):
         self.viewer = napari_viewer
         self._distance, self._unit = np.zeros(0), "px"
         self.profiles: list[Profile] = []
-        tip = "<qt>Shapes layer with the line. Of several lines, the selected one is used.</qt>"
-        self.lines = LayerPicker(self.viewer, tip, "none yet", kinds=("shapes",))
+        tip = "Shapes layer with the line. Of several lines, the selected one is used."
+        kinds = ("shapes",)
+        self.lines = LayerPicker(self.viewer, tip, "none yet", kinds=kinds, label="Line")
+        self.lines.add_button("✎", "Draw a new line.", self._draw)
         self._listed: list[Any] = []
         self.layers = QtWidgets.QListWidget(maximumHeight=_LIST_HEIGHT_PX)
         self.layers.setSelectionMode(QtWidgets.QListWidget.SelectionMode.NoSelection)
@@ -80,10 +82,9 @@ class Analyse(qt.Docked):
         self.hint = forms.WrappingLabel("Press ✎ and draw a line on the image.")
         self.problem = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.export = qt.push_button("Export CSV…", "Save the profile as a table.", self._export)
-        lines = qt.with_button(self.lines, "✎", "Draw a new line.", self._draw)
         width = forms.labelled("Width", self.width_edit)
         title = QtWidgets.QLabel("Layers to plot")
-        controls = (forms.labelled("Line", lines), title, self.layers, width)
+        controls = (self.lines, title, self.layers, width)
         results = (self.hint, self.plot, self.measures, self.export, self.problem)
         page, self.products = QtWidgets.QWidget(), products.ProductForm(self.viewer)
         self.products.setMinimumWidth(0)  # that of the window counts
