@@ -56,11 +56,11 @@ class Format:
         """Return the name of the array that is read, if arrays have names."""
         if variable is not None or not self.lister:
             return variable
-        return str(function("arrays:only_image")(path, *function(self.lister)(path)))
+        return str(function("arrays:only_image")(path, *self._call(self.lister, path)))
 
     def image_names(self, path: Path) -> list[str]:
         """Return the names of the images in a file; none where they have no names."""
-        return function(self.lister)(path)[0] if self.lister else []
+        return self._call(self.lister, path)[0] if self.lister else []
 
     def read(self, path: Path, variable: str | None = None, number: int | None = None) -> Any:
         """Return the content of a file, one of its arrays, or one of the frames; see `reader`.
@@ -72,7 +72,8 @@ class Format:
         numbers = {} if number is None else {"number": number}
         axes = self.count_frames(path, variable) if number is None else ()
         if prod(axes) == 1:
-            return function(self.named_reader if names else self.reader)(path, *names, **numbers)
+            reader = self.named_reader if names else self.reader
+            return self._call(reader, path, *names, **numbers)
         first = f"{variable}[{','.join('0' * len(axes))}]"
         advice = "" if variable is None else f"choose one, such as {first!r}, or "
         raise FileFormatError(
@@ -84,8 +85,13 @@ class Format:
         """Return the lengths of the axes that count frames; none if the file holds one image."""
         if not self.counter or (variable is None) == bool(self.named_reader):
             return ()
-        axes = function(self.counter)(path, *(() if variable is None else (variable,)))
+        axes = self._call(self.counter, path, *(() if variable is None else (variable,)))
         return axes if isinstance(axes, tuple) else (axes,)
+
+    @staticmethod
+    def _call(reference: str, path: Path, *args: Any, **numbers: int) -> Any:
+        """Call a function of a path; what a damaged file makes it raise is one kind of error."""
+        return as_file_errors(function(reference))(path, *args, **numbers)
 
     def fits(self, path: Path, head: bytes) -> bool:
         """Return whether a file that begins with `head` is of this format."""

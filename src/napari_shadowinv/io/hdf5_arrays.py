@@ -57,7 +57,6 @@ def read_hdf5(path: Path, name: str) -> AnyArray:
         return decode_values(path, dataset, stored, number)
 
 
-@as_file_errors
 def read_plane(path: Path, name: str, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
     """Read one array as an image, or frame `number` of it over the axes before the last two."""
     with open_hdf5(path) as file:
@@ -69,7 +68,6 @@ def read_plane(path: Path, name: str, number: int = 0) -> tuple[AnyArray, dict[s
         return image, {"kind": "hdf5", "variable": name, **metadata}
 
 
-@as_file_errors
 def count_frames(path: Path, name: str) -> tuple[int, ...]:
     """Return the lengths of the axes before the last two of an array; none if it is one image."""
     with open_hdf5(path) as file:
@@ -78,7 +76,6 @@ def count_frames(path: Path, name: str) -> tuple[int, ...]:
         return axes if number is None else ()
 
 
-@as_file_errors
 def list_images(path: Path) -> tuple[list[str], list[ArrayEntry]]:
     """Return the names of all images, or of the one that NeXus shows by default; and all arrays."""
     check_regular(path, "an HDF5 file")

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from napari_shadowinv._system.safety import as_file_errors, check_size
+from napari_shadowinv._system.safety import check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.arrays import (
@@ -90,14 +90,12 @@ def read_mat(path: Path, name: str, number: int = 0) -> tuple[AnyArray, dict[str
     return image, {"variable": chosen.name, "bits": 8 * image.dtype.itemsize, "geometry": {}}
 
 
-@as_file_errors
 def count_mat(path: Path, name: str) -> tuple[int, ...]:
     """Return the lengths of the axes after the first two of an array; none for one frame of it."""
     chosen, number = _find_image(path, name)
     return chosen.shape[2:] if number is None else ()
 
 
-@as_file_errors
 def list_images(path: Path) -> tuple[list[str], list[ArrayEntry]]:
     """Return the names of all images, and all arrays."""
     entries = [each.entry for each in _variables(path)]

@@ -25,7 +25,7 @@ import tifffile
 from tifffile import PHOTOMETRIC
 
 from napari_shadowinv._system.arrays import METRES
-from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
+from napari_shadowinv._system.safety import check_regular, check_size
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError
@@ -145,7 +145,6 @@ def _check_imagej_promise(path: Path, tiff: Any, page: Any, size: int) -> None:
         check_promise(path, "TIFF", page.dataoffsets[0] + max(promised) * page.nbytes, size)
 
 
-@as_file_errors
 def count_tiff_frames(path: Path) -> int:
     """Return how many frames a TIFF has."""
     return _layout_of(path).n_frames
