@@ -244,12 +244,12 @@ class Entry:
         content = " or ".join(title for title, is_kind in kinds.items() if is_kind)
         content = f"in {self._unit}" if self._unit else content
         hint = content if self._field.is_required() else f"not set ({content})"
-        if tuple in self._kinds:
+        if self._field.examples:
+            hint = str(self._field.examples[0])
+        elif tuple in self._kinds:
             hint = "all, or a range such as 10:200"
         elif self._default is not None:
             hint = _text_of(self._default, self._unit) if is_number else str(self._default)
-        elif self._field.examples:
-            hint = str(self._field.examples[0])
         elif not content:
             hint = "default"
         line = magic.LineEdit(**texts)
@@ -440,8 +440,10 @@ class ModelPicker(QWidget):
         box = self.choice.native
         steady(box)
         self._line = qt.side_by_side((box, 1)) if label is None else labelled(label, box)
-        self._forms_column = qt.column(holder := QWidget(), *self._rows.values())
-        qt.column(self, self._line, holder)
+        self._below = QtWidgets.QVBoxLayout()
+        qt.column(self, self._line).addLayout(self._below)
+        for row in self._rows.values():
+            self._below.addWidget(row)
         self.fill()
         self.choice.changed.connect(self._on_choice)
 
@@ -532,7 +534,7 @@ class ModelPicker(QWidget):
             form.setVisible(False)
             form.changed.connect(self._on_entry)
             self._forms[kind] = form
-            self._forms_column.addWidget(form)
+            self._below.addWidget(form)
         return self._forms.get(kind)
 
 
