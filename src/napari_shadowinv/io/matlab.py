@@ -48,7 +48,7 @@ class _Variable(NamedTuple):
 
     @property
     def entry(self) -> ArrayEntry:
-        """What it is; scalars, vectors and pictures in colour are no images."""
+        """Its description; scalars, vectors and pictures in colour are no images."""
         reason = ""
         if self.type not in _DTYPES:
             reason = "no numbers"
