@@ -102,6 +102,16 @@ def test_hdf5_without_image_is_left_to_others_at_once(tmp_path, suffix):
     assert get_reader(str(path)) is None
 
 
+def test_fields_on_a_grid_are_refused_with_advice(tmp_path):
+    path = tmp_path / "grid.h5"
+    with h5py.File(path, "w") as file:
+        file["Bx"] = file["By"] = np.ones((3, 4, 5))
+    reader = get_reader(str(path))
+    assert reader is not None
+    with pytest.raises(FileFormatError, match="trace particles through them with shadowinv forwa"):
+        reader(str(path))
+
+
 def test_what_is_no_shot_is_left_to_others(tmp_path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "notes.zarr").mkdir()

@@ -39,8 +39,10 @@ def _can_read(path: Path) -> bool:
         return bool(images_in(path))
     # Other programs use the endings of HDF5, too.
     if path.suffix.lower() in HDF5.suffixes:
-        try:
-            return bool(HDF5.image_names(path))
+        from napari_shadowinv.io.field_grids import is_field_grid
+
+        try:  # fields on a grid are refused with advice
+            return is_field_grid(path) or bool(HDF5.image_names(path))
         except FileFormatError:
             return False
     return _is_image_name(path)
