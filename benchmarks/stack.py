@@ -33,7 +33,7 @@ from napari_shadowinv.io.store import DONE, StackStore
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import Cache, RunOptions
 from napari_shadowinv.preprocessing import Bin
-from napari_shadowinv.stack import ShotOutcome
+from napari_shadowinv.stack import FileReader, ShotOutcome
 
 BURNER = Path(__file__).resolve().parents[2] / "shared" / "data" / "burner" / "data"
 
@@ -154,7 +154,7 @@ def speedup(arguments: argparse.Namespace, folder: Path) -> None:
             Shot(shots.shots, source=shots.source),
             folder / "night.shadowinv.zarr",
             shots.recipe,
-            channel=shots.channel,
+            reader=FileReader(channel=shots.channel),
             scheduler=client,
             on_progress=lambda told: told.outcome and ended.append(told.outcome),
             run=RunOptions(overwrite=True),

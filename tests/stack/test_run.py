@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.preprocessing import Bin
+from napari_shadowinv.stack import FileReader
 
 OPTIONS = InversionOptions(n_sites=100)
 
@@ -276,7 +278,8 @@ def test_store_with_truncated_names_is_refused(night, out):
 
 def test_a_run_with_another_reader_or_channel_is_refused(night, out):
     night.run(out, reader=log_and_read)
-    for other in ({}, {"reader": np.load}, {"channel": "red"}):
+    chosen = partial(log_and_read, loud=True)
+    for other in ({}, {"reader": chosen}, {"reader": FileReader(channel="red")}):
         with pytest.raises(InputError, match="different reader"):
             night.run(out, **other)
 

@@ -144,7 +144,7 @@ def run_batch(
 ) -> None:
     """Invert all shots into a store, and print a summary."""
     from napari_shadowinv.io.frames import left_out_of
-    from napari_shadowinv.stack import run_stack
+    from napari_shadowinv.stack import FileReader, run_stack
 
     if resume and run.overwrite:
         raise InputError(
@@ -164,7 +164,7 @@ def run_batch(
                 shots[0] if len(shots) == 1 else shots,
                 out,
                 recipe,
-                channel=channel,
+                reader=FileReader(channel=channel),
                 run=run,
                 scheduler=scheduler,
                 on_progress=printer.update,
@@ -373,7 +373,7 @@ def run_watch(
     quiet: bool,
 ) -> None:
     """Watch a folder; print a line for each shot and a summary."""
-    from napari_shadowinv.stack import RunStatus, watch_stack
+    from napari_shadowinv.stack import FileReader, RunStatus, watch_stack
 
     names = "images" if watch.pattern == "*" else watch.pattern
     printer = _Printer(quiet, watched=f"{folder} for {names}")
@@ -382,7 +382,7 @@ def run_watch(
             folder,
             out,
             recipe,
-            channel=channel,
+            reader=FileReader(channel=channel),
             watch=watch,
             on_progress=printer.update,
             should_stop=is_interrupted,

@@ -23,7 +23,7 @@ from napari_shadowinv.stack._plan import (
     describe_stack,
     dtype_of,
 )
-from napari_shadowinv.stack._shots import ArrayExposure, Exposure, FileReader, Reader
+from napari_shadowinv.stack._shots import FILES, ArrayExposure, Exposure, Reader
 from napari_shadowinv.stack._worker import AnyTask
 
 if TYPE_CHECKING:
@@ -35,8 +35,7 @@ def invert_stack(
     recipe: Recipe | None = None,
     *,
     variables: Collection[str] | None = None,
-    reader: Reader | None = None,
-    channel: str | int | None = None,
+    reader: Reader = FILES,
 ) -> xarray.Dataset:
     """Describe the inversion of many shots, which dask computes on demand.
 
@@ -58,9 +57,8 @@ def invert_stack(
     variables : collection of str, optional
         Variables to compute. Default: all.
     reader : callable, optional
-        Returns the image of a path. Default: files are read by their format.
-    channel : str or int, optional
-        Channel of colour images, as for `napari_shadowinv.io.read_shot`.
+        Returns the image of a path. Default: files are read by their format;
+        `napari_shadowinv.stack.FileReader` with ``channel="red"`` reads one of their colours.
 
     Returns
     -------
@@ -97,7 +95,7 @@ def invert_stack(
             "the recipe has a section fit, and invert_stack inverts: use run_stack to fit, or "
             "leave the section out"
         )
-    stack = describe_stack(shots, recipe, FileReader(reader, channel), variables)
+    stack = describe_stack(shots, recipe, reader, variables)
     return _lazy_dataset(stack)
 
 

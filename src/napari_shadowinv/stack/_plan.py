@@ -36,6 +36,7 @@ from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
     Exposure,
     FileReader,
+    Reader,
     RowsExposure,
     Shots,
     find_shots,
@@ -117,7 +118,7 @@ def _row_of(shot: Exposure) -> RowsExposure:
 
 
 def describe_stack(
-    shots: Any, recipe: Recipe | None, reader: FileReader, variables: Collection[str] | None
+    shots: Any, recipe: Recipe | None, reader: Reader, variables: Collection[str] | None
 ) -> Stack:
     """Describe a stack, and check everything that can be checked before a shot is read."""
     common = shots if isinstance(shots, Shot) else Shot(shots)
@@ -135,7 +136,8 @@ def describe_stack(
     resolved = map_paths(recipe or Recipe(), Path.absolute)  # for workers elsewhere
     if common.setup is not None:
         resolved = resolved.model_copy(update={"setup": common.setup})
-    stack_shots, inputs, sources = _describe_inputs(common, resolved, reader)
+    files = FileReader.of(reader)
+    stack_shots, inputs, sources = _describe_inputs(common, resolved, files)
     if sources is not None:
         if isinstance(common.image, Shots):
             raise InputError(
@@ -155,7 +157,7 @@ def describe_stack(
         task = _plan_inversion(stack_shots, inputs, resolved, variables)
     else:
         task = _plan_fit(inputs, resolved, variables)
-    return Stack(stack_shots, task, reader.name)
+    return Stack(stack_shots, task, files.name)
 
 
 def _plan_inversion(

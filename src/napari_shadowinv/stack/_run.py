@@ -58,7 +58,7 @@ from napari_shadowinv.stack._plan import (
     dtype_of,
 )
 from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
-from napari_shadowinv.stack._shots import Exposure, FileReader, Reader, differences
+from napari_shadowinv.stack._shots import FILES, Exposure, Reader, differences
 from napari_shadowinv.stack._worker import AnyTask, ShotOutcome, TaskContext
 
 if TYPE_CHECKING:
@@ -121,8 +121,7 @@ def run_stack(
     out: str | Path,
     recipe: Recipe | None = None,
     *,
-    reader: Reader | None = None,
-    channel: str | int | None = None,
+    reader: Reader = FILES,
     run: RunOptions | None = None,
     scheduler: Any = None,
     on_progress: OnStatus | None = None,
@@ -137,7 +136,7 @@ def run_stack(
 
     Parameters
     ----------
-    shots, recipe, reader, channel
+    shots, recipe, reader
         As for `invert_stack`. To resume a store, they and earlier shots must be the same. In
         a table of shots to fit, rows with the same ``shot`` are images of one object.
     out : str or Path
@@ -175,7 +174,7 @@ def run_stack(
     path = check_store_path(out)
     run = as_model(RunOptions, run, "run")
     variables = stored_variables(run.variables, recipe)
-    stack = describe_stack(shots, recipe, FileReader(reader, channel), variables)
+    stack = describe_stack(shots, recipe, reader, variables)
     stack = replace(stack, dtype=run.dtype)
     again = [FAILED] if run.redo_failed else []
     on_progress = on_progress or (lambda _: None)

@@ -42,7 +42,6 @@ from napari_shadowinv.shot import Shot
 if TYPE_CHECKING:
     import xarray
 
-Reader = Callable[[Path], ArrayLike]
 Value = TypeVar("Value")
 
 _MAX_SHAPE_READS = 3  # shots that are read for the shape of all
@@ -118,14 +117,15 @@ class ArrayExposure(Exposure):
 
 @dataclass(frozen=True)
 class FileReader:
-    """How files are read: by a function of the user's, or by their format.
-
-    Of files that hold several arrays it reads one, and of colour images one channel.
-    """
+    """How files are read: by their format, or by a function of the user's."""
 
     function: Callable[[Path], ArrayLike] | None = None
-    channel: str | int | None = None
-    variable: str | None = None
+    channel: str | int | None = None  # of colour images, as for `napari_shadowinv.io.read_shot`
+    variable: str | None = None  # name of an array, of files that hold several
+
+    @classmethod
+    def of(cls, reader: Reader) -> FileReader:
+        return reader if isinstance(reader, FileReader) else cls(reader)
 
     def frames(self, path: str | Path) -> list[FileFrame]:
         """Return all frames that a path stands for; of a user's function, a file is a frame."""
@@ -148,8 +148,15 @@ class FileReader:
         """A text by which a store is not continued with another reader."""
         if self.function is None:
             return "" if self.channel is None else f"channel {self.channel}"
-        kind = type(self.function).__qualname__
-        return f"{self.function.__module__}.{getattr(self.function, '__qualname__', kind)}"
+        function: Any = self.function
+        if isinstance(function, functools.partial):
+            return f"{FileReader(function.func).name} {function.keywords}"
+        kind = type(function).__qualname__
+        return f"{function.__module__}.{getattr(function, '__qualname__', kind)}"
+
+
+Reader = FileReader | Callable[[Path], ArrayLike]
+FILES: FileReader = FileReader()  # mypy does not infer it for defaults of parameters
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,9 +272,6 @@ def stamp(path: Path) -> dict[str, int]:
     """Return size and time of a file, which identify its content."""
     status = path.stat()
     return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
-
-
-FILES = FileReader()
 
 
 def file_cautions(shot: Shot) -> list[Caution]:

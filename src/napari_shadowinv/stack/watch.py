@@ -46,6 +46,7 @@ from napari_shadowinv.stack._run import (
 )
 from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import (
+    FILES,
     FileExposure,
     FileReader,
     NoShotError,
@@ -271,8 +272,7 @@ def watch_stack(
     out: str | Path,
     recipe: Recipe | None = None,
     *,
-    reader: Reader | None = None,
-    channel: str | int | None = None,
+    reader: Reader = FILES,
     watch: WatchOptions | None = None,
     on_progress: OnStatus | None = None,
     should_stop: ShouldStop | None = None,
@@ -293,7 +293,7 @@ def watch_stack(
         has the setup, the masks and the source of all shots.
     out : str or Path
         The store, ``name.shadowinv.zarr``, created once a shot can be read.
-    recipe, reader, channel
+    recipe, reader
         As for `run_stack`.
     watch : WatchOptions, optional
         Choices of the watch: names of the files, when to stop, and the store. A mapping
@@ -321,7 +321,7 @@ def watch_stack(
     watch = as_model(WatchOptions, watch, "watch")
     common = folder if isinstance(folder, Shot) else Shot(folder)
     pattern, _, variable = watch.pattern.partition("::")
-    files = FileReader(reader, channel, variable or None)
+    files = replace(FileReader.of(reader), variable=variable or None)
     place = checked_folder(common.image, pattern)
     path = check_store_path(out)
     variables = stored_variables(watch.variables, recipe)
