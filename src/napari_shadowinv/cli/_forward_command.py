@@ -167,7 +167,7 @@ def _predict(
         beam = field.source if beam is None else beam
         image = synthetic_image(field.displacement, beam)
     else:  # the beam of another experiment is not known
-        cause = flags.deflector or default_deflector(original, target)
+        cause = flags.deflector or field.deflector or default_deflector(original, target)
         image = predict_image(
             field.displacement,
             original,
@@ -177,18 +177,19 @@ def _predict(
             source=beam,
         )
         rows.append(("measured", setup_text(original)))
-        rows.append(("assumed", f"only a {cause} deflects the beam"))
+        rows.append(("assumed", f"the {cause} alone deflects the beam"))
     inside = image.sum() / (image.size if beam is None else beam.sum())
     return image, target, [*rows, ("flux", f"{percent(inside)} lands inside the image")]
 
 
 @dataclass(frozen=True)
 class Field:
-    """A displacement in px, with its source and setup if the file contains them."""
+    """A displacement in px, with its source, setup and cause if the file contains them."""
 
     displacement: FloatArray
     source: FloatArray | None = None
     setup: Setup | None = None
+    deflector: str | None = None
 
 
 def field_from(path: Path) -> Field:
@@ -213,6 +214,7 @@ def field_from(path: Path) -> Field:
 @as_file_errors
 def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
     """Return the only field in the dataset of a result, with the beam of its first image."""
+    from napari_shadowinv.physics.setup import deflector_titles
     from napari_shadowinv.results import unpack_result
 
     result = unpack_result(dataset)
@@ -228,7 +230,8 @@ def _field_of_result(path: Path, dataset: xarray.Dataset) -> Field:
     source = dataset["source"].values if "source" in dataset else None
     if source is not None and source.ndim == 3:
         source = source[0]
-    return Field(displacement, source, result.setup)
+    cause = deflector_titles().get(names[0]) if names else None
+    return Field(displacement, source, result.setup, cause)
 
 
 def _displacement(path: Path, array: AnyArray) -> FloatArray:

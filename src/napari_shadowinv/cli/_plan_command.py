@@ -149,6 +149,6 @@ def _object(
     return object_of_displacement(
         content.displacement,
         original or content.setup,
-        deflector=flags.deflector,
+        deflector=flags.deflector or content.deflector,
         title=Path(text).name,
     )
