@@ -24,6 +24,7 @@ from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
+from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.provenance import Origin, Provenance
@@ -326,6 +327,18 @@ def test_forward_takes_the_field_of_a_fit(make_fit: Callable[..., Fit]) -> None:
     write("fit.shadowinv", fit)
     assert shadowinv("forward", "fit.shadowinv", "--out", "seen.npy").exit_code == 0
     expected = synthetic_image(fit.fields[0].displacement, fit.source[0])
+    np.testing.assert_array_equal(np.load("seen.npy"), expected)
+
+
+def test_a_fitted_field_is_predicted_by_its_own_cause(make_fit: Callable[..., Fit]) -> None:
+    fit = make_fit(names=("E",), setups=(FIRST, SECOND))
+    write("fit.shadowinv", fit)
+    Path("second.toml").write_text(Path("setup.toml").read_text() + "\nenergy = 5.0\n")
+    result = shadowinv("forward", "fit.shadowinv", "--setup", "second.toml", "--out", "seen.npy")
+    assert result.exit_code == 0, result.output
+    assert "the electric field alone deflects the beam" in flat(result.stdout)
+    field = fit.fields[0].displacement
+    expected = predict_image(field, FIRST, SECOND, deflector="electric field")
     np.testing.assert_array_equal(np.load("seen.npy"), expected)
 
 

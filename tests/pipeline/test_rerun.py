@@ -144,7 +144,7 @@ def film_layers(folder: Path) -> Example:
     table = write_layers(doses, folder)[-1]
     steps = (Crop(y=(14, 46), x=(20, 60)),)
     recipe = Recipe(steps=steps, fit=FitChoices(options=PLAIN))
-    _, middle, _ = shot_rows([table], {}, {})
+    _, middle, _ = shot_rows([table])
     result = run_fit(recipe, read_row_images([middle], recipe))
     return Example(write(Path("a.shadowinv"), result), folder / "layer_02.tif", is_quick=False)
 

@@ -187,7 +187,7 @@ def test_cell_that_cannot_be_read_is_refused(
 def test_line_of_a_later_check_is_that_of_the_file(path: Path) -> None:
     write(path, ["file,shot", "", "a.tif,1", "# tilted", "b.tif,"])
     with pytest.raises(InputError, match="line 5 does not say which shot"):
-        rows_by_shot(path, {})
+        rows_by_shot(path)
 
 
 def test_hash_names_a_column_of_film_numbers(path: Path) -> None:

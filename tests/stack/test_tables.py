@@ -230,10 +230,10 @@ def test_a_fit_leaves_excluded_images_out(pack: Path) -> None:
     rows = ("a,film1.npy,14.7,", "a,gone.npy,9,true", "a,film2.npy,30,", "b,film0.npy,5,yes")
     pack = table(*rows, header="shot,file,energy,exclude")
     used = ["film1.npy", "film2.npy"]
-    assert [row.file.name for row in shot_rows([pack], {}, {})] == used
-    assert {
-        name: [row.file.name for row in rows] for name, rows in rows_by_shot(pack, {}).items()
-    } == {"a": used}
+    assert [row.file.name for row in shot_rows([pack])] == used
+    assert {name: [row.file.name for row in rows] for name, rows in rows_by_shot(pack).items()} == {
+        "a": used
+    }
 
 
 def test_columns_for_fits_give_a_warning(pack: Path, out: Path) -> None:

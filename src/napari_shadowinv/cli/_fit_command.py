@@ -63,9 +63,7 @@ def fit(
     from napari_shadowinv.pipeline.fit_run import read_row_images
     from napari_shadowinv.pipeline.shot_table import shot_rows
 
-    rows = shot_rows(
-        images, {"setup": flags.setup}, {"energy": flags.energies}, {"energy": "--energies"}
-    )
+    rows = shot_rows(images, flags.setup, flags.energies, "--energies")
     first, outputs = split_address(rows[0].file)[0], Outputs(overwrite, quiet)
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
     result, figure = result_and_figure(first, target, figure)

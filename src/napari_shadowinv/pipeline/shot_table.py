@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -127,52 +126,49 @@ class _Fiducial(CheckedModel):
 
 def shot_rows(
     images: Sequence[Path],
-    shared: Mapping[str, Any],
-    lists: Mapping[str, str | None],
-    names: Mapping[str, str] = MappingProxyType({}),
+    setup: Path | None = None,
+    energies: str | None = None,
+    name: str = "energies",
 ) -> list[ShotRow]:
     """Describe the images of a fit, or the rows of their table.
 
-    By the names of the columns, `shared` has defaults for all images, `lists` numbers separated by
-    commas, one for each image, and `names` the names of these lists in errors.
+    The setup is that of all images without one; energies are separated by commas, one for each
+    image, and have a name in errors.
     """
-    texts = {name: text for name, text in lists.items() if text is not None}
     if len(images) == 1 and is_table(images[0]):
-        for name in texts:
+        if energies is not None:
             raise InputError(
-                f"received {names.get(name, name)} {texts[name]} and the table {images[0]}: write "
-                f"it into the column '{name}'"
+                f"received {name} {energies} and the table {images[0]}: write it into the column "
+                "'energy'"
             )
-        rows = list(_used_rows(images[0], shared).values())
+        rows = list(_used_rows(images[0], setup).values())
         if len({row.shot for row in rows}) > 1:
             raise InputError(
                 f"{images[0]} has the images of several shots, expected one object: fit them as a "
                 "stack"
             )
         return rows
-    columns = {name: [part.strip() for part in text.split(",")] for name, text in texts.items()}
-    for name, parts in columns.items():
-        if len(parts) != len(images):
-            raise InputError(
-                f"received {len(images)} images and {len(parts)} values of "
-                f"{names.get(name, name)} ({texts[name]}): expected one for each image, separated "
-                "by commas"
-            )
+    values = [None] * len(images) if energies is None else energies.split(",")
+    if len(values) != len(images):
+        raise InputError(
+            f"received {len(images)} images and {len(values)} values of {name} ({energies}): "
+            "expected one for each image, separated by commas"
+        )
     return [
         validate(
             ShotRow,
-            _drop_none({"file": image, **shared, **{name: columns[name][k] for name in columns}}),
+            _drop_none({"file": image, "setup": setup, "energy": value and value.strip()}),
             str(image),
-            names,
+            {"energy": name},
         )
-        for k, image in enumerate(images)
+        for image, value in zip(images, values, strict=True)
     ]
 
 
-def rows_by_shot(table: Path, shared: Mapping[str, Any]) -> dict[str, tuple[ShotRow, ...]]:
+def rows_by_shot(table: Path) -> dict[str, tuple[ShotRow, ...]]:
     """Return the rows of a table with the images of many shots, by shot, in their order."""
     by_shot: dict[str, tuple[ShotRow, ...]] = {}
-    for line, row in _used_rows(table, shared).items():
+    for line, row in _used_rows(table).items():
         if row.shot is None:
             raise InputError(
                 f"{table}, line {line} does not say which shot its image belongs to: give the "
@@ -184,7 +180,7 @@ def rows_by_shot(table: Path, shared: Mapping[str, Any]) -> dict[str, tuple[Shot
 
 def rows_to_invert(table: Path | Sequence[ShotRow]) -> list[ShotRow]:
     """Return the rows to invert one by one."""
-    rows = _used_rows(table, {})
+    rows = _used_rows(table)
     place = f"{table}, line" if isinstance(table, Path) else "the table, row"
     for number, row in rows.items():
         if row.source == "unknown":
@@ -200,8 +196,8 @@ def table_rows(table: Path) -> list[ShotRow]:
     return list(_read_shots(table).values())
 
 
-def _used_rows(table: Path | Sequence[ShotRow], shared: Mapping[str, Any]) -> dict[int, ShotRow]:
-    rows = _read_shots(table, shared) if isinstance(table, Path) else dict(enumerate(table, 1))
+def _used_rows(table: Path | Sequence[ShotRow], setup: Path | None = None) -> dict[int, ShotRow]:
+    rows = _read_shots(table, setup) if isinstance(table, Path) else dict(enumerate(table, 1))
     used = {number: row for number, row in rows.items() if not row.exclude}
     if not used:
         raise InputError(
@@ -226,7 +222,7 @@ def is_table(path: Path) -> bool:
     return path.suffix.lower() in SITES.suffixes and has_column_names(path)
 
 
-def _read_shots(table: Path, shared: Mapping[str, Any] | None = None) -> dict[int, ShotRow]:
+def _read_shots(table: Path, setup: Path | None = None) -> dict[int, ShotRow]:
     """Return all rows of a table by their lines; file names are relative to its folder."""
-    shared = _drop_none(shared or {})
+    shared = _drop_none({"setup": setup})
     return read_rows(table, ShotRow, columns=ShotRow.columns(), shared=shared)

@@ -517,7 +517,7 @@ def table_shots(
             raise InputError("received rows of a table to fit, expected its file: write it first")
         return [
             RowsExposure(name, recipe, channel, rows=_with_absolute_paths(rows))
-            for name, rows in rows_by_shot(table, {}).items()
+            for name, rows in rows_by_shot(table).items()
         ]
     rows = rows_to_invert(table)
     shots = list[Exposure]()
