@@ -201,7 +201,7 @@ def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qt
     assert tuple(field.scale) == pytest.approx((1.5, 1.5))
     assert tuple(window.layers["6.0 MeV"].scale) == pytest.approx((1.5, 1.5))
     # It can be messages, projected and saved like the result of an inversion.
-    assert result_of(field).setup == SETUPS[0]
+    assert result_of(field).content.setup == SETUPS[0]
     report = texts_of(tool.view.report)
     assert "6 MeV proton" in report["Image 2"]
     assert report["Setup"].startswith("particles")

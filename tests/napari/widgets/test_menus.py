@@ -41,7 +41,10 @@ def docked(window, kind):
     return widget
 
 
-def test_the_selected_image_is_plotted_along_a_line(window, choose, messages):
+def test_analyse_opens_once_for_the_selected_image_or_result(
+    window, choose, solved, messages, qtbot
+):
+    choose("analyse")  # in the menu Plugins
     choose("plot_along_line")
     assert messages == ["No image is selected: select a grey image in the layer list"]
     window.add_image(np.ones((20, 30)), name="other")
@@ -52,17 +55,17 @@ def test_the_selected_image_is_plotted_along_a_line(window, choose, messages):
     assert analyse.checked() == [image]
     assert analyse.lines.layer.name == "profile – shot"
     assert analyse.lines.layer.mode == "add_line"
-
-
-def test_products_are_measured_of_the_selected_result(window, choose, solved, messages):
+    qtbot.waitUntil(analyse.isVisible, timeout=PATIENCE)
+    analyse.parent().hide()
     field, arrows = add_some(window, solved, "field", "arrows")
     add_some(window, solved, "field")
     window.layers.selection.active = arrows
     choose("measure_products")
-    analyse = docked(window, Analyse)
+    assert docked(window, Analyse) is analyse
+    assert analyse.isVisible()
     assert analyse.tabs.currentWidget() is analyse.products
     assert analyse.products.result.layer is field
-    assert not messages
+    assert len(messages) == 1
     window.layers.selection.active = window.add_image(np.ones((20, 30)))
     choose("measure_products")
     assert messages[-1].startswith("No result is selected: select a layer of an inversion")
@@ -115,18 +118,6 @@ def test_a_setup_is_stored_with_its_image(window, choose, proton_setup, solved, 
     (window.layers.selection.active,) = add_some(window, solved, "field")
     choose("edit_setup")
     assert "is no image of a shot" in messages[-1]
-
-
-def test_an_open_widget_is_not_opened_twice(window, choose, qtbot):
-    window.add_image(np.ones((20, 30)))
-    choose("analyse")  # in the menu Plugins
-    analyse = docked(window, Analyse)
-    qtbot.waitUntil(analyse.isVisible, timeout=PATIENCE)
-    dock = analyse.parent()
-    dock.hide()
-    choose("plot_along_line")
-    assert docked(window, Analyse) is analyse
-    assert analyse.isVisible()
 
 
 def test_the_dialog_of_napari_shows_and_keeps_the_preferences(preferences, window, qtbot):
