@@ -261,10 +261,7 @@ def checked_scan(scan: ArrayLike) -> AnyArray:
 
 
 def unexposed_pixel(scan: ArrayLike) -> FloatArray:
-    """Return the pixel of unexposed film, shape (3,), from its scan, shape (H, W, 3).
-
-    The median of its middle half in height and width, since its rim shows the scanner's bed.
-    """
+    """Return the pixel of unexposed film, (3,), from its scan; see `net_optical_density`."""
     planes = (_check_plane(np.asarray(scan), channel, "scan") for channel in _CHANNELS)
     return np.array([_median_of_middle(plane) for plane in planes])
 

@@ -209,9 +209,7 @@ def natural_neighbor(
     *,
     threads: int | None = None,
 ) -> FloatArray:
-    """Interpolate values, shape (n, ...), at the sites of a mesh, at points (y, x) in their hull.
-
-    The mesh is a Delaunay triangulation.
+    """Interpolate values, (n, ...), at sites of a Delaunay mesh, at points (y, x) in their hull.
 
     >>> corners = np.array([[0.0, 0.0], [0.0, 4.0], [4.0, 0.0], [4.0, 4.0]])
     >>> natural_neighbor(RegularTriangulation(corners), corners[:, 0], [[1.0, 2.5]])
@@ -667,9 +665,9 @@ def _nearest_corner(corners: Indices, points: FloatArray, n: int, y: float, x: f
 
 
 class CloughTocher:
-    """C¹ interpolant of values, shape (n,), and gradients, shape (n, 2), at the sites of a mesh.
+    """C¹ interpolant of values, (n,), and gradients, (n, 2), at the sites of a Delaunay mesh.
 
-    The mesh is a Delaunay triangulation. A plane is met exactly, also beyond the sites:
+    A plane is met exactly, also beyond the sites:
 
     >>> sites = np.array([[0.0, 0.0], [0.0, 3.0], [3.0, 0.0], [3.0, 4.0]])
     >>> upwards = np.tile([1.0, 0.0], (4, 1))
