@@ -12,11 +12,11 @@ from qtpy.QtCore import Signal
 from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.events import without_proxy
 from napari_shadowinv._napari.form import Kinds, ModelPicker, labelled
 from napari_shadowinv._napari.jobs import name_of_result
 from napari_shadowinv._napari.layer_metadata import data_of, kind_of
 from napari_shadowinv._napari.placement import labels_on, mapped, matrix_between
+from napari_shadowinv._napari.viewer_sync import without_proxy
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._system.arrays import complete_block_means, join_masks
 from napari_shadowinv._typing import BoolArray, FloatArray
