@@ -69,7 +69,7 @@ def test_transparent_pixels_are_not_light(tmp_path: Path, name: str) -> None:
     path, (picture, options, opaque) = tmp_path / "shot.png", TRANSPARENT[name]
     picture.save(path, **options)
     shot = read(path)
-    np.testing.assert_array_equal(shot.usable, opaque)
+    np.testing.assert_array_equal(shot.mask, opaque)
     np.testing.assert_array_equal(shot.image[opaque], SHOT[opaque])
     assert any(f"{(~opaque).sum()} pixels without a value" in note for note in shot.notes)
 

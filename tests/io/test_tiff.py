@@ -175,7 +175,7 @@ def test_pixels_without_data_are_left_out(path: Path) -> None:
     stored[2:5, 7] = 65535
     tifffile.imwrite(path, stored, extratags=[(42113, "s", 0, "65535", True)], metadata=None)
     shot = read(path)
-    np.testing.assert_array_equal(shot.usable, stored != 65535)
+    np.testing.assert_array_equal(shot.mask, stored != 65535)
     assert any("3 pixels" in note for note in shot.notes)
 
 
@@ -239,7 +239,7 @@ def test_transparent_pixels_are_not_light(path: Path) -> None:
     pixels, kinds = np.stack([SHOT, alpha], axis=-1), ["unassalpha"]
     tifffile.imwrite(path, pixels, photometric="minisblack", extrasamples=kinds)
     shot = read(path)
-    np.testing.assert_array_equal(shot.usable, alpha > 0)
+    np.testing.assert_array_equal(shot.mask, alpha > 0)
     np.testing.assert_array_equal(shot.image[alpha > 0], SHOT[alpha > 0])
 
 
