@@ -122,6 +122,8 @@ def test_pattern_may_name_an_array_in_each_file_but_the_source(folder, out, tmp_
     beam = str(tmp_path / "beam.npy")
     stored = watched_once(folder, out, pattern="*.h5::entry/data", source=beam)
     assert list(stored.status.values) == [DONE, DONE]
+    with pytest.raises(InputError, match="read by a function, which selects no array"):
+        watch_stack(folder, out, reader=np.load, watch={"pattern": "*.h5::entry/data"})
 
 
 def test_a_store_inside_the_folder_does_not_set_it_off(folder):

@@ -123,6 +123,13 @@ class FileReader:
     channel: str | int | None = None  # of colour images, as for `napari_shadowinv.io.read_shot`
     variable: str | None = None  # name of an array, of files that hold several
 
+    def __post_init__(self) -> None:
+        if self.function is not None and (self.channel is not None or self.variable is not None):
+            raise InputError(
+                "the shots are read by a function, which selects no array and no channel: leave "
+                "them out"
+            )
+
     @classmethod
     def of(cls, reader: Reader) -> FileReader:
         return reader if isinstance(reader, FileReader) else cls(reader)
@@ -133,7 +140,8 @@ class FileReader:
             return find_frames(path, self.variable)
         if split_address(path)[1] is not None:
             raise InputError(
-                f"shots are {path}, and their reader does not select an array: give the file alone"
+                f"shots are {path}, and a function that reads them selects no array: give the file "
+                "alone"
             )
         return find_frames(path, numbered=False)
 
