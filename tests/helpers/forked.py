@@ -39,7 +39,7 @@ def forking() -> Iterator[Any]:
     with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
         context: Any = get_mp_context()
         context.set_forkserver_preload(["helpers.preloaded"])
-        with patch.dict(os.environ, PYTHONPATH=SEARCHED):
+        with patch.dict(os.environ, PYTHONPATH=SEARCHED, PRELOADING="1"):
             multiprocessing.forkserver.ensure_running()  # type: ignore[attr-defined]
         yield context
 
