@@ -41,7 +41,7 @@ def without_proxy(model: Any) -> Any:
 def connect(model: Any, names: str | Sequence[str], callback: Callable[[Any], Any]) -> Disconnect:
     """Call a function at events of a model, and return a function that disconnects it.
 
-    It gets napari's event, which holds methods weakly. Of several events, the model may lack some.
+    It gets napari's event. Of several events, the model may lack some.
     """
     events = without_proxy(model).events
     names = (names,) if isinstance(names, str) else names
