@@ -68,15 +68,15 @@ class Job:
         return Finished(content, self.layers(content))
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class ImageJob(Job):
-    """A job on the image of a layer."""
+    """A job on the image or the stack of a layer."""
 
     task: ClassVar[str]
 
     recipe: Recipe
-    name: str  # of the result
-    frame: Frame
+    name: str = ""  # of the result
+    frame: Frame = field(default_factory=Frame)
     origins: Mapping[str, str] = field(default_factory=dict)  # of its inputs, saved and reported
     image: Any = None  # the layer
     companions: tuple[Any, ...] = ()  # layers that lie on the image
@@ -86,11 +86,11 @@ class ImageJob(Job):
         return str(self.image.name)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class InversionJob(ImageJob):
     """An inversion of a shot with its masks; image and source may be lazy."""
 
-    task = "inversion"
+    task: ClassVar[str] = "inversion"
     pace: ClassVar[float | None] = None  # time of the last inversion relative to its estimate
 
     shot: Shot
@@ -161,14 +161,14 @@ class SourceJob(Job):
         ]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class FitJob(ImageJob):
     """A fit to several images; images and sources may be lazy.
 
     The recipe holds the choices of the fit and the setup of the first image.
     """
 
-    task = "fit"
+    task: ClassVar[str] = "fit"
     pace: ClassVar[float | None] = None  # time of the last fit relative to its estimate
 
     shots: tuple[Shot, ...]  # with the names of their images
@@ -216,7 +216,7 @@ class FitJob(ImageJob):
         return run_fit(self.recipe, shots, on_progress=on_progress, should_stop=should_stop)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(eq=False, kw_only=True)
 class Refinement(FitJob):
     """A fit to the image of an inversion, starting from the inversion."""
 

@@ -30,10 +30,14 @@ FEW = InversionOptions(n_sites=500)
 Array = np.ndarray[Any, Any]
 
 
+def stack_job(shots, folder, recipe):
+    return StackJob(shots=Shot(shots), out=folder / "a.shadowinv.zarr", recipe=recipe)
+
+
 def test_a_stack_tells_that_it_compiles(shot, tmp_path, monkeypatch):
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     progress: list[Progress] = []
-    job = StackJob(shot[None], tmp_path / "a.shadowinv.zarr", Recipe(options=FEW))
+    job = stack_job(shot[None], tmp_path, Recipe(options=FEW))
     status = job.run(progress.append, lambda: False)
     assert list(dict.fromkeys(report.stage for report in progress)) == ["prepare", "shots"]
     assert any(report.message.startswith("compiling, ") for report in progress)
@@ -54,9 +58,7 @@ def running(recipe):
         lambda tmp_path: SourceJob(SLOW, Shot(LARGE), None, {}).run,
         lambda tmp_path: running(Recipe(source=SLOW)),
         lambda tmp_path: running(Recipe(steps=(BackgroundFilter(degree=10),))),
-        lambda tmp_path: (
-            StackJob(LARGE[None], tmp_path / "a.shadowinv.zarr", Recipe(source=SLOW)).run
-        ),
+        lambda tmp_path: stack_job(LARGE[None], tmp_path, Recipe(source=SLOW)).run,
     ],
     ids=["source", "shot", "step", "stack"],
 )
@@ -82,7 +84,8 @@ def test_a_shot_is_looked_at_before_the_books_count_it(shot, tmp_path):
             if status.outcome is not None:
                 counted.append((status.outcome.index, self.status.ended))
 
-    job = CountingJob(stack, out, Recipe(options=FEW), options=RunOptions(workers=1))
+    options = RunOptions(workers=1)
+    job = CountingJob(shots=Shot(stack), out=out, recipe=Recipe(options=FEW), options=options)
     run_job(job)
     assert counted == [(0, 0), (1, 1)]
     assert job.status.ended == 2

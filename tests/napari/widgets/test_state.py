@@ -304,7 +304,7 @@ def hump():
 def the_masks(tool):
     """Return the object with the masks of a run."""
     job = tool.request()
-    return job if tool.image.is_stack else job.shot
+    return job.shots if tool.image.is_stack else job.shot
 
 
 @pytest.mark.parametrize("is_stack", [False, True])

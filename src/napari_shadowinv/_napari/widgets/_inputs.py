@@ -588,6 +588,11 @@ class ImagePanel(ToolPanel):
         if recipe.setup is not None:
             self.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
 
+    def shot_of(self, layer: Any) -> Shot:
+        """Return an image with its source and mask."""
+        shot = shot_of_layer(layer, layers.image_of(layer))
+        return replace(shot, source=self.source.measured(layer), mask=self.masks.usable(layer))
+
     def describe(
         self,
         image: Any,

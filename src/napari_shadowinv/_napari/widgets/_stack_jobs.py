@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 from qtpy.QtWidgets import QLabel, QWidget
 
-from napari_shadowinv._napari.jobs import Job
+from napari_shadowinv._napari.jobs import ImageJob
 from napari_shadowinv._napari.layer_metadata import kind_of, layer_key, main_layers, role_of
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.run import Outcome
@@ -23,7 +22,6 @@ from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_together, result_frame
 from napari_shadowinv._system.progress import OnProgress, Progress, ShouldStop
-from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.preprocessing import Recipe
@@ -45,26 +43,20 @@ def _empty_status() -> RunStatus:
     return RunStatus()
 
 
-@dataclass(eq=False)
-class StackJob(Job):
+@dataclass(eq=False, kw_only=True)
+class StackJob(ImageJob):
     """Shots to invert into a store, or a folder to watch; the layers over the store grow with it.
 
     Its thread writes the last fields, which the window reads at any time.
     """
 
+    task: ClassVar[str] = "inversion"
     patience: ClassVar[float] = math.inf  # it finishes writing to the store
 
-    shots: Any  # an array (shot, y, x), also a lazy one, files, rows of a table, or a folder
+    shots: Shot  # an array (shot, y, x), also a lazy one, files, rows of a table, or a folder
     out: Path
-    recipe: Recipe = field(default_factory=Recipe)
-    source: ArrayLike | None = None  # measured; for all shots, or one for each
-    mask: BoolArray | None = None
-    source_mask: BoolArray | None = None
     options: RunOptions | WatchOptions = field(default_factory=RunOptions)
-    image: Any = None  # the layer of the shots
-    companions: tuple[Any, ...] = ()  # layers that lie on the image
     placement: Mapping[str, Any] = field(default_factory=dict)  # keywords of the layers
-    origins: Mapping[str, str] = field(default_factory=dict)  # of its inputs, rows of the report
     status: RunStatus = field(default_factory=_empty_status)
     layer_data: LayerData = field(default_factory=list)  # empty until a shot is finished
     newest: int = 0  # the last shot that could be inverted
@@ -91,12 +83,11 @@ class StackJob(Job):
             on_progress(self._progress(status))
 
         on_progress(Progress("prepare", 0, None, "shots and source"))
-        shots = Shot(self.shots, source=self.source, mask=self.mask, source_mask=self.source_mask)
         callbacks: dict[str, Any] = {"on_progress": update, "should_stop": should_stop}
         if isinstance(self.options, WatchOptions):
-            watch_stack(shots, self.out, self.recipe, watch=self.options, **callbacks)
+            watch_stack(self.shots, self.out, self.recipe, watch=self.options, **callbacks)
         else:
-            run_stack(shots, self.out, self.recipe, run=self.options, **callbacks)
+            run_stack(self.shots, self.out, self.recipe, run=self.options, **callbacks)
         return self.status
 
     def layers(self, content: RunStatus) -> LayerData:

@@ -14,7 +14,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, FitJob, name_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.run import Run
-from napari_shadowinv._napari.shots import layers_of_shot, shot_of_layer
+from napari_shadowinv._napari.shots import layers_of_shot
 from napari_shadowinv._napari.widgets import _inputs as inputs
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets._image_table import (
@@ -222,11 +222,9 @@ class FitImages(inputs.ImagePanel):
         is_known = self._is_brightness_known and any(row["brightness"] != 1 for row in rows)
         return tuple(
             replace(
-                shot_of_layer(image, layers.image_of(image)),
+                self.shot_of(image),
                 name=image.name,
                 setup=None if setup is None else self._setup_of(image, setup),
-                source=self.source.measured(image),
-                mask=self.masks.usable(image),
                 strength=(self.images.beam_value(image),) if setup is None else None,
                 brightness=row["brightness"] if is_known else None,
                 psf=row["psf"],

@@ -14,7 +14,6 @@ from napari_shadowinv._napari import jobs
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import main_layers
 from napari_shadowinv._napari.run import Outcome, Run
-from napari_shadowinv._napari.shots import shot_of_layer
 from napari_shadowinv._napari.viewer_sync import USER_ERRORS
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
@@ -187,38 +186,27 @@ class Invert(ImagePanel):
         return self.input_recipe(steps=self.all_steps(), options=self.options.model())
 
     def request(self, preview: bool = False) -> jobs.InversionJob | StackJob:
-        layer, is_stack = self.image.layer, self.image.is_stack
-        image = None if is_stack else layers.image_of(layer)
+        layer: Any = self.image.layer
+        if not self.image.is_stack:
+            layers.image_of(layer)
         if not preview:
             self.setup.keep()
         recipe = self.recipe()
-        mask, hidden = self.masks.usable(layer), self._hidden_from_source(layer)
-        self.source.check(mask)
-        measured = self.source.measured_for_stack if is_stack else self.source.measured
-        source: Any = measured(layer)
+        shot = replace(self._shot(layer), source_mask=self._hidden_from_source(layer))
+        self.source.check(shot.mask)
         chosen = (self.masks.layer, self.source_masks.layer, self.crop.layer)
         source_mask = self.source_masks.summary(layer) if self.source.is_estimated else ""
         described = self.describe(
             layer, recipe, chosen, name=self.image.name, source_mask=source_mask
         )
-        if is_stack:
+        if self.image.is_stack:
             return StackJob(
-                shots=self.image.shots(),
+                shots=shot,
                 out=self.store.path,
-                source=source,
-                mask=mask,
-                source_mask=hidden,
                 placement={} if layer is None else placement_on(layer, recipe),
                 options=self.store.options(self.image.kind),
                 **described,
             )
-        shot = replace(
-            shot_of_layer(layer, image),
-            cautions=layers.cautions_of(layer),
-            mask=mask,
-            source_mask=hidden,
-            source=source,
-        )
         return jobs.InversionJob(
             name=", ".join(filter(None, (jobs.name_of_result(layer), self.source.short_name))),
             frame=result_frame(layer, recipe),
@@ -227,6 +215,13 @@ class Invert(ImagePanel):
             preview=preview,
             **described,
         )
+
+    def _shot(self, layer: Any) -> Shot:
+        """Return the shot or the shots, with their source and mask."""
+        if not self.image.is_stack:
+            return replace(self.shot_of(layer), cautions=layers.cautions_of(layer))
+        source = self.source.measured_for_stack(layer)
+        return Shot(self.image.shots(), source=source, mask=self.masks.usable(layer))
 
     @qt.notify_errors
     def refine(self, layer: Any = None) -> None:
