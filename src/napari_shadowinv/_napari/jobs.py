@@ -7,7 +7,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, ClassVar
@@ -54,6 +54,7 @@ class Job:
     """
 
     patience: ClassVar[float] = 0.5
+    show: Callable[[Any], Any] | None = None  # what its work returned, unless its window does
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
         raise NotImplementedError
@@ -128,7 +129,7 @@ class InversionJob(ImageJob):
         return layer_data
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class SourceJob(Job):
     estimate: Estimate
     shot: Shot  # its image may be lazy

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from napari_shadowinv._napari.form import TOML
 from napari_shadowinv._napari.jobs import Job, name_of_result
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import dataset_to_save, layers_of_result, missing_layers
-from napari_shadowinv._napari.run import Outcome
 from napari_shadowinv._napari.stores import shot_of_store
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._layers import new_mask
@@ -59,7 +59,6 @@ class _Repetition(Job):
     folder: Path
     frame: about.Frame
     name: str
-    again: Rerun | None = None
 
     @classmethod
     def of(cls, layer: Any, viewer: Any) -> _Repetition:
@@ -83,19 +82,18 @@ class _Repetition(Job):
             f"{name_of_result(layer)} repeated",
         )
 
-    def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
+    def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> Rerun:  # type: ignore[override]
         inputs = collect_rerun(
             self.result.content, self.images, source=self.source, folder=self.folder
         )
-        self.again = inputs.run(on_progress, should_stop)
+        return inputs.run(on_progress, should_stop)
 
-    def show(self, viewer: Any) -> None:
+    def add_to(self, viewer: Any, again: Rerun) -> None:
         """Add the layers of the repeated result, and report the difference."""
-        assert self.again is not None
-        repeated = about.Result(self.again.content, self.result.origins)
+        repeated = about.Result(again.content, self.result.origins)
         add_layers(viewer, about.main_layers(layers_of_result(repeated, self.frame, self.name)))
-        changes = "; ".join(self.again.changes) or "nothing"
-        show_info(f"Difference: {self.again.difference}. Changed: {changes}")
+        changes = "; ".join(again.changes) or "nothing"
+        show_info(f"Difference: {again.difference}. Changed: {changes}")
 
 
 class RecipeButton(QPushButton):
@@ -116,7 +114,6 @@ class RecipeButton(QPushButton):
             menu.addAction("Copy as Python").triggered.connect(lambda: self.copy())
         menu.addAction("Repeat").triggered.connect(lambda: self.repeat())
         self.setMenu(menu)
-        tool.panel.ended.connect(self._on_end)
 
     def _ask_and_load(self) -> None:
         path, _ = QFileDialog.getOpenFileName(self, "Load recipe", "", TOML)
@@ -160,13 +157,7 @@ class RecipeButton(QPushButton):
         if tool.panel.running:
             raise InputError("a run is under way: wait until it finishes, or press Cancel")
         job = _Repetition.of(tool.viewer.layers.selection.active, tool.viewer)
-        tool.start(job)
-
-    @notify_errors
-    def _on_end(self, outcome: Outcome) -> None:
-        job = outcome.tag
-        if isinstance(job, _Repetition) and job.again is not None:
-            job.show(self._tool.viewer)
+        tool.start(job, partial(job.add_to, tool.viewer))
 
     @notify_errors
     def load(self, path: Path) -> None:

@@ -12,6 +12,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from qtpy import QtWidgets
@@ -206,9 +207,13 @@ class ToolPanel(qt.Docked):
     def show_result(self, finished: Any, job: Any) -> None:
         raise NotImplementedError
 
-    def start(self, job: Job, *, preview: bool = False) -> None:
-        """Do a job in the thread; a preview shows no progress."""
+    def start(
+        self, job: Job, show: Callable[[Any], Any] | None = None, *, preview: bool = False
+    ) -> None:
+        """Do a job in the thread, then `show` it; a preview shows no progress."""
         self.previewing = preview
+        if show is not None:
+            job.show = show
         self.panel.start(job.work, job, quiet=preview)
 
     @qt.notify_errors
@@ -222,7 +227,8 @@ class ToolPanel(qt.Docked):
     @qt.notify_errors
     def _on_end(self, outcome: Outcome) -> None:
         if outcome.value is not None:
-            self.show_result(outcome.value, outcome.tag)
+            show = outcome.tag.show or partial(self.show_result, job=outcome.tag)
+            show(outcome.value)
 
 
 class ResultView(QtWidgets.QWidget):

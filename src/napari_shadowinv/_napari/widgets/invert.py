@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -242,9 +243,9 @@ class Invert(ImagePanel):
         image = self._last.shot_of(chosen)
         name = jobs.name_of_result(chosen) if image is None else str(image.name)
         choices: Any = self.refine_form.model()
-        self.start(
-            jobs.refinement(chosen, chosen if image is None else image, name, choices.psf or 0.0)
-        )
+        image = chosen if image is None else image
+        job = jobs.refinement(chosen, image, name, choices.psf or 0.0)
+        self.start(job, partial(self._show_refinement, job=job))
 
     @qt.notify_errors
     def _show_source(self) -> None:
@@ -260,7 +261,8 @@ class Invert(ImagePanel):
         if hidden is not None:
             made_from["source_mask"] = self.source_masks.summary(layer)
         shot = Shot(image, source_mask=hidden)
-        self.start(jobs.SourceJob(estimate, shot, layer, made_from))
+        job = jobs.SourceJob(estimate, shot, layer, made_from)
+        self.start(job, partial(self._show_estimate, job=job))
 
     def _on_progress(self, progress: Progress) -> None:
         job = self.panel.tag
@@ -283,20 +285,11 @@ class Invert(ImagePanel):
             self.panel.say(text)
             self.panel.status.setToolTip(str(job.out.absolute()))
 
-    def show_result(self, finished: jobs.Finished, job: Any) -> None:
-        if isinstance(job, jobs.InversionJob):
-            self._show_inversion(finished, job)
-        elif isinstance(job, jobs.SourceJob):
-            self._show_estimate(finished, job)
-        else:
-            self.previewed.hide()
-            self.results = self._refined = self.view.show_fit(job, finished)
-
     def forget(self) -> None:
         self.stack_view.empty()
         self.panel.status.setToolTip("")
 
-    def _show_inversion(self, finished: jobs.Finished, job: jobs.InversionJob) -> None:
+    def show_result(self, finished: jobs.Finished, job: jobs.InversionJob) -> None:
         inversion = finished.content
         moved = place_inputs(self.viewer, job, quiet=job.preview)
         if job.preview:
@@ -313,6 +306,10 @@ class Invert(ImagePanel):
         self.results = self._last.layers_for_next(job.image)
         layer_data = main_layers(finished.layer_data, also=self.results.layer_keys)
         self.results.show(layer_data, fit=moved)
+
+    def _show_refinement(self, finished: jobs.Finished, job: jobs.Refinement) -> None:
+        self.previewed.hide()
+        self.results = self._refined = self.view.show_fit(job, finished)
 
     def _show_estimate(self, finished: jobs.Finished, job: jobs.SourceJob) -> None:
         self._last.layers_for_next((job.image, about.SOURCE)).show(finished.layer_data)
