@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import html
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -65,14 +65,11 @@ def steady(widget: QWidget) -> None:
         each.installEventFilter(_WheelGuard(each))
 
 
-class SteadyComboBox(QtWidgets.QComboBox):
-    """A narrow combo box that ignores the mouse wheel; `choices` are titles by key."""
-
-    def __init__(self, choices: Mapping[Any, str] | None = None, tip: str = "") -> None:
-        super().__init__(toolTip=f"<qt>{tip}</qt>" if tip else "")
-        for key, title in (choices or {}).items():
-            self.addItem(title, key)
-        steady(self)
+def combo_box(tip: str, choices: Iterable[tuple[str, Any]] = ()) -> magic.ComboBox:
+    """Return a narrow box that ignores the mouse wheel, with a choice of titles and values."""
+    box = magic.ComboBox(choices=list(choices), tooltip=f"<qt>{tip}</qt>" if tip else "")
+    steady(box.native)
+    return box
 
 
 def labelled(text: str, widget: QtWidgets.QWidget) -> QtWidgets.QWidget:
@@ -435,10 +432,8 @@ class ModelPicker(QWidget):
         self._rows = {kind: row for kind, (_, row) in kinds.items() if isinstance(row, QWidget)}
         self._forms: dict[str, ModelForm] = {}
         self.chosen: Any = None
-        tooltip = f"<qt>{tip}</qt>" if tip else ""
-        self.choice = magic.ComboBox(choices=(), tooltip=tooltip)
+        self.choice = combo_box(tip)
         box = self.choice.native
-        steady(box)
         self._line = qt.side_by_side((box, 1)) if label is None else labelled(label, box)
         self._below = QtWidgets.QVBoxLayout()
         qt.column(self, self._line).addLayout(self._below)
@@ -583,16 +578,16 @@ class StepsSection(QWidget):
         super().__init__()
         self._kinds = kinds
         self.forms: list[StepForm] = []
-        self.choice = SteadyComboBox(
-            {None: "add a step…", **{name: kind.title for name, kind in kinds.items()}},
+        self.choice = combo_box(
             "Processing of image, source and masks before the inversion or fit.",
+            [("add a step…", ""), *((kind.title, name) for name, kind in kinds.items())],
         )
         self._list = QWidget()
         qt.column(self._list)
-        self.folded = titled_section(self._list, labelled("", self.choice))
+        self.folded = titled_section(self._list, labelled("", self.choice.native))
         self._earlier = WrappingLabel(style=PROBLEM_STYLE)
         qt.column(self, self.folded, self._earlier)
-        self.choice.activated.connect(self._on_choice)
+        self.choice.changed.connect(self._on_choice)
         self._on_change()
 
     def steps(self) -> tuple[Step, ...]:
@@ -634,10 +629,10 @@ class StepsSection(QWidget):
                     self.add(str(values["step"]), values).folded.collapse(animate=False)
         self._on_change()
 
-    def _on_choice(self, index: int) -> None:
-        if index > 0:
-            self.add(str(self.choice.itemData(index)))
-        self.choice.setCurrentIndex(0)
+    def _on_choice(self, name: str) -> None:
+        if name:
+            self.choice.value = ""
+            self.add(name)
 
     def _move(self, form: StepForm, offset: int | None) -> None:
         """Move a step down by `offset` places; remove it if that is None."""

@@ -199,12 +199,15 @@ class Simulate(panels.ToolPanel):
     def _build_task(self) -> None:
         tip = "Image layer of the undisturbed beam."
         self.source = LayerPicker(self.viewer, tip, "uniform", about.may_be_source)
-        self.deflector = forms.SteadyComboBox(
-            {None: "default for the beam", **{name: name for name in deflector_titles().values()}},
+        self.deflector = forms.combo_box(
             "Field that deflects the beam. Used only to predict the object's image in another "
             "experiment, when the setup differs from the result's setup.",
+            [
+                ("default for the beam", None),
+                *((name, name) for name in deflector_titles().values()),
+            ],
         )
-        self._deflector_row = forms.labelled("Deflected by", self.deflector)
+        self._deflector_row = forms.labelled("Deflected by", self.deflector.native)
         image, plan = QWidget(), QWidget()
         column(image, forms.labelled("Source", self.source), self._deflector_row)
         self.energies = forms.SavedLine(
@@ -318,7 +321,7 @@ class Simulate(panels.ToolPanel):
             target,
             shape=shape,
             setup=setup,
-            deflector=self.deflector.currentData(),
+            deflector=self.deflector.value,
             source=source,
             name=f"{target.title} image",
             frame=about.frame_for(shape, setup) if is_moved else about.frame_of(layer),

@@ -146,7 +146,7 @@ def test_the_source_of_a_shot_a_layer_or_a_file_is_used(
     tool.image.layer = window.layers["measured"]
     assert tool.setup.setup() == proton_setup
     assert tool.source.kind == "own"
-    for kind in ("own", "layer", "file"):
+    for kind in ("own", window.layers["beam"], "file"):
         tool.source.set_kind(kind)
         if kind == "file":
             enter(tool.source.form.entries["file"], f"{tmp_path / 'run.nxs'}::/entry/beam")

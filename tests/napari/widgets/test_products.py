@@ -130,7 +130,7 @@ def test_drawn_circle_measures_the_same_current_as_python(form, qtbot, inversion
 def test_profile_is_drawn_with_its_bands(form, qtbot):
     draw(form, "profile", "line", [[23.5, 5.0], [23.5, 42.0]])
     enter(form.product.form.entries["width"], "4 px")
-    form.unit.setCurrentText("MG µm")
+    form.unit.value = "MG µm"
     measured = measure(form, qtbot)
     assert (measured.unit.symbol, measured.product.width) == ("MG µm", 4)
     (axes,) = form.plot.figure.axes

@@ -80,7 +80,7 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
 ):
     layers = by_role(add_to_viewer(viewer, solved, proton_setup, name="solved", all_layers=True))
     tool = opened(Simulate)
-    choices = [tool.deflector.itemData(index) for index in range(tool.deflector.count())]
+    choices = list(tool.deflector.choices)
     assert choices[1:] == list(deflector_titles().values())
     tool.object.set_kind("layer")
     slow = proton_setup.model_copy(update={"energy": 3.0})
@@ -95,13 +95,13 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     tool.field.layer = layers["potential"]
     tool.setup.show_setup(slow.model_dump())
     np.testing.assert_allclose(image(tool).data, expected)
-    tool.deflector.setCurrentText("electric field")
+    tool.deflector.value = "electric field"
     expected = predict_image(solved.displacement, proton_setup, slow, deflector="electric field")
     np.testing.assert_allclose(image(tool).data, expected)
     # It knows its own experiment.
     for show_own in (
         lambda: tool.setup.show_setup(proton_setup.model_dump()),
-        lambda: tool.setup.picker.set_kind("none"),
+        lambda: tool.setup.set_kind("none"),
     ):
         show_own()
         again = image(tool).data

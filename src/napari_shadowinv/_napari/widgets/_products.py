@@ -136,7 +136,7 @@ class ProductForm(ToolPanel):
         tip = "Shapes layer with the line or outline. Of several, the selected is used."
         self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",), label="Shape")
         self.shapes.add_button("✎", "Draw a new shape for the product.", self._draw)
-        self.unit = forms.SteadyComboBox(tip="Unit of the field, which chooses the field, too.")
+        self.unit = forms.combo_box("Unit of the field, which chooses the field, too.")
         self.bands, self.shots = forms.ModelForm(_Bands), forms.ModelForm(_Shots)
         self.plot, self.report = qt.Plot(_PANEL_HEIGHT_PX, fixed=True), ReportView()
         self.export = qt.push_button("Export CSV…", "Save all measured products.", self._export)
@@ -150,7 +150,7 @@ class ProductForm(ToolPanel):
             self.shots,
             self.product,
             self.shapes,
-            forms.labelled("Unit", self.unit),
+            forms.labelled("Unit", self.unit.native),
             self.bands,
             self.panel,
             self.plot,
@@ -188,10 +188,7 @@ class ProductForm(ToolPanel):
         )
         fields = {"displacement"} if setup is None else {each.name for each in setup.si_fields}
         symbols = [s for s, unit in FIELD_UNITS.items() if unit.field in fields | {"displacement"}]
-        before = self.unit.currentText()
-        self.unit.clear()
-        self.unit.addItems([_BY_SETUP, *symbols])
-        self.unit.setCurrentText(before if before in symbols else _BY_SETUP)
+        self.unit.choices = (_BY_SETUP, *symbols)
 
     def request(self) -> ProductJob:
         """Return what is to be measured, or raise an `InputError`."""
@@ -205,7 +202,7 @@ class ProductForm(ToolPanel):
         values = {**choices.model_dump(exclude_unset=True), "product": self.kind.name()}
         if _is_drawn(self.kind):
             values |= self._outline(layer)
-        symbol = self.unit.currentText()
+        symbol = self.unit.value
         product, unit = product_from_dict(values), None if symbol == _BY_SETUP else symbol
         origin: Any = _store_of(layer) or about.result_of(layer)
         bands: Any = self.bands.model()
