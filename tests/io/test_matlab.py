@@ -68,6 +68,11 @@ def test_variables_beside_an_image_of_73_do_not_change_it(tmp_path: Path) -> Non
     np.testing.assert_array_equal(read_shot(path).image, RAMP / 2)
 
 
+def test_cells_of_73_are_no_candidates(tmp_path: Path) -> None:
+    path = save_mat73(tmp_path / "shot.mat", {"#refs#/a": RAMP * 1.0, "shot": RAMP * 0.5})
+    np.testing.assert_array_equal(read_shot(path).image, RAMP / 2)
+
+
 def test_variable_of_another_kind_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", RAMP)
     with pytest.raises(InputError, match="is neither a MATLAB nor an HDF5 file"):

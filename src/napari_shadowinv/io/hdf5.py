@@ -102,7 +102,7 @@ def walk(file: Any, most_visits: float = math.inf) -> Iterator[tuple[str, Any]]:
             if address not in addresses:
                 addresses.add(address)
                 yield f"{prefix}{name}", item
-                if isinstance(item, h5py.Group):
+                if isinstance(item, h5py.Group) and name[:1] != "#":  # of MATLAB's own
                     groups.append((f"{prefix}{name}/", item))
 
 

@@ -158,7 +158,7 @@ def list_sizes(path: Path, *, most: int = 40) -> list[tuple[str, str]]:
 def _entries(file: Any, most_visits: int = 10_000) -> Iterator[ArrayEntry]:
     """Yield the arrays of a file from the top down."""
     for name, item in walk(file, most_visits):
-        if "#" in (part[:1] for part in name.split("/")):  # MATLAB's own
+        if name.rpartition("/")[2][:1] == "#":  # MATLAB's own
             continue
         if isinstance(item, str):
             yield ArrayEntry(name, "", f"in another file, {item!r}")
