@@ -359,6 +359,7 @@ class ModelForm(QWidget):
             self.entries[name] = Entry(field, default, partial(self._on_edit, name))
             widget = self.entries[name].widget
             label = QtWidgets.QLabel(widget.label, toolTip=widget.tooltip)
+            label.setMinimumWidth(_LABEL_WIDTH_PX)
             rows.addRow(label, widget.native)
             extra = field.json_schema_extra
             if isinstance(extra, dict) and extra.get("rare"):
