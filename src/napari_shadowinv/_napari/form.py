@@ -8,7 +8,6 @@ A form holds what the user stated, and the model reads it; grey text shows the d
 
 from __future__ import annotations
 
-import html
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -37,7 +36,7 @@ Kinds = dict[str, tuple[str, type[BaseModel] | QWidget | None]]
 PROBLEM_COLOUR = QColor("#c8711a")  # as other colours of text, readable on dark and light
 PROBLEM_STYLE = f"color: {PROBLEM_COLOUR.name()};"
 _LABEL_WIDTH_PX, _ENTRY_WIDTH_PX = 80, 80
-INDENT = 12
+_INDENT = 12
 TOML = "TOML (*.toml)"
 # Fields that exclude each other: stating one empties the other.
 _ALTERNATIVES = ("pixel_size", "detector_pixel_size")
@@ -113,11 +112,6 @@ class WrappingLabel(QtWidgets.QLabel):
         if style not in (None, self.styleSheet()):
             self.setStyleSheet(style)
         self.setVisible(bool(text))
-
-    def show_titled(self, title: str, text: str, style: str) -> None:
-        """Show a sentence below a bold title."""
-        sentence = html.escape(f"{text[:1].upper()}{text[1:]}")
-        self.show_text(f"<b>{html.escape(title)}</b><br>{sentence}", style)
 
 
 class SavedLine(QtWidgets.QLineEdit):
@@ -526,7 +520,7 @@ class ModelPicker(QWidget):
         _, model_class = self._kinds.get(kind, ("", None))
         if isinstance(model_class, type) and kind not in self._forms:
             form = ModelForm(model_class)
-            form.layout().setContentsMargins(INDENT, 0, 0, 0)
+            form.layout().setContentsMargins(_INDENT, 0, 0, 0)
             form.setVisible(False)
             form.changed.connect(self._on_entry)
             self._forms[kind] = form

@@ -119,8 +119,10 @@ class VerdictLine(forms.WrappingLabel):
 
     def show_headline(self, headline: Headline, prefix: str = "") -> None:
         """Show a headline after a prefix, such as ``"Preview: "``."""
-        title = f"{prefix}{headline.title.capitalize()}"
-        self.show_titled(title, headline.text, _LEVEL_STYLES[headline.level])
+        text = f"{headline.text[:1].upper()}{headline.text[1:]}"
+        lines = f"{prefix}{headline.title.capitalize()}", text
+        title, sentence = map(html.escape, lines)
+        self.show_text(f"<b>{title}</b><br>{sentence}", _LEVEL_STYLES[headline.level])
 
 
 class ToolPanel(qt.Docked):

@@ -52,9 +52,11 @@ def _cautions_of(images: Sequence[Any]) -> dict[str, str]:
 
 
 def _has_recorded_beam(image: Any | None) -> bool:
-    """Whether an image belongs to a result with its beam, which no fit has found."""
+    """Whether an image belongs to a result with its beam, which no fit of several has found."""
     result = None if image is None else about.result_of(image)
-    provenance = None if result is None else result.content.provenance
+    if result is None or about.source_of(image) is not None:
+        return result is not None
+    provenance = result.content.provenance
     origins = () if provenance is None else provenance.images
     return bool(origins) and all(origin.source is not None for origin in origins)
 
