@@ -6,13 +6,11 @@ The layer's own setup is used; an image without one is shown in pixels.
 
 import napari
 from napari_shadowinv import InversionOptions, add_to_viewer, invert
-from napari_shadowinv.physics.setup import setup_from_dict
 
 viewer = napari.current_viewer()
 shot = viewer.layers.selection.active
 
-facts = shot.metadata.get("napari-shadowinv", {})
-setup = setup_from_dict(facts["setup"]) if "setup" in facts else None
+setup = shot.metadata.get("napari-shadowinv", {}).get("setup")
 
 inversion = invert(shot.data, options=InversionOptions(n_sites=4000))
 add_to_viewer(
