@@ -12,7 +12,6 @@ import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Any
 
 from qtpy import QtWidgets
@@ -228,9 +227,13 @@ class ToolPanel(qt.Docked):
 
     @qt.notify_errors
     def _on_end(self, outcome: Outcome) -> None:
-        if outcome.value is not None:
-            show = outcome.tag.show or partial(self.show_result, job=outcome.tag)
-            show(outcome.value)
+        job = outcome.tag
+        if outcome.value is None:
+            return
+        if job.show is None:
+            self.show_result(outcome.value, job)
+        else:
+            job.show(outcome.value)
 
 
 class ResultView(QtWidgets.QWidget):
