@@ -317,8 +317,9 @@ class FilmPack(panels.ToolPanel):
 
     def _opened(self, name: str) -> list[Any]:
         """Return the layers of a pack's result that was opened from a file."""
-        of_pack = [layer for layer in self.viewer.layers if about.metadata_of(layer).get("films")]
-        return [layer for layer in of_pack if name_of_result(layer) == name]
+        roles = {kind.role for kind in packs.KINDS}
+        of_packs = [layer for layer in self.viewer.layers if about.role_of(layer) in roles]
+        return [layer for layer in of_packs if name_of_result(layer) == name]
 
     def _follow_result(self) -> None:
         for layer in self.results.layers:
@@ -401,8 +402,8 @@ class FilmPack(panels.ToolPanel):
     @qt.notify_errors
     def _add_fit_images(self) -> None:
         layer, doses = self._selected()
-        for role in (packs.DOSE, packs.FLUENCE, packs.UNUSABLE):
-            partner = self._partner(layer, role)
+        for kind in packs.KINDS:
+            partner = self._partner(layer, kind.role)
             if partner is not None:
                 partner.visible = False
         layer_data = packs.film_layers(doses, about.frame_of(layer), layer.name)
