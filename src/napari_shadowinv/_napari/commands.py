@@ -282,8 +282,13 @@ def _moved(selection: _Selection, step: Step, title: str) -> results.FullLayerDa
     """Return an image after a step that moves pixels, with its source and usable pixels."""
     moved, before = step.apply(selection.shot), selection.shot.shape
     frame = frame_of(selection.layer).beneath(step.matrix(before))
-    kept = {"frame": frame, "setup": moved.setup, "source": moved.source, "usable": moved.mask}
-    return _derived(selection, moved.image, title, **kept)
+    properties = {
+        "frame": frame,
+        "setup": moved.setup,
+        "source": moved.source,
+        "usable": moved.mask,
+    }
+    return _derived(selection, moved.image, title, **properties)
 
 
 def _derived(

@@ -130,11 +130,11 @@ def _show_in_window(layers: Sequence[Any]) -> None:
         return
 
     def show(added: list[Any]) -> None:
-        kept = [layer for layer in added if layer in viewer.layers]
-        for layer in kept:
+        present_layers = [layer for layer in added if layer in viewer.layers]
+        for layer in present_layers:
             if role_of(layer) == "arrows" and "store" in metadata_of(layer):
                 follow_shots(viewer, layer)
-        present(viewer, kept)
+        present(viewer, present_layers)
 
     connect_viewer(viewer)
     once_added(viewer, len(layers), show)

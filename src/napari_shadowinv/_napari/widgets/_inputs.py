@@ -210,9 +210,9 @@ class SetupPicker(forms.ModelPicker):
 
     def _show_setups(self, kind: str, entry: _Entry | None = None) -> None:
         """Show a setup or none; the forms of other kinds get the user's entries."""
-        shown = self._entered | ({} if entry is None else {kind: entry})
-        self._origins = {each: setup.origin for each, setup in shown.items()}
-        values = {each: setup.values for each, setup in shown.items()}
+        setups = self._entered | ({} if entry is None else {kind: entry})
+        self._origins = {each: setup.origin for each, setup in setups.items()}
+        values = {each: setup.values for each, setup in setups.items()}
         with QSignalBlocker(self):
             super().restore({"kind": kind, "values": {each: {} for each in self._forms} | values})
         self._show_notes()
@@ -322,7 +322,7 @@ class SourcePicker(layers.LayerPicker):
 
     def __init__(self, viewer: Any, kinds: Sequence[str], tip: str) -> None:
         self._image: Any = None
-        self._own: str | None = None  # the kind, if the image has a source and uses it
+        self._supplied: str | None = None  # the kind, if the image has a source and uses it
         models = {**preprocessing.ESTIMATES, FILE: preprocessing.MeasuredSource}
         entries = {kind: (_SOURCE_TITLES[kind], models.get(kind)) for kind in kinds}
         super().__init__(viewer, tip, suits=self._suits_image, label="Source", entries=entries)
@@ -456,7 +456,7 @@ class SourcePicker(layers.LayerPicker):
         """Select the source supplied with an image, or a likely one; else the chosen one."""
         self._image = image
         has_own = image is not None and about.source_of(image) is not None
-        self._own = SUPPLIED if has_own and SUPPLIED in self._kinds else None
+        self._supplied = SUPPLIED if has_own and SUPPLIED in self._kinds else None
         self.fill()
 
     @property
@@ -467,7 +467,7 @@ class SourcePicker(layers.LayerPicker):
 
     def _remember(self, choice: Any) -> None:
         # The source supplied with a shot is not that of the next one.
-        self._own = SUPPLIED if choice == SUPPLIED else None
+        self._supplied = SUPPLIED if choice == SUPPLIED else None
         self.chosen = UNIFORM if choice == SUPPLIED else choice
 
     def _preferred(self, before: Any) -> Sequence[Any]:
@@ -475,7 +475,7 @@ class SourcePicker(layers.LayerPicker):
         image, likely = self._image, None
         if image is not None and self.chosen is None:
             likely = layers.likely_beam(image, self.offered)
-        return self._own, self.chosen, likely, UNIFORM
+        return self._supplied, self.chosen, likely, UNIFORM
 
     def _suits_image(self, layer: Any) -> bool:
         # An image cannot be its own source.

@@ -92,8 +92,8 @@ class FitImages(inputs.ImagePanel):
         self.fields = forms.ModelPicker(
             "Fields", {}, "Field that deflects the beam. Two fields require images at two energies."
         )
-        others = FitChoices.model_fields.keys() - _ELSEWHERE
-        self.choices = forms.ModelForm(FitChoices, sorted(others))
+        fields = FitChoices.model_fields.keys() - _ELSEWHERE
+        self.choices = forms.ModelForm(FitChoices, sorted(fields))
         self.setup_section = forms.titled_section(self.setup)
         self.cost = forms.WrappingLabel()
         tip = (
