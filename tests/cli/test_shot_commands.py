@@ -382,7 +382,7 @@ def test_variables_of_matlab_and_hdf5(folder: Path, refused: Callable[..., None]
     with h5py.File("shots.h5", "w") as file:
         file.update({"day/shot": image, "day/beam": source, "day/d": BLOB.displacement})
     expected = invert(image, source=source).displacement
-    for name, group, remedy in (("shots.mat", "", "::shot"), ("shots.h5", "day/", "::/name")):
+    for name, group, remedy in (("shots.mat", "", "::shot"), ("shots.h5", "day/", "::day/beam")):
         refused("invert", name, "--overwrite", names=(name, remedy, f"{group}shot"))
         refused("info", name, names=(name, remedy, f"'{group}shot' (24×32"))
         refused("info", f"{name}::shop", names=(name, "'shop'", f"{group}beam"))
