@@ -32,27 +32,13 @@ def test_tiff_knows_its_pixel_size(tmp_path: Path, proton_setup: ProtonSetup) ->
     assert 0.01 / (numerator / denominator) == pytest.approx(1.5e-6)
 
 
-def test_sites_as_a_table(tmp_path: Path, inversion: Inversion) -> None:
-    path = write(tmp_path / "sites.csv", inversion)
-    assert path.read_text().startswith("y_px,x_px,weight_px2,mass,")
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    expected = [
-        inversion.cells.sites,
-        inversion.cells.weights[:, None],
-        inversion.cells.mass[:, None],
-        inversion.cells.flux[:, None],
-        inversion.cells.displacement,
-    ]
-    np.testing.assert_array_equal(table, np.hstack(expected))
-
-
 def test_dataset_is_written_as_well(tmp_path: Path, inversion: Inversion) -> None:
     dataset = inversion.to_dataset()
     first = write(tmp_path / "a.shadowinv", dataset)
     assert first.stat().st_size > 0
-    with pytest.raises(InputError, match="dataset has no 'sites'"):
-        write(tmp_path / "a.csv", dataset.drop_vars("sites"))
-    assert not (tmp_path / "a.csv").exists()
+    with pytest.raises(InputError, match="dataset has no 'potential'"):
+        write(tmp_path / "a.h5", dataset.drop_vars("potential"))
+    assert not (tmp_path / "a.h5").exists()
 
 
 def test_unknown_ending_and_existing_file_are_refused(tmp_path: Path, inversion: Inversion) -> None:
@@ -66,12 +52,12 @@ def test_unknown_ending_and_existing_file_are_refused(tmp_path: Path, inversion:
     assert (tmp_path / "a.shadowinv").read_text() == "old"
 
 
-@pytest.mark.parametrize("name", ["a.shadowinv", "a.h5", "a.csv", "a.tif", "a.npy", "a.png"])
+@pytest.mark.parametrize("name", ["a.shadowinv", "a.h5", "a.tif", "a.npy", "a.png"])
 def test_a_full_disk_is_reported_and_keeps_the_old_file(
     name: str, small_disk: Disk, inversion: Inversion, proton_setup: ProtonSetup
 ) -> None:
     folder, _ = small_disk
-    result = inversion if name.endswith((".shadowinv", ".h5", ".csv")) else IMAGE
+    result = inversion if name.endswith((".shadowinv", ".h5")) else IMAGE
     old = write(folder / name, result, setup=proton_setup).read_bytes()
     (folder / "other").write_bytes(bytes(_left(folder)))
     with pytest.raises(FileFormatError, match=rf"{name} cannot be written \(No space left on dev"):

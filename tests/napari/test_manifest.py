@@ -21,7 +21,7 @@ def test_it_is_valid_and_each_command_can_be_imported(manifest):
 
 
 # The manifest leaves them out, so that nobody has to choose a reader.
-OPENED_BY_NAPARI = formats.SCAN_SUFFIXES | {".npy", formats.SITES.suffix}
+OPENED_BY_NAPARI = formats.SCAN_SUFFIXES | {".npy", formats.TABLE.suffix}
 
 
 def test_its_readers_and_writers_are_those_of_the_registry(manifest):

@@ -122,15 +122,6 @@ def test_painted_caustics_are_kept(viewer, solved, tmp_path):
     np.testing.assert_array_equal(caustic[5:], solved.caustic[5:])
 
 
-def test_sites_are_written_with_all_that_is_known(viewer, solved, tmp_path):
-    sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
-    viewer.layers.selection = {sites}
-    viewer.layers.save(str(tmp_path / "a.csv"), selected=True, plugin=PLUGIN)
-    rows = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
-    np.testing.assert_array_equal(rows[:, :2], solved.cells.sites)
-    np.testing.assert_array_equal(rows[:, 2], solved.cells.weights)
-
-
 def test_layers_of_two_results_are_refused(viewer, solved, make_inversion, tmp_path):
     add_to_viewer(viewer, solved, name="one")
     add_to_viewer(viewer, make_inversion((24, 32)), name="two")

@@ -27,7 +27,7 @@ from napari_shadowinv._napari.packs import pack_layers
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io import write
-from napari_shadowinv.io.formats import PRADFORMAT, RESULT, SITES, Format
+from napari_shadowinv.io.formats import PRADFORMAT, RESULT, Format
 from napari_shadowinv.results import result_from_dataset
 
 if TYPE_CHECKING:
@@ -182,11 +182,6 @@ def write_result(path: str, layers: Sequence[FullLayerData]) -> list[str]:
 def write_pradformat(path: str, layers: Sequence[FullLayerData]) -> list[str]:
     """Write a result's potential and deflection as a pradformat inversion."""
     return _write(path, layers, PRADFORMAT)
-
-
-def write_sites(path: str, layers: Sequence[FullLayerData]) -> list[str]:
-    """Write all sites of a result, with weight, mass and displacement, as CSV."""
-    return _write(path, layers, SITES)
 
 
 def _write(path: str, layers: Sequence[FullLayerData], form: Format) -> list[str]:

@@ -69,14 +69,14 @@ def analyse(
     from napari_shadowinv.analysis import analyse as measure
     from napari_shadowinv.analysis.series import shot_times
     from napari_shadowinv.io import read_dataset, replacing, write
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, SITES
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, RESULT, TABLE
     from napari_shadowinv.io.store import is_stack
     from napari_shadowinv.io.store_shots import open_shots
     from napari_shadowinv.physics.beam import numbers_in_unit
 
     chosen, outputs = _products(product or [], flags.products), Outputs(overwrite, quiet)
     outputs.check(
-        [(csv, SITES.suffixes), (figure, FIGURE_SUFFIXES), (out, RESULT.suffixes)],
+        [(csv, TABLE.suffixes), (figure, FIGURE_SUFFIXES), (out, RESULT.suffixes)],
         [result, flags.setup, flags.products],
     )
     if is_stack(result):

@@ -57,7 +57,7 @@ def film(
     """
     from napari_shadowinv.film import write_corners
     from napari_shadowinv.io import replacing
-    from napari_shadowinv.io.formats import SITES
+    from napari_shadowinv.io.formats import TABLE
     from napari_shadowinv.pipeline import read_pack, run_film, write_layers
     from napari_shadowinv.pipeline.film_files import (
         LAYERS_TABLE,
@@ -86,7 +86,7 @@ def film(
     outputs.check_result(ResultKind.FILM_DOSES, result, figure)
     table = None if layers is None else layers / LAYERS_TABLE
     replaced = table if table is not None and table.exists() else None
-    outputs.check([(corners, SITES.suffixes), (replaced, SITES.suffixes)], [])
+    outputs.check([(corners, TABLE.suffixes), (replaced, TABLE.suffixes)], [])
     content = read_pack(pack)
     outputs.protect([pack, *content.files])
     with work_callbacks(quiet) as callbacks:

@@ -72,14 +72,14 @@ def plan(
 ) -> None:
     """Simulate shots of an experiment, and report whether the field would be determined."""
     from napari_shadowinv.io.files import replacing
-    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, SITES
+    from napari_shadowinv.io.formats import FIGURE_SUFFIXES, TABLE
     from napari_shadowinv.pipeline.experiment import plan_experiment
     from napari_shadowinv.pipeline.experiment_object import setups_of_text, shape_of_text
     from napari_shadowinv.plotting import plan_figure
 
     page, outputs = figure or figure_beside(out), Outputs(overwrite, quiet)
     outputs.check(
-        [(out, SITES.suffixes), (page, FIGURE_SUFFIXES)],
+        [(out, TABLE.suffixes), (page, FIGURE_SUFFIXES)],
         [flags.setup, flags.recorded_with, _file_of(object)],
     )
     keys = _flags.instrument_keys(flags.instrument) | {"plan.counts": ("--counts", flags.counts)}

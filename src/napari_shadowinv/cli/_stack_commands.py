@@ -150,10 +150,10 @@ def export(
 ) -> None:
     """Write shots of a store in another format."""
     from napari_shadowinv.cli._export import export_shots
-    from napari_shadowinv.io.formats import SITES, STORE
+    from napari_shadowinv.io.formats import STORE, TABLE
 
     stem = store.name.removesuffix(STORE.suffix)
-    target = Path(f"{stem}{SITES.suffix}" if form == "csv" else stem) if out is None else out
+    target = Path(f"{stem}{TABLE.suffix}" if form == "csv" else stem) if out is None else out
     names = [name.strip() for name in variables.split(",")]
     written = export_shots(store, target, form, shots, names, overwrite)
     if not quiet:

@@ -162,18 +162,15 @@ SPE = Format(
     "spe", (".spe",), "Princeton .spe", ((2996, b"\x67\x45\x23\x01"), (4098, b"\x55\x55")),
     unmarked="binary", reader="cameras:read_spe", counter="cameras:count_spe",
 )
-SITES = Format(
-    "sites", (".csv",), holds=(), result_writer="read_write:write_sites",
-    results=(ResultKind.INVERSION,),
-)
+TABLE = Format("table", (".csv",), holds=())
 TEXT = Format(
-    "text", (".txt", SITES.suffix, ".dat", ".asc"), "numbers as .txt, .csv or .dat",
+    "text", (".txt", TABLE.suffix, ".dat", ".asc"), "numbers as .txt, .csv or .dat",
     unmarked="text", reader="text:read_text",
 )
 STORE = Format("store", (".shadowinv.zarr",), holds=("result",))
 
 FORMATS = (
-    TIFF, PNG, BMP, JPEG, NPY, PCO, MATLAB, RESULT, PRADFORMAT, HDF5, CPSA, SPE, TEXT, SITES, STORE,
+    TIFF, PNG, BMP, JPEG, NPY, PCO, MATLAB, RESULT, PRADFORMAT, HDF5, CPSA, SPE, TEXT, STORE,
 )
 # fmt: on
 

@@ -35,7 +35,6 @@ from napari_shadowinv.io.frames import FileFrame, find_frames, lazy_frames
 from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, seal_hdf5
 from napari_shadowinv.io.images import film_cautions, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
-from napari_shadowinv.physics.units import refuse_missing
 from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
@@ -230,9 +229,6 @@ def read_toml(path: Path) -> dict[str, Any]:
         ) from None
 
 
-_SITE_COLUMNS = "y_px,x_px,weight_px2,mass,flux,displacement_y_px,displacement_x_px"
-
-
 def write_result(content: BytesIO, dataset: xarray.Dataset) -> None:
     """Write a dataset as NetCDF4, moderately compressed and with checksums."""
     import h5netcdf
@@ -265,14 +261,6 @@ def read_result(path: Path) -> xarray.Dataset:
     return xr.load_dataset(path, engine="h5netcdf", decode_times=False)
 
 
-def write_sites(content: BytesIO, dataset: xarray.Dataset) -> None:
-    """Write the sites of a result as comma-separated values, one in each row."""
-    names = ("sites", "weights", "site_mass", "site_flux", "site_displacement")
-    refuse_missing(dataset, "result of an inversion", names)
-    columns = np.column_stack([dataset[name].values for name in names])
-    np.savetxt(content, columns, delimiter=",", header=_SITE_COLUMNS, comments="", fmt="%.17g")
-
-
 def write(
     path: str | Path,
     result: AnyResult | xarray.Dataset | AnyArray,
@@ -285,9 +273,9 @@ def write(
     Parameters
     ----------
     path : str or Path
-        For a result: ``.shadowinv`` for all of it, ``.h5`` for pradformat, ``.csv`` for the
-        sites; for a fit ``.shadowinv``, or ``.h5`` for its field alone. For an image: ``.tif``
-        (float32), ``.npy``, ``.png`` (16 bits, its largest value white).
+        For a result: ``.shadowinv`` for all of it, ``.h5`` for pradformat, of a fit for its field
+        alone. For an image: ``.tif`` (float32), ``.npy``, ``.png`` (16 bits, its largest value
+        white).
     result : Inversion, Fit, FilmDoses, xarray.Dataset, or ndarray of shape (H, W)
         Result or image to write.
     setup : Setup, optional

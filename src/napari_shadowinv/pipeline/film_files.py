@@ -29,9 +29,9 @@ from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_shot, read_toml, replacing, write
 from napari_shadowinv.io.files import in_counting_order, make_folder, write_toml
-from napari_shadowinv.io.formats import SCAN_SUFFIXES, SITES, TIFF
+from napari_shadowinv.io.formats import SCAN_SUFFIXES, TABLE, TIFF
 
-LAYERS_TABLE = f"layers{SITES.suffix}"
+LAYERS_TABLE = f"layers{TABLE.suffix}"
 _COLUMNS = ("file", "mask", "setup", "energy", "strength", "exclude")
 
 
@@ -117,7 +117,7 @@ def draft_pack(folder: Path) -> dict[str, Any]:
     scans = [path for path in scans if path not in unexposed]
     if not scans:
         raise InputError(f"{folder} has no scans of films: expected images in colour, such as TIFF")
-    tables = [path for path in files if path.suffix.lower() in SITES.suffixes]
+    tables = [path for path in files if path.suffix.lower() in TABLE.suffixes]
     calibrations = [path for path in tables if _is_calibration(path)]
     layers: list[dict[str, Any]] = [
         {"film": _film_type_of(path) or _USUAL_FILM, "filters": [], "file": path.name}

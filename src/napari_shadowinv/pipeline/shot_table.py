@@ -18,7 +18,7 @@ from napari_shadowinv._system.tables import has_column_names, is_number, read_ro
 from napari_shadowinv._system.validation import CheckedModel, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import name_of
-from napari_shadowinv.io.formats import SITES
+from napari_shadowinv.io.formats import TABLE
 from napari_shadowinv.options import MAX_STRENGTH, Noise
 from napari_shadowinv.physics.setup import beam_quantities
 
@@ -219,7 +219,7 @@ def _drop_none(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def is_table(path: Path) -> bool:
     """Return whether a file is a table with column names, not an image as text."""
-    return path.suffix.lower() in SITES.suffixes and has_column_names(path)
+    return path.suffix.lower() in TABLE.suffixes and has_column_names(path)
 
 
 def _read_shots(table: Path, setup: Path | None = None) -> dict[int, ShotRow]:

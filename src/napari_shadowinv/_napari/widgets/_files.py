@@ -36,7 +36,6 @@ from napari_shadowinv.io.formats import (
     PNG,
     PRADFORMAT,
     RESULT,
-    SITES,
     TIFF,
     Format,
     formats_for,
@@ -215,7 +214,6 @@ def _read_mask(file: Path | None, shape: tuple[int, ...] | None) -> BoolArray | 
 _TITLES = {
     RESULT: "Complete result",
     PRADFORMAT: "Potential and deflection, pradformat",
-    SITES: "Table of sites",
     TIFF: "Image, float32 TIFF",
     NPY: "Image, NumPy array",
     PNG: "Image, 16-bit PNG",

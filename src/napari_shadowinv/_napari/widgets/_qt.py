@@ -36,7 +36,7 @@ from napari_shadowinv._napari.viewer_sync import (
     show_user_error,
 )
 from napari_shadowinv.io import replacing
-from napari_shadowinv.io.formats import RESULT, SITES
+from napari_shadowinv.io.formats import RESULT, TABLE
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
@@ -101,7 +101,7 @@ def filter_of(title: str, endings: Sequence[str]) -> str:
     return f"{title} ({' '.join(f'*{ending}' for ending in endings)})"
 
 
-TABLES = filter_of("Tables", SITES.suffixes)
+TABLES = filter_of("Tables", TABLE.suffixes)
 RESULT_FILES = filter_of("Results", RESULT.suffixes)
 
 

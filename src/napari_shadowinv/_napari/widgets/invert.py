@@ -50,7 +50,7 @@ _REFINE_TIP = (
 )
 _SAVE_TIP = (
     "Save the selected or last result, of a stack the shot in view: complete with its layers "
-    "(.shadowinv), for other programs (.h5), or its sites (.csv)."
+    "(.shadowinv), or for other programs (.h5)."
 )
 _PREVIEW_DELAY_MS = 10  # merges simultaneous changes
 
