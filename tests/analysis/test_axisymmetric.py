@@ -150,7 +150,8 @@ def test_temperature_is_that_of_the_ideal_gas():
 def test_electron_density_is_that_of_its_line_integral():
     density, sigma = 3e24, SIGMA * LIGHT.object_pixel_size
     integral = density * np.sqrt(2 * np.pi) * sigma
-    amplitude = float(LIGHT.normalized_potential_from_density(integral))
+    log_index = -integral / (2 * LIGHT.critical_density)
+    amplitude = float(LIGHT.normalized_potential_from_log_index(log_index))
     (profile,) = analyse(
         result_of(gaussian_blob((90, 100), amplitude, SIGMA), LIGHT),
         AxisymmetricProfile(),

@@ -136,14 +136,11 @@ COLUMNS: tuple[ShotColumn, ...] = (
         "Largest relative flux error of a cell",
         value=attrgetter("report.residual"),
     ),
-    _of_inversions(
+    ShotColumn(
         "iterations",
-        "Solver iterations, summed over all levels",
+        "Iterations of the solver, on all levels; of a fit at full size",
         kind=int,
         value=attrgetter("report.iterations"),
-    ),
-    _of_fits(
-        "iterations", "Iterations at full size", kind=int, value=attrgetter("report.iterations")
     ),
     _of_inversions(
         "image_residual",

@@ -386,10 +386,6 @@ class OpticalSetup(BeamSetup):
         """
         return 2 * self.critical_density * self.potential(phi)
 
-    def normalized_potential_from_density(self, integral: ArrayLike) -> FloatArray:
-        """Potential φ in px² of a thin plasma, from ∫n dz in m⁻²."""
-        return self.normalized_potential(integral) / (2 * self.critical_density)
-
     def relative_density_modulation(self, phi: ArrayLike, density: float) -> FloatArray:
         """Modulation of a plasma's density, relative to its mean: ∫Δn/n₀ dz in m.
 

@@ -29,7 +29,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, ndimage
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, check_shape, complete_block_means
+from napari_shadowinv._system.arrays import (
+    NORMAL_MAD,
+    check_shape,
+    complete_block_means,
+    finest_differences,
+)
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.options import DEFAULT_REGISTRATION, REFERENCE_BEAM, BeamPrior, Instrument
@@ -332,10 +337,9 @@ def _by_borders(
 
 def _noise_of(ratio: FloatArray, lit: BoolArray) -> float:
     """Return the variance of noise in the outermost cells."""
-    finest = (ratio[1:, 1:] - ratio[1:, :-1] - ratio[:-1, 1:] + ratio[:-1, :-1]) / 2
     used = lit[1:, 1:] & lit[1:, :-1] & lit[:-1, 1:] & lit[:-1, :-1]
     used[1:-1, 1:-1] = False
-    return float((NORMAL_MAD * np.median(np.abs(finest[used]))) ** 2) if used.any() else 0.0
+    return float(NORMAL_MAD * np.median(finest_differences(ratio, used))) ** 2
 
 
 def _likeliest_shifts(
