@@ -26,7 +26,7 @@ from napari_shadowinv.pipeline.experiment_object import object_of_displacement
 INSTRUMENTS = {
     "noise only": Instrument(beam_rms=0.0),
     "beam stated to 2 %": Instrument(beam_rms=0.02),
-    "camera, implosion": Instrument.of("camera", source="implosion"),
+    "camera, implosion": Instrument(detector="camera", beam_source="implosion"),
 }
 
 

@@ -55,7 +55,7 @@ def print_table(side: int = 48) -> None:
         "uneven, the same": (0.1, 0.0, Instrument(beam_rms=0.1)),
         "uneven, different": (0.0, 0.05, Instrument(beam_rms=0.0, beam_between=0.05)),
         "both": (0.1, 0.05, Instrument(**both)),
-        "both, film": (0.1, 0.05, Instrument.of("film", source="TNSA")),
+        "both, film": (0.1, 0.05, Instrument(detector="film", beam_source="TNSA")),
     }
     for name, (rms, between, instrument) in cases.items():
         random = np.random.default_rng(0)

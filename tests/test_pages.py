@@ -116,8 +116,10 @@ def test_the_totals_of_the_tables_of_limits_are_those_of_inversions(limits: Any)
     for name, value, total in rows:
         instrument = Instrument(**{"beam_rms": 0.0, name: float(value)})
         cases.append((None if name == "beam_rms" else reference, instrument, total))
-    cases += [(None, Instrument.of(name, beam_rms=0.005), total) for name, total in detectors]
-    cases += [(None, Instrument.of("film", source=name), total) for total, name in sources]
+    cases += [(None, Instrument(detector=name, beam_rms=0.005), total) for name, total in detectors]
+    cases += [
+        (None, Instrument(detector="film", beam_source=name), total) for total, name in sources
+    ]
     for source, instrument, total in cases:
         errors = invert(shot, source=source, instrument=instrument).errors
         share = 100 * errors.total.rms / errors.rms

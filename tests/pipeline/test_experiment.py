@@ -171,7 +171,7 @@ def test_flux_is_conserved_by_an_exact_instrument():
 
 
 def test_a_draw_is_the_same_again_and_others_differ():
-    instrument = Instrument.of("film", source="TNSA")
+    instrument = Instrument(detector="film", beam_source="TNSA")
     first, again = (simulator(instrument, counts=100).draw(3) for _ in range(2))
     np.testing.assert_array_equal(first.images, again.images)
     assert (first.images != simulator(instrument, counts=100).draw(4).images).any()

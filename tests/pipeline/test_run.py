@@ -227,7 +227,7 @@ def test_a_recipe_survives_its_file(
         source=chosen if source is MeasuredSource else changed(source),
         mask=tmp_path / "below" / "mask.png",
         setup=setup,
-        instrument=Instrument.of("film", source="TNSA", beam_rms=0.02, background=0),
+        instrument=Instrument(detector="film", beam_source="TNSA", beam_rms=0.02, background=0),
         options=InversionOptions(n_sites=7, boundary="free", flux="known"),
         fit=fit,
     )

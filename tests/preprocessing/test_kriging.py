@@ -278,7 +278,7 @@ def test_a_stated_beam_replaces_the_conditional_variance():
     )
     result = run(recipe, shot)
     assert (result.errors.beam_basis, result.errors.beam_variation) == ("stated", 0.02)
-    of_source = recipe.model_copy(update={"instrument": Instrument.of(source="TNSA", gamma=0.1)})
+    of_source = recipe.model_copy(update={"instrument": Instrument(beam_source="TNSA", gamma=0.1)})
     assert run(of_source, shot).errors.beam_basis == "outside"
     assert run(of_source, shot).instrument.gamma == 0.1
 

@@ -75,7 +75,7 @@ class Instrument(CheckedModel, allow_inf_nan=False):
     >>> instrument = Instrument(beam=BeamPrior(rms=0.02), background=0.05)
     >>> instrument.beam_rms, instrument.beam_length
     (0.02, 0.25)
-    >>> film = Instrument.of("film", source="TNSA", background=0.1)
+    >>> film = Instrument(detector="film", beam_source="TNSA", background=0.1)
     >>> film.beam_rms, film.gamma, film.background
     (0.1, 0.03, 0.1)
     """
@@ -161,26 +161,6 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         description="Standard deviation of the Gaussian blur that correlates the noise of "
         "neighbouring pixels, in px; 0 for white noise. Default: measured in the image.",
     )
-
-    @classmethod
-    def of(cls, detector: str | None = None, source: str | None = None, **numbers: Any) -> Self:
-        """Return the instrument with the defaults of a detector and of a source of the beam.
-
-        Parameters
-        ----------
-        detector : str, optional
-            Such as "film"; all are in `DETECTORS`.
-        source : str, optional
-            Origin of the beam, such as "TNSA"; all are in `BEAM_SOURCES`.
-        **numbers
-            Numbers that differ from the defaults.
-
-        Raises
-        ------
-        InputError
-            If the detector or the source is unknown, or a number is out of range.
-        """
-        return cls(detector=detector, beam_source=source, **numbers)
 
     @model_validator(mode="wrap")
     @classmethod

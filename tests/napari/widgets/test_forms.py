@@ -45,7 +45,7 @@ STATED = [
     OpticalSetup.example(),
     InversionOptions(**CHANGED),
     FitOptions(smoothness=1.5, evidence=True, align="shift"),
-    Instrument.of("film", source="laser", gamma=0, noise_correlation=0),
+    Instrument(detector="film", beam_source="laser", gamma=0, noise_correlation=0),
     Crop(y=(3, 40), x=(5, None)),
     Dark(level=Path("dark.tif")),
     STEPS["low-pass"](width=12.345),
@@ -148,7 +148,7 @@ def test_an_instrument_shows_its_defaults_in_grey(qtbot: Any) -> None:
     enter(form.entries["blur"], 2.0)
     assert "blur" not in placeholders(form)
     enter(form.entries["detector"], "camera")
-    assert form.model() == Instrument.of("camera", source="TNSA", blur=2)
+    assert form.model() == Instrument(detector="camera", beam_source="TNSA", blur=2)
     form.restore({})
     assert placeholders(form) == exact
 

@@ -474,7 +474,7 @@ def test_a_layer_of_an_estimated_source_was_not_measured(
     assert tool.recipe().instrument == Instrument(beam_rms=0.05)
     enter(tool.instrument.entries["beam_source"], "laser")
     enter(tool.instrument.entries["beam_rms"], 0.01)
-    assert tool.recipe().instrument == Instrument.of(source="laser", beam_rms=0.01)
+    assert tool.recipe().instrument == Instrument(beam_source="laser", beam_rms=0.01)
     tool.instrument.restore({})
     tool.source.layer = window.add_image(source.data, name="recorded")
     assert tool.recipe().instrument == Instrument()

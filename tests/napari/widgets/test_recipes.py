@@ -319,7 +319,7 @@ def test_a_recipe_comes_back_from_its_file(
         steps=(Bin(factor=2), Crop(x=(3, None)), Rotate(angle=-7.5)),
         source=MeasuredSource(file=tmp_path / "beams.h5", variable="second"),
         options=InversionOptions(n_sites=120, floor=2e-3),
-        instrument=Instrument.of("film", source="TNSA", gamma=0.2, noise_correlation=1),
+        instrument=Instrument(detector="film", beam_source="TNSA", gamma=0.2, noise_correlation=1),
     )
     write_recipe(tmp_path / "in.toml", recipe)
     tool.recipes.load(tmp_path / "in.toml")

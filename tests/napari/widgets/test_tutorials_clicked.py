@@ -499,7 +499,7 @@ def test_film_without_reference_is_clicked_to_its_verdict(
         select(tool, entry, title)
     press(tool, "Run")
     wait_for_layers(tool, qtbot)
-    assert tool.instrument.model() == Instrument.of("film", source="TNSA")
+    assert tool.instrument.model() == Instrument(detector="film", beam_source="TNSA")
     report = report_of(tool)
     assert tool.verdict.text().startswith("<b>Too uncertain</b>")
     for number in ("1.75 ± 0.42 mT·m", "98 % of the field"):
