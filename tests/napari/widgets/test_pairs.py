@@ -92,6 +92,16 @@ def test_a_choice_is_never_overruled(viewer: ViewerModel, opened: Any) -> None:
     assert tool.image.layer.name == "ref"
 
 
+def test_a_layer_may_have_the_name_of_another_entry(viewer: ViewerModel, opened: Any) -> None:
+    viewer.add_image(OBJECT, name="shot")
+    beam = viewer.add_image(BEAM, name="uniform")
+    tool = opened(Invert)
+    for choice, kind in ((beam, "layer"), ("uniform", "uniform"), (beam, "layer")):
+        tool.source.choice.value = choice
+        assert tool.source.kind == kind
+    assert tool.source.choice.current_choice == "layer uniform"
+
+
 def test_without_its_beam_an_image_has_the_source_from_before(
     viewer: ViewerModel, opened: Any
 ) -> None:

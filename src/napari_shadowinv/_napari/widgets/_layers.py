@@ -252,7 +252,12 @@ class LayerPicker(ModelPicker):
 
     def _entries(self, kind: str) -> list[tuple[str, Any]]:
         if kind == LAYER:
-            return [(layer.name, layer) for layer in self.offered]
+            # The box has one entry for each title.
+            taken = {title for title, _ in self._kinds.values()}
+            return [
+                (f"layer {layer.name}" if layer.name in taken else layer.name, layer)
+                for layer in self.offered
+            ]
         return super()._entries(kind) if kind or self._none or not self.offered else []
 
     def _preferred(self, before: Any) -> Sequence[Any]:
