@@ -94,7 +94,8 @@ def opened(viewer, qtbot):
 
 @pytest.fixture
 def assert_it_fits(window, qtbot):
-    """Check that a widget needs no sideways scrolling in a small and in a large window."""
+    """Check that a widget needs no sideways scrolling, and has no gaps, in windows of any size."""
+    from qtpy.QtCore import Qt
 
     def check(tool):
         for size in ((1280, 800), (2560, 1440)):
@@ -102,6 +103,8 @@ def assert_it_fits(window, qtbot):
             qtbot.wait(50)
             qtbot.waitUntil(lambda: tool.area.horizontalScrollBar().maximum() == 0)
             assert tool.area.widget().minimumSizeHint().width() <= tool.area.viewport().width()
+            spread = tool.area.widget().layout().expandingDirections()
+            assert not spread & Qt.Orientation.Vertical
 
     return check
 
