@@ -129,6 +129,7 @@ def test_corners_are_shown_dragged_and_used(
     layer_of(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
     viewer.dims.set_current_step(0, 1)
     tool.show_corners.click()
+    assert tool.corners.polygon.mode == "direct"
     corners = pack_doses.corners
     np.testing.assert_allclose(tool.corners.polygon.data[0], corners[1], atol=1e-4)
     assert tool.corners.scan.rgb

@@ -65,8 +65,8 @@ class CornerEditor(QObject):
         if doses is not self._doses:
             self.close()
         self._films, self._doses = films, doses
+        self.set_visible(True)  # first, as it ends the mode in which corners are dragged
         self._show(plane_in_view(self._viewer, films))
-        self.set_visible(True)
 
     def close(self) -> None:
         """Remove the layers and discard the changes."""
