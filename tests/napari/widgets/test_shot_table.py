@@ -95,4 +95,6 @@ def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str], pack: Pat
     expect("/no/pack.csv does not exist: expected a .csv file")
     tool.image.form.restore({"path": str(pack.with_name("film0.npy"))})
     expect("film0.npy is no table: expected a .csv file")
+    tool.image.form.restore({"path": str(pack.parent)})
+    expect(f"{pack.parent} is no table: expected a .csv file")
     assert not tool.store.path.exists()

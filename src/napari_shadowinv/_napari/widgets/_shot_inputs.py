@@ -159,7 +159,7 @@ class ShotPicker(layers.LayerPicker):
             return paths[0] if len(paths) == 1 else paths
         path = Path(self.name).expanduser()
         if self.kind == TABLE and not (path.is_file() and is_table(path)):
-            reason = "is no table" if path.is_file() else "does not exist"
+            reason = "is no table" if path.exists() else "does not exist"
             raise InputError(
                 f"{path} {reason}: expected a .csv file that begins with names of columns, such as "
                 "file and energy"
