@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from qtpy.QtWidgets import QCheckBox
+from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import jobs
@@ -114,7 +114,8 @@ class Invert(ImagePanel):
         self.add(self.store, self.cost, self.panel, self.view, self.stack_view)
         self.add(self.refine_section)
         self.add(forms.section("Mask and crop", self.masks, self.crop), *self.settings)
-        self.add(self.keep_earlier, qt.side_by_side((self.live, 1), (self.recipes, 0)))
+        last_row = qt.side_by_side((self.live, 0), (QWidget(), 1), (self.recipes, 0))
+        self.add(self.keep_earlier, last_row)
 
     def _connect(self) -> None:
         self.image.changed.connect(self._on_shots)
