@@ -273,14 +273,14 @@ class Simulate(panels.ToolPanel):
         setup = self.setup.setup()
         target = self._object()
         size = self.side.text().strip()
-        shape = shape_of_text(size, "the size") if size else None
+        shape = shape_of_text(size, "'Size (px)'") if size else None
         if self.task.kind == _IMAGE:
             return self._image_job(target, setup, shape or _SHAPE)
         instrument = validate(Instrument, self.instrument.state(), "instrument")
         options: Any = self.options.model()
         return PlanJob(
             object=target,
-            setups=tuple(setups_of_text(setup, self.energies.text(), "the energies") or ()),
+            setups=tuple(setups_of_text(setup, self.energies.text(), "'Energies'") or ()),
             shape=shape,
             instrument=instrument,
             options=options,

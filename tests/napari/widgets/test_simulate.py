@@ -186,7 +186,7 @@ def test_a_plan_shows_its_verdict_and_the_first_image(tool, image):
 
 @pytest.mark.parametrize(
     ("energies", "size", "message"),
-    [("3; 15", "64 x 64", "separated by commas"), ("", "64", "expected height and width")],
+    [("3; 15", "64 x 64", "'Energies' is '3; 15'"), ("", "64", "'Size (px)' is '64'")],
 )
 def test_wrong_entries_are_a_sentence_below_the_button(tool, messages, energies, size, message):
     tool.energies.setText(energies)
