@@ -45,7 +45,7 @@ def draw_errors(axes: Axes, plan: ExperimentPlan, ink: str = QUIET_COLOUR) -> No
     totals = [100 * shot.total for shot in plan.shots]
     axes.plot(numbers, totals, "_", color=ink, markersize=7, label="reported")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("draw (blue: depends on the beam, orange: doubtful)")
+    axes.set_xlabel("draw\n(blue: depends on the beam, orange: doubtful)")  # narrow, for a window
     axes.set_ylabel("error of the field (%)")
     axes.legend(fontsize=7)
 
