@@ -206,6 +206,7 @@ class FitChoices(CheckedModel, allow_inf_nan=False):
         description="'poisson' for images in counts; 'proportional' if the noise is a fraction of "
         "each pixel, as on film; or the standard deviation of a pixel after all steps. Default: "
         "estimated from the images, the same for all pixels.",
+        examples=["estimated; or poisson, proportional"],
     )
     psf: PointSpread = None
     source_size: SourceSize = None
