@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -302,6 +303,34 @@ def test_a_film_on_a_full_disk_is_refused_and_the_old_one_kept(store, small_disk
     assert "Wrote" not in result.output
     assert film.read_bytes() == bytes(8000)
     assert list(disk.iterdir()) == [film]
+
+
+# A process of its own: what remains of a writer shows as it ends.
+_SMALL_FILES = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from napari_shadowinv.plotting import write_film
+
+frames = np.random.default_rng(0).integers(0, 255, (4, 50, 50, 3), np.uint8)
+_, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (4096, most))
+try:
+    write_film(Path(sys.argv[1]), frames, 10.0)
+except OSError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="files have no limit there")
+def test_a_film_that_finds_no_room_is_refused_in_one_line(tmp_path):
+    film = tmp_path / "plume.gif"
+    command = [sys.executable, "-c", _SMALL_FILES, str(film)]
+    printed = subprocess.run(command, capture_output=True, text=True)
+    assert (printed.returncode, printed.stderr) == (0, "")
+    (line,) = printed.stdout.splitlines()
+    assert line.startswith(f"{film} cannot be written (")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_film_that_cannot_be_read_back_is_none(store, monkeypatch):

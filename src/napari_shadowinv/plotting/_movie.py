@@ -5,6 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
@@ -150,12 +151,16 @@ def _encode(path: Path, frames: Iterable[NDArray[np.uint8]], rate: float) -> int
     is_gif = path.suffix == ".gif"
     form = {"duration": 1000 / rate, "loop": 0} if is_gif else {"fps": rate, **_H264}
     count = 0
-    film: Any = iio.get_writer(path, mode="I", **form)
+    # In memory: on a full disk the writer of GIF, once deleted, would print tracebacks.
+    target = BytesIO() if is_gif else path
+    film: Any = iio.get_writer(target, format=path.suffix, mode="I", **form)
     with film:
         for frame in frames:
             film.append_data(frame)
             count += 1
-    if not is_gif:
+    if isinstance(target, BytesIO):
+        path.write_bytes(target.getvalue())
+    else:
         from imageio_ffmpeg import count_frames_and_secs
 
         try:
