@@ -229,6 +229,8 @@ def test_a_sample_opened_beside_a_widget_is_the_image_not_its_source(viewer, ope
     assert tool.setup.note.text() == "Came with the sample 'toroid'."
     tool.source.layer = source
     assert tool.source.kind == "layer"
+    viewer.layers.remove(source)
+    assert tool.source.kind == "own"
 
 
 def test_no_image_is_its_own_source(viewer, opened, plain, shot):

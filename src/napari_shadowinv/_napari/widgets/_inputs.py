@@ -322,7 +322,7 @@ class SourcePicker(layers.LayerPicker):
 
     def __init__(self, viewer: Any, kinds: Sequence[str], tip: str) -> None:
         self._image: Any = None
-        self._supplied: str | None = None  # the kind, if the image has a source and uses it
+        self._takes_supplied = False
         models = {**preprocessing.ESTIMATES, FILE: preprocessing.MeasuredSource}
         entries = {kind: (_SOURCE_TITLES[kind], models.get(kind)) for kind in kinds}
         super().__init__(viewer, tip, suits=self._suits_image, label="Source", entries=entries)
@@ -454,9 +454,7 @@ class SourcePicker(layers.LayerPicker):
 
     def follow(self, image: Any) -> None:
         """Select the source supplied with an image, or a likely one; else the chosen one."""
-        self._image = image
-        has_own = image is not None and about.source_of(image) is not None
-        self._supplied = SUPPLIED if has_own and SUPPLIED in self._kinds else None
+        self._image, self._takes_supplied = image, True
         self.fill()
 
     @property
@@ -467,15 +465,18 @@ class SourcePicker(layers.LayerPicker):
 
     def _remember(self, choice: Any) -> None:
         # The source supplied with a shot is not that of the next one.
-        self._supplied = SUPPLIED if choice == SUPPLIED else None
+        self._takes_supplied = choice == SUPPLIED
         self.chosen = UNIFORM if choice == SUPPLIED else choice
 
     def _preferred(self, before: Any) -> Sequence[Any]:
         """Return the image's own source, the chosen one, or else its only likely beam."""
-        image, likely = self._image, None
+        image, own, likely = self._image, None, None
+        if image is not None and about.source_of(image) is not None:
+            own = SUPPLIED
         if image is not None and self.chosen is None:
             likely = layers.likely_beam(image, self.offered)
-        return self._supplied, self.chosen, likely, UNIFORM
+        first = own if self._takes_supplied else None
+        return first, self.chosen, own, likely, UNIFORM
 
     def _suits_image(self, layer: Any) -> bool:
         # An image cannot be its own source.

@@ -247,6 +247,10 @@ class ProductForm(ToolPanel):
             )
         self.result.layer = layer if layer in of_result else of_result[-1]
 
+    def forget(self) -> None:
+        self.report.setVisible(False)
+        self.plot.setVisible(False)
+
     def show_result(self, finished: Finished, job: ProductJob) -> None:
         if self._origin != job.origin:
             self.measured = []
@@ -271,8 +275,7 @@ class ProductForm(ToolPanel):
 
     def _clear(self) -> None:
         self.measured, self._origin = [], None
-        self.report.setVisible(False)
-        self.plot.setVisible(False)
+        self.forget()
         for widget in (self.export, self.picture, self.save, self.clear):
             widget.setEnabled(False)
 
