@@ -191,14 +191,14 @@ def test_a_batch_goes_on_with_the_store_of_a_watch(folder, out, tmp_path):
     assert list(read(out).name.values) == [f"shot_{i}.npy" for i in (3, 4, 1, 0)]
 
 
-def test_late_frames_cost_as_early_ones_and_leave_no_thread(folder, out, opened_paths):
-    count = 40
+def test_a_hundred_frames_cost_alike_and_leave_no_thread(folder, out, opened_paths):
+    count = 100
     opened: list[int] = []  # files, before each shot that ends
     with Watched(folder, out, max_shots=count) as watch:
         opened_paths.clear()
         for number in range(count):
             np.save(folder / f"shot_{number:03d}.npy", IMAGES[number % 6])
-            if number % 8 == 7:
+            if number % 20 == 19:
                 watch.ended(number + 1)
                 opened.append(len(opened_paths))
         watch.until(lambda: not watch._thread.is_alive())
