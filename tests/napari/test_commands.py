@@ -267,7 +267,7 @@ def test_closing_the_window_ends_a_command(
         raise InversionCancelled
 
     monkeypatch.setattr(jobs, "run", wait_for_stop)
-    window = make_napari_viewer()
+    window = make_napari_viewer(show=True)  # a command belongs to the window in sight
     add_shot(window, shot)
     in_loop(registered("invert_uniform"))
     window.close()
