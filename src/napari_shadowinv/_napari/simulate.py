@@ -299,8 +299,11 @@ class Simulate(panels.ToolPanel):
                 "open a .shadowinv file (File → Open), or select a simulated object"
             )
         displacement = np.asarray(about.displacement_of(layer), dtype=np.float64)
+        fields: Any = getattr(result.content, "fields", ())  # of a fit, each with its cause
+        names = [each.name for each in fields if np.array_equal(each.displacement, displacement)]
+        cause = deflector_titles().get(names[0]) if names else None
         return object_of_displacement(
-            displacement, result.content.setup, title=name_of_result(layer)
+            displacement, result.content.setup, deflector=cause, title=name_of_result(layer)
         )
 
     def _image_job(

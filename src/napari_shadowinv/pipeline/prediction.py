@@ -14,7 +14,7 @@ from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
-from napari_shadowinv.physics.projection import default_deflector, transferred_displacement
+from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.tracing import trace
 from napari_shadowinv.pipeline.experiment_object import PlannedObject
@@ -92,9 +92,11 @@ def _transfer(
     """Return the displacement in a setup, and the assumption behind it."""
     if field.setup is None or setup is None or field.setup == setup:
         return field.samples, []
-    cause = deflector or default_deflector(field.setup, setup)
+    cause = deflector or field.cause(setup)
     shape = None if source is None else (source.shape[0], source.shape[1])
     moved = transferred_displacement(
         field.samples, field.setup, setup, deflector=cause, shape=shape
     )
-    return moved, [f"Converted to another setup, assuming that only a {cause} deflects the beam."]
+    return moved, [
+        f"Converted to another setup, assuming that the {cause} alone deflects the beam."
+    ]

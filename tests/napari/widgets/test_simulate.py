@@ -13,8 +13,15 @@ from helpers.jobs import run_job
 from helpers.layers import by_role
 from helpers.reports import texts_of
 from napari_shadowinv import InputError, Instrument, OpticalSetup, ProtonSetup, trace
-from napari_shadowinv._napari.layer_metadata import role_of, source_of, unit_of
-from napari_shadowinv._napari.layers import add_to_viewer
+from napari_shadowinv._napari.layer_metadata import (
+    Frame,
+    Result,
+    displacement_of,
+    role_of,
+    source_of,
+    unit_of,
+)
+from napari_shadowinv._napari.layers import add_layers, add_to_viewer, fit_layers
 from napari_shadowinv._napari.simulate import ForwardJob, GridFile, Simulate
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.io import read_field_grid
@@ -75,6 +82,22 @@ def test_only_fields_of_results_are_offered(viewer, opened, messages, solved, pr
     assert tool.setup.setup() == proton_setup
 
 
+def test_a_fitted_field_deflects_by_its_own_cause(viewer, opened, image, two_fields):
+    add_layers(viewer, fit_layers(Result(two_fields), Frame(), "fit"))
+    first, second = two_fields.setups
+    tool = opened(Simulate)
+    tool.object.set_kind("layer")
+    for field, cause in zip(two_fields.fields, ("magnetic field", "electric field"), strict=True):
+        tool.field.layer = next(
+            layer
+            for layer in tool.field.offered
+            if np.array_equal(displacement_of(layer), field.displacement)
+        )
+        tool.setup.show_setup(second.model_dump())
+        expected = predict_image(field.displacement, first, second, deflector=cause)
+        np.testing.assert_allclose(image(tool).data, expected)
+
+
 def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     viewer, opened, image, messages, solved, proton_setup
 ):
@@ -89,7 +112,7 @@ def test_a_result_is_seen_in_another_experiment_as_the_core_sees_it(
     layer = image(tool)
     assert layer.name.startswith("solved image")
     np.testing.assert_allclose(layer.data, expected)
-    assert "only a magnetic field deflects the beam" in tool.warning.text()
+    assert "the magnetic field alone deflects the beam" in tool.warning.text()
     # Its potential stands for the same field.
     assert unit_of(layers["potential"]) != "px²"
     tool.field.layer = layers["potential"]
