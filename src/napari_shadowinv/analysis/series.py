@@ -39,7 +39,7 @@ _TIME, _SHOT = SERIES_AXES
 _AXES = {"s": (_TIME, "time"), "": (_SHOT, "number of the shot")}
 
 
-def growth_rate(series: ProductResult, name: str) -> Quantity:
+def growth_rate(series: ProductResult, name: str, *, samples: int = 1000) -> Quantity:
     """Return the rate γ in 1/s of exponential growth, such as of the r.m.s. of a region.
 
     It is the slope of the logarithm over time, by least squares in which a shot counts as its
@@ -52,6 +52,8 @@ def growth_rate(series: ProductResult, name: str) -> Quantity:
         Of `time_series` or `analyse_shots`.
     name : str
         One of its numbers.
+    samples : int
+        Number of draws that represent the scatter.
 
     Raises
     ------
@@ -61,21 +63,13 @@ def growth_rate(series: ProductResult, name: str) -> Quantity:
     quantities = series.quantities
     if name not in quantities:
         raise InputError(f"got the number {name!r}, expected one of {', '.join(quantities)}")
-    if not _keeps_sign(quantities[name]):
+    quantity = quantities[name]
+    if not _keeps_sign(quantity):
         raise InputError(
             f"{name} is zero or changes its sign in the series: expected numbers that grow or "
             "decay, such as an r.m.s."
         )
-    (places,) = series.coordinates.values()
-    return _growth_rate(quantities[name], places.values)
-
-
-def _keeps_sign(quantity: Quantity) -> bool:
-    return bool((np.sign(quantity.value[0]) * quantity.value > 0).all())
-
-
-def _growth_rate(quantity: Quantity, times: FloatArray, *, samples: int = 1000) -> Quantity:
-    """Return the rate, by the scatter of the shots with a number of samples."""
+    (times,) = (places.values for places in series.coordinates.values())
     sign, count = np.sign(quantity.value[0]), len(times)
     weights = np.ones(count)
     if has_bands(quantity):
@@ -94,6 +88,10 @@ def _growth_rate(quantity: Quantity, times: FloatArray, *, samples: int = 1000) 
     error = np.sqrt((residual**2).sum() / (count - 2) / (from_middle**2).sum())
     normal = np.random.default_rng(0).standard_t(count - 2, samples)
     return Quantity(rate, rate + error * normal)
+
+
+def _keeps_sign(quantity: Quantity) -> bool:
+    return bool((np.sign(quantity.value[0]) * quantity.value > 0).all())
 
 
 def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None) -> ProductResult:
@@ -164,7 +162,7 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Pr
         coordinates={axis: Coordinate(places, unit, long_name)},
         stored={},
     )
-    return replace(result, facts=tuple(_facts(result, places, unit)))
+    return replace(result, facts=tuple(_facts(result, unit)))
 
 
 def _single_numbers(result: ProductResult) -> dict[str, Measurand]:
@@ -181,7 +179,7 @@ def _single_numbers(result: ProductResult) -> dict[str, Measurand]:
     return variables
 
 
-def _facts(series: ProductResult, times: FloatArray, unit: str) -> Iterator[Fact]:
+def _facts(series: ProductResult, unit: str) -> Iterator[Fact]:
     """Yield each number in the first and last shot, its growth, and the contents of the band."""
     for name, quantity in series.quantities.items():
         variable = series.variables[name]
@@ -194,7 +192,7 @@ def _facts(series: ProductResult, times: FloatArray, unit: str) -> Iterator[Fact
         is_length = name in series.product.lengths
         if is_length or not _keeps_sign(quantity) or np.ptp(quantity.value) == 0:
             continue
-        rate = _growth_rate(quantity, times)
+        rate = growth_rate(series, name)
         factor, symbol = _rate_unit(float(rate.value), unit)
         bands = [rate.band(share) for share in BANDS] if has_bands(rate) else []
         ends = [(factor * float(low), factor * float(high)) for low, high in bands]
