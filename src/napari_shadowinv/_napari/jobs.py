@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, ClassVar
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import KEY, Frame, Result, frame_of, result_of, role_of
 from napari_shadowinv._napari.layers import LayerData, fit_layers, result_layers
 from napari_shadowinv._napari.shots import shot_in_memory, shot_layer
-from napari_shadowinv._system.progress import OnProgress, Progress, Reporter, ShouldStop
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
@@ -187,18 +186,8 @@ class FitJob(ImageJob):
         assert self.recipe.fit is not None
         return self.recipe.fit
 
-    @cached_property
-    def history(self) -> list[tuple[str, float]]:
-        """Steps of the fit so far, with their objectives."""
-        return []
-
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
-        def note(progress: Progress) -> None:
-            if progress.objective is not None:
-                self.history.append((progress.message, progress.objective))
-            on_progress(progress)
-
-        fit = self.compute(note, should_stop)
+        fit = self.compute(on_progress, should_stop)
         shape, instrument = self.recipe.shape_after(self.shots[0].shape), self.recipe.instrument
         cost = fit_cost(shape, len(self.shots), self.choices, instrument)
         FitJob.pace = sum(fit.report.seconds.values()) / cost.seconds

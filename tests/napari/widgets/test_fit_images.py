@@ -32,7 +32,6 @@ from napari_shadowinv._napari.layer_metadata import (
     unit_of,
 )
 from napari_shadowinv._napari.layers import fit_layers
-from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Assessment, Verdict
@@ -49,7 +48,6 @@ from napari_shadowinv.shot import Shot, shots_of
 
 Array = np.ndarray[Any, Any]
 PATIENCE = 120_000  # ms
-REDRAW_MS = _panels._REDRAW_MS  # ms
 SHAPE = (48, 64)
 LENGTHS = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2, "pixel_size": 1.5e-6}
 ENERGIES = (14.7, 6.0)
@@ -70,7 +68,6 @@ def images(noise: float = 0.01) -> list[Array]:
 @pytest.fixture(autouse=True)
 def _curve_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw the curve once: repeated drawing would take as long as these fits."""
-    monkeypatch.setattr(_panels, "_REDRAW_MS", PATIENCE)
 
 
 @pytest.fixture
@@ -393,27 +390,24 @@ def test_each_stage_ends_soon_after_cancel(
 ) -> None:
     monkeypatch.setattr(FitJob, "patience", math.inf)  # the fit has to end by itself
     enlarged(window, times)
-    tool.view._redraw_timer.setInterval(REDRAW_MS)
     usual = {**QUICK, "samples": 1000, "max_iterations": 100}
     before = list(window.layers)
     for stage in stages:
         tool.options.restore(usual | BEFORE.get(stage, {}))
         tool.panel.button.click()
-        course = tool.panel.tag
-        qtbot.waitUntil(
-            lambda: any(reached == stage for reached, _ in course.history),  # noqa: B023
+        with qtbot.waitSignal(
+            tool.panel.progressed,
             timeout=PATIENCE,
-        )
-        assert course.history[-1][0] == stage
+            check_params_cb=lambda news: news.message == stage,  # noqa: B023
+        ):
+            pass
         if stage == "samples":
-            qtbot.waitUntil(tool.view.curve.isVisible, timeout=PATIENCE)
-            assert tool.panel.status.text().startswith("Fitting: stage 3 of 3")
+            qtbot.waitUntil(lambda: "stage 3 of 3" in tool.panel.status.text(), timeout=PATIENCE)
         traced_images.clear()
         cancel(tool, qtbot)
         assert len(traced_images) <= 8 * len(before)  # a line search of the step under way
         assert tool.panel.status.text() == "Cancelled."
-        assert not threads()
-        qtbot.wait(50)
+        qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
         assert list(window.layers) == before
         assert messages == []
         height, width = window.layers[0].data.shape
@@ -453,10 +447,14 @@ def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
 def test_closing_the_dock_ends_the_fit(
     window: Any, tool: Any, qtbot: Any, messages: list[str], traced_images: list[int]
 ) -> None:
-    tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.restore({"samples": 1000})
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.panel.tag.history), timeout=PATIENCE)
+    with qtbot.waitSignal(
+        tool.panel.progressed,
+        timeout=PATIENCE,
+        check_params_cb=lambda news: news.objective is not None,
+    ):
+        pass
     stop = tool.panel._box.stop
     window.window.remove_dock_widget(tool)
     tool.deleteLater()

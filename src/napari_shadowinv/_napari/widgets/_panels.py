@@ -1,15 +1,13 @@
 """The frame of a window: controls in a column, and the result below its button.
 
 - a column of controls, whose button runs a job: `ToolPanel`
-- verdict and report of a result, of a fit also its course: `ResultView`
+- verdict and report of a result: `ResultView`
 """
 
 from __future__ import annotations
 
 import html
-import math
 import re
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
@@ -41,9 +39,6 @@ _SETTLE_MS = 10  # merges simultaneous changes
 _WRITE_DELAY_MS = 300  # a moving slider is written once
 # Errors that a saved state causes which another version wrote in another form.
 _UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
-_REDRAW_MS = 500
-_CURVE_HEIGHT_PX = 210
-_MIN_REDRAW_RATIO = 10  # interval over the time of a drawing
 
 
 def fact_rows(facts: Iterable[Fact], *, details: bool = False) -> list[tuple[str, str]]:
@@ -237,7 +232,7 @@ class ToolPanel(qt.Docked):
 
 
 class ResultView(QtWidgets.QWidget):
-    """Verdict and report of a result; of a fit also its course.
+    """Verdict and report of a result.
 
     It follows the results of selected layers if their `content` is of one of these kinds; `said`
     returns warnings that stand elsewhere.
@@ -256,19 +251,16 @@ class ResultView(QtWidgets.QWidget):
         self._result: Result[Any] | None = None
         self._recipe: Recipe | None = None  # that was run for the result, if it is the form's
         self.changes = forms.WrappingLabel()
-        self.curve = qt.Plot(_CURVE_HEIGHT_PX, fixed=True)
         self.verdict = VerdictLine()
         self.save_result = qt.push_button("Save result…", save_tip, self.save)
         tip = "Add potential, components of the field, re-projection, sites and other layers."
         self.more_layers = qt.push_button("More layers", tip, self.add_layers)
         buttons = qt.side_by_side((self.save_result, 1), (self.more_layers, 1))
         self.report = ReportView()
-        qt.column(self, self.changes, self.verdict, self.curve, buttons, self.report)
-        self._redraw_timer = qt.timer(self, _REDRAW_MS, self._draw)
+        qt.column(self, self.changes, self.verdict, buttons, self.report)
         # Also for runs that are cancelled, or refused before they start.
         tool.panel.button.clicked.connect(self.empty)
         tool.panel.started.connect(self._on_start)
-        tool.panel.ended.connect(self._on_end)
         qt.while_alive(self, tool.viewer.layers.selection, "active", self.follow)
         self.empty()
 
@@ -276,8 +268,6 @@ class ResultView(QtWidgets.QWidget):
         """Clear the report of the last result; its layers stay."""
         self._result = self._recipe = None
         self.changes.show_text("")
-        self._drawn_steps = 0
-        self.curve.setVisible(False)
         self.verdict.show_text("")
         self.report.empty()
 
@@ -344,24 +334,3 @@ class ResultView(QtWidgets.QWidget):
         # The verdict of a preview stays until the next preview.
         if not self._tool.previewing:
             self.empty()
-        if isinstance(self._tool.panel.tag, FitJob):
-            self._redraw_timer.start()
-
-    def _draw(self) -> None:
-        start = time.perf_counter()
-        self._draw_steps(self._tool.panel.tag)
-        # A slow screen must not delay the fit and the window.
-        elapsed_ms = 1000 * (time.perf_counter() - start)
-        self._redraw_timer.setInterval(max(_REDRAW_MS, round(_MIN_REDRAW_RATIO * elapsed_ms)))
-
-    def _draw_steps(self, job: Any) -> None:
-        """Draw the objective of a fit, if there are new steps."""
-        history = list(job.history) if isinstance(job, FitJob) else []
-        steps = [step for step in history if math.isfinite(step[1])]  # samples have no objective
-        if sum(value > 0 for _, value in steps) > 1 and len(steps) != self._drawn_steps:
-            self._drawn_steps = len(steps)
-            self.curve.show_drawing(lambda axes: qt.draw_objective(axes[0], steps))
-
-    def _on_end(self, outcome: Any) -> None:
-        self._redraw_timer.stop()
-        self._draw_steps(outcome.tag)

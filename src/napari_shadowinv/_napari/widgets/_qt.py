@@ -7,11 +7,9 @@ import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
-from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 from qtpy.QtCore import QObject, QSettings, QSize, Qt, QTimer
 from qtpy.QtWidgets import (
     QDockWidget,
@@ -371,21 +369,3 @@ class Plot(QWidget):
         except (KeyError, AttributeError, ValueError):
             palette = self.palette()
             return palette.windowText().color().name(), palette.window().color().name()
-
-
-def draw_objective(axis: Any, history: Sequence[tuple[str, float]]) -> None:
-    """Draw the objective of a fit at each step, with a colour for each stage."""
-    colours: dict[str, str] = {}
-    begin = 0
-    for stage, group in groupby(history, key=lambda step: step[0]):
-        values = np.array([value for _, value in group])
-        numbers = begin + 1 + np.arange(len(values))
-        begin += len(values)
-        if not (values > 0).any():
-            continue
-        label = "" if stage in colours else stage
-        colour = colours.setdefault(stage, COLOURS[len(colours) % len(COLOURS)])
-        axis.plot(numbers, np.where(values > 0, values, np.nan), color=colour, label=label)
-    axis.set_yscale("log")
-    axis.set_ylabel("objective")
-    axis.set_xlabel("step")
