@@ -300,7 +300,7 @@ class Fact:
 
 def verdict_fact(verdict: Verdict) -> Fact:
     """Return a verdict, whose reason is in the headline."""
-    return Fact("verdict", "Verdict", str(verdict), verdict.level, short=str(verdict))
+    return Fact("verdict", "Verdict", str(verdict), verdict.level)
 
 
 def caution_facts(cautions: Iterable[Caution]) -> list[Fact]:

@@ -97,7 +97,9 @@ def test_a_stored_fit_keeps_its_cautions(images: Any, out: Path) -> None:
 @pytest.mark.parametrize(("code", "exits"), [("samples", True), ("hot-pixels", False)])
 def test_unreliable_error_bars_of_a_stored_fit_are_an_exit_code(code: str, exits: bool) -> None:
     report = {"verdict": "determined", "warnings": [{"code": code, "text": "…"}]}
-    store: Any = SimpleNamespace(statuses=lambda: np.array([DONE]), reports=lambda: [report])
+    store: Any = SimpleNamespace(
+        statuses=lambda: np.array([DONE]), reports=lambda: [report], field="B"
+    )
     with pytest.raises(typer.Exit) if exits else nullcontext() as ended:
         exit_unless_reliable(store)
     assert not exits or ended.value.exit_code == 3

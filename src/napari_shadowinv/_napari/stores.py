@@ -106,7 +106,8 @@ def shot_rows(path: Path, index: int) -> list[tuple[str, str]]:
     dataset = _open(path)
     report = json.loads(str(dataset["report"][index].values) or "{}")
     columns = columns_of_store(dataset.attrs)
-    texts = {column.title: column.text(report) for column in columns if column.show}
+    texts = {"result": report.get("headline", "")}
+    texts |= {column.title: column.text(report) for column in columns if column.show}
     rows = [(title.capitalize(), text) for title, text in texts.items() if text]
     return [("Shot", f"{index} ({_shot_names(dataset)[index]})"), *rows]
 

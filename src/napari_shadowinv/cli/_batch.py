@@ -37,7 +37,7 @@ from napari_shadowinv.cli._terminal import (
     work_callbacks,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import Verdict, percent
+from napari_shadowinv.facts import Level, Verdict, percent
 from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
@@ -57,8 +57,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.stack import RunStatus
 
 _MAX_LISTED = 10  # shots, or reasons, that a row lists
-_LINE_COLUMNS = 100
-_MIN_NAME_COLUMNS = 12
 
 
 def _rate_text(status: RunStatus) -> str:
@@ -88,7 +86,7 @@ class _Printer:
         elif not self.watched:
             return
         elif status.outcome is not None:
-            self._print_shot(status, status.outcome.seconds)
+            self._print_shot(status)
         elif self.quiet:
             return
         elif status.note or status.stage:
@@ -109,23 +107,20 @@ class _Printer:
         message = "; ".join(filter(None, [", ".join(texts), status.name]))
         return Progress(status.scheduler, status.done + status.failed, status.total, message)
 
-    def _print_shot(self, status: RunStatus, seconds: float) -> None:
-        result = status.result
-        assert result is not None
+    def _print_shot(self, status: RunStatus) -> None:
+        assert status.outcome is not None
+        report, level = status.outcome.report, Level(status.outcome.report["level"])
+        cautions = list(map(Caution.from_json, report["warnings"]))
         name = f"{status.name} (again, as the file has changed)" if status.again else status.name
-        texts = [*(fact.short for fact in result.facts if fact.short), f"{seconds:.2f} s"]
+        texts = [report["headline"], f"{status.outcome.seconds:.2f} s"]
         texts += [f"{status.waiting} waiting"] if status.waiting else []
         texts += [f"{status.skipped} skipped"] if status.skipped else []
         # A verdict that is no success implies its warnings.
-        if result.verdict.level.is_success and (count := len(result.cautions)):
-            texts.append(f"{count} warning{'s' if count > 1 else ''}")
-        summary = "".join(f"  {text}" for text in texts)
-        columns = max(_LINE_COLUMNS - len(summary), _MIN_NAME_COLUMNS)
-        if len(name) > columns:  # its end identifies the file
-            name = f"…{name[1 - columns :]}"
+        if level.is_success and cautions:
+            texts.append(f"{len(cautions)} warning{'s' if len(cautions) > 1 else ''}")
         if not self.quiet:
-            say(f"{name}{summary}", "" if result.headline.level.is_success else "yellow")
-        for warning in result.cautions:
+            say("  ".join([name, *texts]), "" if level.is_success else "yellow")
+        for warning in cautions:
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
                 say_on_stderr(f"warning: {status.name}: {warning.text}", "yellow")
@@ -208,7 +203,7 @@ def exit_unless_reliable(store: StackStore) -> None:
         if status != DONE:
             continue
         codes = {caution["code"] for caution in report.get("warnings", ())}
-        is_inversion = "level" in report
+        is_inversion = store.field is None
         converged = not is_inversion or report["converged"]
         if flaw_of(converged, None if is_inversion else report["verdict"], codes):
             raise typer.Exit(EXIT_NOT_CONVERGED)

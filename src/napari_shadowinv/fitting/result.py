@@ -553,7 +553,7 @@ def _solution_facts(fit: Fit) -> Iterator[Fact]:
         yield Fact("converged", "Converged", f"in {steps}")
     else:
         text = f"NO, not in {steps}: allow more"
-        yield Fact("converged", "Converged", text, Level.FAILED, short="NOT converged")
+        yield Fact("converged", "Converged", text, Level.FAILED)
 
 
 def _setups(dataset: xarray.Dataset) -> tuple[Setup, ...]:

@@ -335,7 +335,6 @@ class Inversion(Summarised):
                 f"{to_figures(report.tolerance)}: "
                 f"{'converged' if report.converged else 'NOT converged'}",
                 convergence,
-                short="" if report.converged else "NOT converged",
             ),
             *(Fact(key, key.capitalize(), text, is_detail=True) for key, text in details.items()),
             time_fact(report.seconds),

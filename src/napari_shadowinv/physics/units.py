@@ -244,11 +244,11 @@ def peak_facts(
     row, column = pixels.peak
     text = f"{pixels.peak_text(error)}, at y = {row}, x = {column} px"
     if setup is None:
-        return [Fact("displacement", "Displacement", text, short=pixels.short_peak_text(error))]
+        return [Fact("displacement", "Displacement", text)]
     (field,) = shown_fields([displacement], setup, deflector, mask=mask)
     of_field = field_error or error
     return [
-        Fact("field", "Field", field.peak_text(of_field), short=field.short_peak_text(of_field)),
+        Fact("field", "Field", field.peak_text(of_field)),
         Fact("displacement", "Displacement", text, is_detail=True),
     ]
 

@@ -27,8 +27,6 @@ from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model, check_instance
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError, RunInterruptedError
-from napari_shadowinv.fitting import Fit
-from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
 from napari_shadowinv.io.store import (
@@ -84,7 +82,6 @@ class RunStatus:
     stage: str = ""  # of the preparation, before all shots
     name: str = ""  # of the shot that has just ended, if any
     outcome: ShotOutcome | None = None  # of this shot
-    result: Inversion | Fit | None = None  # of it in a watched folder; do not keep a reference
     again: bool = False  # whether it was inverted before, and its file has changed since
     failures: tuple[tuple[str, str], ...] = ()  # names of the failed shots, with the reasons
     note: str = ""  # a sentence for the user
@@ -203,7 +200,7 @@ def run_stack(
                 new = {name: each[len(filled.names) :] for name, each in _of_shots(stack).items()}
                 filled.append(new, source_image=stack.source_text(None))
 
-            def report(outcome: ShotOutcome | None = None, _: Any = None) -> None:
+            def report(outcome: ShotOutcome | None = None) -> None:
                 name = "" if outcome is None else stack.shots.items[outcome.index].name
                 status = replace(filled.status, scheduler=chosen.name, name=name, outcome=outcome)
                 on_progress(status)
@@ -259,8 +256,7 @@ class StoreRun:
         for index, (status, report) in enumerate(
             zip(store.statuses(), store.reports(), strict=True)
         ):
-            new, doubts = PENDING if status in again else status, len(report.get("warnings", ()))
-            self._note(index, new, report.get("reason", "unknown"), doubts)
+            self._note(index, PENDING if status in again else status, report)
 
     @property
     def writer(self) -> ShotWriter:
@@ -281,14 +277,14 @@ class StoreRun:
             failures=tuple((self.names[index], why) for index, why in self._failures.items()),
         )
 
-    def _note(self, index: int, status: int, reason: str = "", doubts: int = 0) -> None:
-        """Note the status of a shot in place of its earlier one."""
+    def _note(self, index: int, status: int, report: Mapping[str, Any]) -> None:
+        """Note the status of a shot, with its report, in place of its earlier one."""
         self.statuses[index] = status
         self._failures.pop(index, None)
         self._doubtful.discard(index)
         if status == FAILED:
-            self._failures[index] = reason
-        elif status == DONE and doubts:
+            self._failures[index] = report.get("reason", "unknown")
+        elif status == DONE and report.get("warnings"):
             self._doubtful.add(index)
 
     def report(self, index: int) -> dict[str, Any]:
@@ -319,30 +315,27 @@ class StoreRun:
         """Mark a shot as pending, and forget its report and fields."""
         if self.statuses[index] != PENDING:
             self.writer.reopen(index)
-            self._note(index, PENDING)
+            self._note(index, PENDING, {})
 
     def run(
         self,
         shots: Mapping[int, Exposure],
         task: AnyTask,
         scheduler: Scheduler,
-        on_end: Callable[[ShotOutcome, Any], None],
+        on_end: Callable[[ShotOutcome], None],
         should_stop: ShouldStop | None = None,
-        *,
-        keeps_results: bool = False,
     ) -> None:
-        """Run shots by their numbers; `on_end` takes each outcome, and its result if asked for."""
-        results: dict[int, Any] | None = {} if keeps_results else None
+        """Run shots by their numbers; `on_end` takes each outcome."""
         workers = scheduler.workers and max(1, min(len(shots), scheduler.workers))
         began = time.monotonic() - self._seconds
 
         def end(outcome: ShotOutcome) -> None:
             self._ended += 1
             self._seconds = time.monotonic() - began
-            self._note(outcome.index, outcome.status, outcome.reason, outcome.cautions)
-            on_end(outcome, None if results is None else results.pop(outcome.index))
+            self._note(outcome.index, outcome.status, outcome.report)
+            on_end(outcome)
 
-        context = TaskContext(self.writer, task, workers, results)
+        context = TaskContext(self.writer, task, workers)
         scheduler.run(shots, context, end, should_stop or (lambda: False))
 
 

@@ -12,7 +12,6 @@ from typing import Any
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import check_output, replacing
-from napari_shadowinv.physics.units import shown_fields
 from napari_shadowinv.stack._arrivals import Arrivals
 from napari_shadowinv.stack._run import WATCHING, OnStatus, RunStatus
 
@@ -77,9 +76,9 @@ def _numbers(status: RunStatus) -> dict[str, Any]:
 
 
 def _newest(status: RunStatus, folder: Path) -> dict[str, Any]:
-    outcome, result = status.outcome, status.result
+    outcome = status.outcome
     assert outcome is not None
-    written = None
+    report, written = outcome.report, None
     with suppress(OSError):  # it may have been put away
         stamp = datetime.fromtimestamp((folder / status.name).stat().st_mtime, UTC)
         written = stamp.isoformat(timespec="milliseconds")
@@ -90,17 +89,6 @@ def _newest(status: RunStatus, folder: Path) -> dict[str, Any]:
         "status": "failed" if outcome.reason else "done",
         "reason": outcome.reason,
         "seconds": round(outcome.seconds, 3),
-        **({} if result is None else _result_entries(result)),
-    }
-
-
-def _result_entries(result: Any) -> dict[str, Any]:
-    """Return the peak of a result, its headline and its warnings."""
-    displacement = (result.fields[0] if hasattr(result, "fields") else result).displacement
-    (field,) = shown_fields([displacement], result.setup)
-    return {
-        "peak": {"symbol": field.symbol, "value": field.largest, "unit": field.unit},
-        "headline": str(result.headline),
-        "level": result.headline.level.value,
-        "warnings": {caution.code: caution.text for caution in result.cautions},
+        **{key: report[key] for key in ("peak", "headline", "level") if key in report},
+        "warnings": {each["code"]: each["text"] for each in report.get("warnings", ())},
     }

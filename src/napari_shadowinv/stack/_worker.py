@@ -32,6 +32,7 @@ from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, column_val
 from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.options import FitChoices, InversionOptions
 from napari_shadowinv.physics.setup import Setup
+from napari_shadowinv.physics.units import ShownField
 from napari_shadowinv.pipeline.fit_run import run_fit, usual_fields
 from napari_shadowinv.pipeline.inversion_run import Cache, Inputs, collect_inputs, run_prepared
 from napari_shadowinv.preprocessing import Recipe, UniformEstimate
@@ -217,13 +218,11 @@ class InvertTask(Task):
 
     def report(self, result: Inversion) -> dict[str, Any]:
         """Return the report of a shot, with its own provenance if it is a row of a table."""
-        headline = result.headline
         entries = {
             **dataclasses.asdict(result.report),
             "errors": None if result.errors is None else result.errors.to_dict(),
             "stages": result.report.seconds,
-            "level": headline.level.value,
-            "headline": str(headline),
+            **_headline_of(result, result.main_field),
             **column_values(ROWS if self.by_row else INVERSIONS, result),
         }
         if self.by_row:
@@ -297,6 +296,7 @@ class FitTask(Task):
 
     def report(self, result: Fit) -> dict[str, Any]:
         entries = {
+            **_headline_of(result, result.shown(result.fields[0])),
             **column_values(FITS, result),
             "explanation": result.explanation,
             "chi2_images": result.chi2.tolist(),
@@ -315,6 +315,16 @@ class FitTask(Task):
 
 
 AnyTask = InvertTask | FitTask
+
+
+def _headline_of(result: Inversion | Fit, field: ShownField) -> dict[str, Any]:
+    """Return the headline of a result, and the peak of its field, for the report of a shot."""
+    headline = result.headline
+    return {
+        "headline": str(headline),
+        "level": headline.level.value,
+        "peak": {"symbol": field.symbol, "value": field.largest, "unit": field.unit},
+    }
 
 
 def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:
@@ -350,9 +360,12 @@ class ShotOutcome:
     index: int
     status: int  # DONE or FAILED of `napari_shadowinv.io.store`
     seconds: float  # that its worker spent on it, reading and writing included
-    reason: str = ""  # of a failure
-    converged: bool = True  # whether the solver reached its tolerance, or the fit its end
-    cautions: int = 0  # number of them about its result
+    report: dict[str, Any]  # as in the store: of a failure its reason, else headline and numbers
+
+    @property
+    def reason(self) -> str:
+        """Why it failed; empty for another."""
+        return str(self.report.get("reason", ""))
 
 
 @dataclass(frozen=True)
@@ -362,7 +375,6 @@ class TaskContext:
     writer: ShotWriter
     task: AnyTask
     workers: int | None
-    results: dict[int, Any] | None = None  # takes them, by the shots' numbers, in this process
 
 
 def run_shot(
@@ -382,7 +394,6 @@ def run_shot(
     result: Any = None
     origin: dict[str, Any] = {}
     entries: dict[str, Any] = {}
-    failure = ""
     try:
         origin = shot.stamp()
         images, loaded = shot.load()
@@ -396,25 +407,18 @@ def run_shot(
         raise
     except Exception as error:
         # No error of a reader or a solver may stop the other shots.
-        failure = failure_text(error)
-        entries = {"reason": failure}
+        entries = {"reason": failure_text(error)}
     cautions = () if result is None else result.cautions
     warnings = list(map(dataclasses.asdict, (*cautions, *origin.pop("cautions", ()))))
     seconds = time.perf_counter() - began
     report = {**entries, "seconds": seconds, **origin, "warnings": warnings}
-    if context.results is not None:
-        context.results[index] = result
-    if result is None:
-        context.writer.write(index, {}, report, FAILED)
-        return ShotOutcome(index, FAILED, seconds, failure)
-    context.writer.write(index, task.arrays(result), report)
-    spent = time.perf_counter() - began
-    return ShotOutcome(
-        index, DONE, spent, converged=result.report.converged, cautions=len(warnings)
-    )
+    status = FAILED if result is None else DONE
+    context.writer.write(index, {} if result is None else task.arrays(result), report, status)
+    return ShotOutcome(index, status, time.perf_counter() - began, report)
 
 
 def write_failure(writer: ShotWriter, index: int, reason: str) -> ShotOutcome:
     """Write a shot that could not be begun."""
-    writer.write(index, {}, {"reason": reason}, FAILED)
-    return ShotOutcome(index, FAILED, 0.0, reason)
+    report = {"reason": reason}
+    writer.write(index, {}, report, FAILED)
+    return ShotOutcome(index, FAILED, 0.0, report)

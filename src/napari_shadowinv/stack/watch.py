@@ -256,15 +256,15 @@ class Watch:
                 filled.reopen(filled.numbers[name])
         self._running = {filled.numbers[text_of(file)]: file for file in files}
 
-        def end(outcome: ShotOutcome, result: Any) -> None:
+        def end(outcome: ShotOutcome) -> None:
             del self._running[outcome.index]
             self._last_end = time.monotonic()
             name = filled.names[outcome.index]
-            self.report(name=name, outcome=outcome, result=result, again=name in again)
+            self.report(name=name, outcome=outcome, again=name in again)
 
         numbered = {filled.numbers[name]: shot for name, shot in shots.items()}
         task = self._stack.task
-        filled.run(numbered, task, scheduler, end, self._should_stop, keeps_results=True)
+        filled.run(numbered, task, scheduler, end, self._should_stop)
 
 
 def watch_stack(
