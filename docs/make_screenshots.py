@@ -25,7 +25,7 @@ import numpy as np
 from make_film_pictures import pack_of_page
 from napari._qt.dialogs.preferences_dialog import PreferencesDialog
 from napari._qt.dialogs.qt_notification import NapariQtNotification
-from PIL import Image
+from PIL import Image, ImageDraw
 from qtpy.QtCore import QPoint, QSettings
 from qtpy.QtGui import QImage
 from qtpy.QtWidgets import QApplication
@@ -46,6 +46,8 @@ ABOVE, BELOW = 190, 50  # px of the canvas that colour bar and scale bar take
 MENU_X, MENU_Y = 90, 24  # px, of the menu *Layers* in the menu bar
 MENU_PICTURE = (900, 400)  # px, upper left part of the window
 NIGHT_ARROWS = 7.0  # their length, as the tutorial tells to type
+TOUR_SIZE, TOUR_COLOURS = (1120, 700), 128
+POINTER = ((0, 0), (0, 22), (5, 17), (9, 26), (13, 24), (9, 15), (16, 15))  # px
 # What the tutorial tells to type.
 PROTON_FIELDS = {
     "energy": 14.7,
@@ -188,6 +190,74 @@ def first_windows() -> None:
         profile.check(layer, False)
     profile.check(viewer.layers["✓ |∫B×dz| (mT·m) – toroid"])
     photograph(viewer, "tutorial-first-profile.png")
+
+
+class MovingPicture:
+    """Pictures of a window, each with the time that it is shown and where the pointer is."""
+
+    def __init__(self, viewer: napari.Viewer) -> None:
+        self.viewer, self.pictures, self.times = viewer, [], []
+
+    def add(self, seconds: float, at: Any = None) -> None:
+        """Take a picture of the window, with the pointer on the middle of a widget."""
+        settle(0.3)
+        for notification in self.viewer.window._qt_window.findChildren(NapariQtNotification):
+            notification.close()
+        pixels = self.viewer.window.screenshot(canvas_only=False, flash=False)
+        picture = Image.fromarray(pixels[..., :3])
+        if at is not None:
+            window = self.viewer.window._qt_window
+            place = at if isinstance(at, QPoint) else at.mapTo(window, at.rect().center())
+            corners = [(place.x() + x, place.y() + y) for x, y in POINTER]
+            ImageDraw.Draw(picture).polygon(corners, fill="white", outline="black", width=2)
+        self.pictures.append(picture.resize(TOUR_SIZE, Image.Resampling.LANCZOS))
+        self.times.append(round(1000 * seconds))
+
+    def save(self, path: Path) -> None:
+        """Save the pictures as a GIF that begins again at its end."""
+        first, *others = (
+            picture.quantize(TOUR_COLOURS, dither=Image.Dither.NONE) for picture in self.pictures
+        )
+        first.save(path, save_all=True, append_images=others, duration=self.times, loop=0)
+        size = path.stat().st_size / 1e6
+        print(f"wrote {path}, {sum(self.times) / 1000:.1f} s, {size:.2f} MB")
+
+
+def tour() -> None:
+    """The README's twelve seconds: open a pair with its setup, Run, a line across the field."""
+    text = (HERE.parent / "tutorials" / "proton-radiograph.md").read_text(encoding="utf-8")
+    (making,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
+        exec(compile(making, "proton-radiograph.md", "exec"), {})
+        viewer = new_window("napari")
+        film = MovingPicture(viewer)
+        viewer.open(["reference.tif", "shot.tif"])
+        film.add(1.4)
+        tool = open_widget(viewer, "Invert")
+        film.add(1.2, tool.image)
+        tool.setup.set_kind("proton")
+        film.add(1.0, tool.setup)
+        tool.setup.form.restore(PROTON_FIELDS)
+        tool.setup.changed.emit()
+        film.add(1.2, tool.setup.form)
+        tool.area.ensureWidgetVisible(tool.panel)
+        film.add(0.9, tool.panel.button)
+        press_run(tool)
+        fit(viewer)
+        film.add(2.6)
+        analyse = open_widget(viewer, "Analyse")
+        analyse.tabs.setCurrentWidget(analyse.products)
+        analyse.products.product.set_kind("profile")
+        analyse.products._draw()
+        analyse.products.shapes.layer.add([[99.5, 20.0], [99.5, 180.0]], shape_type="line")
+        analyse.products.shapes.layer.mode = "pan_zoom"
+        film.add(1.2, analyse.products.panel.button)
+        analyse.products.panel.button.click()
+        while analyse.products.panel.running:
+            settle(0.2)
+        film.add(3.2)
+        film.save(HERE / "tour.gif")
+        viewer.close()
 
 
 def proton_windows() -> None:
@@ -429,6 +499,7 @@ def main() -> None:
 
 WINDOWS = {
     "toroid": toroid_window,
+    "tour": tour,
     "first": first_windows,
     "proton": proton_windows,
     "source": source_windows,
