@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from napari.components import ViewerModel
 
 from helpers.reports import texts_of
 from napari_shadowinv._napari.form import StepsSection
@@ -23,7 +20,7 @@ from napari_shadowinv.preprocessing import Bin
 PATIENCE = 60_000  # ms
 
 
-def test_an_error_calls_the_fields_of_a_setup_by_their_labels() -> None:
+def test_an_error_calls_the_fields_of_a_setup_by_their_labels():
     with pytest.raises(InputError) as caught:
         setup_from_dict({"kind": "proton", "object_image_distance": 0}, "the setup")
     assert "'object_image_distance' is 0" in str(caught.value)
@@ -34,9 +31,7 @@ def test_an_error_calls_the_fields_of_a_setup_by_their_labels() -> None:
     assert (type(sent), str(sent)) == (InputError, str(caught.value))
 
 
-def test_a_doubt_of_a_setup_stands_in_the_form_only(
-    viewer: ViewerModel, opened: Any, qtbot: Any, messages: list[str]
-) -> None:
+def test_a_doubt_of_a_setup_stands_in_the_form_only(viewer, opened, qtbot, messages):
     image = synthetic_image(ellipse_pair((40, 52)).displacement)
     viewer.add_image(image, name="shot")
     tool = opened(Invert)
@@ -50,7 +45,7 @@ def test_a_doubt_of_a_setup_stands_in_the_form_only(
     assert doubt not in texts_of(tool.report).values()
 
 
-def test_steps_of_an_earlier_image_are_announced(qtbot: Any) -> None:
+def test_steps_of_an_earlier_image_are_announced(qtbot):
     steps = StepsSection()
     qtbot.addWidget(steps)
     steps.restore([{"step": "bin", "factor": 2}])
@@ -61,16 +56,14 @@ def test_steps_of_an_earlier_image_are_announced(qtbot: Any) -> None:
     assert steps._earlier.text() == ""
 
 
-def estimated(tool: Any, method: str, qtbot: Any) -> str:
+def estimated(tool, method, qtbot):
     tool.source.set_kind(method)
     tool.show_source.click()
     qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
     return str(tool.panel.status.text())
 
 
-def test_an_estimate_that_contains_the_object_says_so(
-    viewer: ViewerModel, opened: Any, qtbot: Any
-) -> None:
+def test_an_estimate_that_contains_the_object_says_so(viewer, opened, qtbot):
     image = synthetic_image(1.5 * ellipse_pair((96, 120)).displacement)
     viewer.add_image(image * np.random.default_rng(5).normal(1, 0.01, image.shape), name="shot")
     tool = opened(Invert)
@@ -83,8 +76,8 @@ def test_an_estimate_that_contains_the_object_says_so(
 
 
 def test_a_file_that_fails_is_not_shown_in_place_of_the_last_shot(
-    window: Any, open_widget: Any, qtbot: Any, tmp_path: Path
-) -> None:
+    window, open_widget, qtbot, tmp_path
+):
     tool = open_widget("Invert")
     tool.options.restore({"n_sites": 100})
     tool.image.set_kind("folder")

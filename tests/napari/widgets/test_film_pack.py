@@ -5,14 +5,11 @@ from __future__ import annotations
 import csv
 import shutil
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from napari.components import ViewerModel
 from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QFileDialog
 
@@ -29,21 +26,20 @@ from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.film import read_corners
 from napari_shadowinv.film_doses import FilmDoses
-from simulated_pack import Truth
 
 PATIENCE = 60_000  # ms
 
 
 @pytest.fixture
-def tool(viewer: ViewerModel, qtbot: Any) -> Any:
+def tool(viewer, qtbot):
     widget = FilmPack(viewer)
     qtbot.addWidget(widget)
     return widget
 
 
 @pytest.fixture
-def wait(qtbot: Any) -> Callable[[Any], None]:
-    def until_at_rest(tool: Any) -> None:
+def wait(qtbot):
+    def until_at_rest(tool):
         qtbot.waitUntil(
             lambda: not (tool.panel.running or tool.results.busy or tool.fit_images.busy),
             timeout=PATIENCE,
@@ -54,19 +50,17 @@ def wait(qtbot: Any) -> Callable[[Any], None]:
 
 
 @pytest.fixture
-def evaluated(viewer: ViewerModel, tool: Any, pack_doses: Any, tmp_path: Path) -> Any:
+def evaluated(viewer, tool, pack_doses, tmp_path):
     """The widget with a result that was opened from a file."""
     viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
     return tool
 
 
-def scratch_of(tool: Any) -> list[Path]:
+def scratch_of(tool):
     return list(tool._scratch.rglob("*"))
 
 
-def test_a_run_shows_the_fluences_of_the_films(
-    window: Any, open_widget: Any, film_pack: Truth, pack_doses: Any, wait: Callable[[Any], None]
-) -> None:
+def test_a_run_shows_the_fluences_of_the_films(window, open_widget, film_pack, pack_doses, wait):
     tool = open_widget("Film pack")
     tool.file.restore({"file": str(film_pack.pack)})
     tool.panel.button.click()
@@ -97,13 +91,13 @@ def test_a_run_shows_the_fluences_of_the_films(
     assert len(window.layers) == 3
 
 
-def test_the_spectrum_follows_the_region(evaluated: Any, pack_doses: Any, qtbot: Any) -> None:
+def test_the_spectrum_follows_the_region(evaluated, pack_doses, qtbot):
     tool = evaluated
     tool._draw_region()
     scale = tool.packs.layer.scale[1:]
     assert tool.regions.layer.name == "region – trio"
 
-    def mean(rows: slice, columns: slice) -> list[float]:
+    def mean(rows, columns):
         used = pack_doses.usable[:, rows, columns]
         fluence = pack_doses.fluence[:, rows, columns]
         return [film[mask].astype(float).mean() for film, mask in zip(fluence, used, strict=True)]
@@ -122,9 +116,7 @@ def test_the_spectrum_follows_the_region(evaluated: Any, pack_doses: Any, qtbot:
     )
 
 
-def test_corners_are_shown_dragged_and_used(
-    viewer: ViewerModel, evaluated: Any, pack_doses: Any, wait: Callable[[Any], None], qtbot: Any
-) -> None:
+def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, wait, qtbot):
     tool, names = evaluated, {layer.name for layer in viewer.layers}
     layer_of(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
     viewer.dims.set_current_step(0, 1)
@@ -160,7 +152,7 @@ def test_corners_are_shown_dragged_and_used(
     assert {layer.name for layer in viewer.layers} == names  # those of the file, updated
 
 
-def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluated: Any) -> None:
+def test_a_polygon_that_is_no_film_is_one_sentence(viewer, evaluated):
     tool = evaluated
     tool.show_corners.click()
     polygon = tool.corners.polygon
@@ -178,23 +170,14 @@ def test_a_polygon_that_is_no_film_is_one_sentence(viewer: ViewerModel, evaluate
     assert not tool.panel.running
 
 
-def test_an_opened_result_does_not_keep_the_file_of_another_one(
-    viewer: ViewerModel, tool: Any, pack_doses: Any, tmp_path: Path
-) -> None:
+def test_an_opened_result_does_not_keep_the_file_of_another_one(viewer, tool, pack_doses, tmp_path):
     tool.file.restore({"file": str(tmp_path / "another.toml")})
     viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
     assert tool.file.state() == {}
     assert tool.request().pack == pack_doses.pack
 
 
-def test_painted_pixels_are_not_used(
-    viewer: ViewerModel,
-    evaluated: Any,
-    pack_doses: Any,
-    wait: Callable[[Any], None],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, wait, tmp_path, monkeypatch):
     tool = evaluated
     tool.show_corners.click()
     tool.paint.click()
@@ -231,16 +214,10 @@ def test_painted_pixels_are_not_used(
     assert tool._selected()[1].usable[spot].all()
 
 
-def test_cancelling_leaves_nothing(
-    viewer: ViewerModel,
-    evaluated: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    wait: Callable[[Any], None],
-    qtbot: Any,
-) -> None:
+def test_cancelling_leaves_nothing(viewer, evaluated, monkeypatch, wait, qtbot):
     written: list[list[Path]] = []
 
-    def work_slowly(pack: Any, *, on_progress: Any, should_stop: Any) -> Any:
+    def work_slowly(pack, *, on_progress, should_stop):
         written.append(scratch_of(tool))
         for _ in range(PATIENCE // 10):
             if should_stop():
@@ -261,9 +238,7 @@ def test_cancelling_leaves_nothing(
     assert list(viewer.layers) == before
 
 
-def test_mistakes_are_one_sentence_in_the_widget(
-    viewer: ViewerModel, tool: Any, film_pack: Truth, tmp_path: Path, wait: Callable[[Any], None]
-) -> None:
+def test_mistakes_are_one_sentence_in_the_widget(viewer, tool, film_pack, tmp_path, wait):
     lost = tmp_path / "lost.toml"
     lost.write_text(film_pack.pack.read_text())
     for name in ("HDV2.csv", "unexposed.tif"):
@@ -281,9 +256,7 @@ def test_mistakes_are_one_sentence_in_the_widget(
     assert not viewer.layers
 
 
-def test_films_become_images_that_can_be_fitted(
-    viewer: ViewerModel, evaluated: Any, qtbot: Any, pack_doses: Any, wait: Callable[[Any], None]
-) -> None:
+def test_films_become_images_that_can_be_fitted(viewer, evaluated, qtbot, pack_doses, wait):
     evaluated.to_fit.click()
     wait(evaluated)
     images = [layer for layer in viewer.layers if role_of(layer) == "shot"]
@@ -305,9 +278,7 @@ def test_films_become_images_that_can_be_fitted(
     assert request.recipe.setup == setup_of(images[1])
 
 
-def test_layers_are_written_with_a_table(
-    evaluated: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, messages: list[str]
-) -> None:
+def test_layers_are_written_with_a_table(evaluated, tmp_path, monkeypatch, messages):
     folder = tmp_path / "layers"
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_, **__: str(folder))
     evaluated.write.click()
@@ -321,9 +292,7 @@ def test_layers_are_written_with_a_table(
     assert "exists" in evaluated.panel.status.text()
 
 
-def test_without_a_setup_films_know_how_strongly_they_are_displaced(
-    viewer: ViewerModel, pack_doses: Any, qtbot: Any
-) -> None:
+def test_without_a_setup_films_know_how_strongly_they_are_displaced(viewer, pack_doses, qtbot):
     bare = replace(pack_doses, setups=())
     add_layers(viewer, film_layers(bare, Frame(), "trio"))
     fit = FitImages(viewer)

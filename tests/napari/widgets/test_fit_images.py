@@ -7,7 +7,6 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -43,7 +42,7 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.pipeline import read_recipe
-from napari_shadowinv.pipeline.fit_run import FitInputs, collect_fit_inputs
+from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.shot import Shot, shots_of
 
 Array = np.ndarray[Any, Any]
@@ -58,7 +57,7 @@ QUICK = {"samples": 0, "max_iterations": 5, "spacing": 0.25, "smoothness": 5.0}
 MIDDLE = np.s_[2:42, 11:59]  # of an image, with the whole object
 
 
-def images(noise: float = 0.01) -> list[Array]:
+def images(noise=0.01):
     """One magnetic object at two energies."""
     rng = np.random.default_rng(5)
     planes = [predict_image(TRUTH, SETUPS[0], setup) for setup in SETUPS]
@@ -66,12 +65,12 @@ def images(noise: float = 0.01) -> list[Array]:
 
 
 @pytest.fixture(autouse=True)
-def _curve_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+def _curve_at_the_end(monkeypatch):
     """Draw the curve once: repeated drawing would take as long as these fits."""
 
 
 @pytest.fixture
-def tool(window: Any, open_widget: Callable[[str], Any]) -> Any:
+def tool(window, open_widget):
     for energy, setup, image in zip(ENERGIES, SETUPS, images(), strict=True):
         window.add_image(image, name=f"{energy} MeV", metadata=metadata_for("shot", "", setup))
     widget = open_widget("Fit several images")
@@ -80,17 +79,17 @@ def tool(window: Any, open_widget: Callable[[str], Any]) -> Any:
 
 
 @pytest.fixture(scope="session")
-def fitted() -> Fit:
+def fitted():
     """The fit of the widget to its two images, without the window."""
     options = FitOptions(samples=2, max_iterations=5, spacing=0.25)
     return fit(shots_of(np.stack(images()), setup=SETUPS, psf=[0, 0]), options=options)
 
 
 @pytest.fixture
-def show(qtbot: Any) -> Callable[[Any, Fit], None]:
+def show(qtbot):
     """Show a fit as if the widget had made it."""
 
-    def shown(tool: Any, found: Fit) -> None:
+    def shown(tool, found):
         job = tool.request()
         result = Result(found, job.origins)
         layer_data = fit_layers(result, job.frame, job.name)
@@ -101,10 +100,10 @@ def show(qtbot: Any) -> Callable[[Any, Fit], None]:
 
 
 @pytest.fixture
-def run(qtbot: Any) -> Callable[[Any], Any]:
+def run(qtbot):
     """Press Run, wait until the layers are there, and return the result."""
 
-    def pressed(widget: Any) -> Any:
+    def pressed(widget):
         answers: list[Any] = []
         widget.panel.ended.connect(answers.append)
         widget.panel.button.click()
@@ -117,22 +116,22 @@ def run(qtbot: Any) -> Callable[[Any], Any]:
     return pressed
 
 
-def inputs_of(tool: Any) -> FitInputs:
+def inputs_of(tool):
     """Return the inputs of the requested fit."""
     job = tool.request()
     return collect_fit_inputs(job.recipe, job.shots)
 
 
-def texts(tool: Any, column: int) -> list[str]:
+def texts(tool, column):
     table = tool.images
     return [table.item(row, column).text() for row in range(table.rowCount())]
 
 
-def type_in(tool: Any, row: int, column: int, text: str) -> None:
+def type_in(tool, row, column, text):
     tool.images.item(row, column).setText(text)
 
 
-def test_the_table_is_filled_from_the_layers(window: Any, tool: Any, assert_it_fits: Any) -> None:
+def test_the_table_is_filled_from_the_layers(window, tool, assert_it_fits):
     window.add_image(np.ones((20, 30)), name="another size")
     window.add_image(np.ones((*SHAPE, 3)), name="colour", rgb=True)
     window.add_image(np.ones(SHAPE), name="beam", metadata=metadata_for("source", ""))
@@ -147,7 +146,7 @@ def test_the_table_is_filled_from_the_layers(window: Any, tool: Any, assert_it_f
     assert_it_fits(tool)
 
 
-def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> None:
+def test_what_is_asked_for_is_what_the_controls_show(window, tool):
     type_in(tool, 1, BEAM, "7 MeV")
     type_in(tool, 1, GAIN, "1.2")
     type_in(tool, 1, PSF, "0.8 px")
@@ -172,7 +171,7 @@ def test_what_is_asked_for_is_what_the_controls_show(window: Any, tool: Any) -> 
     assert texts(tool, BEAM)[0] == "15"
 
 
-def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qtbot: Any) -> None:
+def test_the_field_is_recovered_in_si_units(window, tool, run, qtbot):
     tool.options.restore({"samples": 2, "max_iterations": 5, "spacing": 0.25})
     tool.instrument.restore({"beam_rms": 0.0})
     result = run(tool)
@@ -204,9 +203,7 @@ def test_the_field_is_recovered_in_si_units(window: Any, tool: Any, run: Any, qt
     assert report["Setup"].startswith("particles")
 
 
-def test_the_images_of_an_opened_fit_can_be_fitted_again(
-    window: Any, tool: Any, fitted: Fit, tmp_path: Path
-) -> None:
+def test_the_images_of_an_opened_fit_can_be_fitted_again(window, tool, fitted, tmp_path):
     window.layers.clear()
     window.open(write(tmp_path / "pair.shadowinv", fitted), plugin="napari-shadowinv")
     assert [shot.setup for shot in tool.request().shots] == list(fitted.setups)
@@ -214,9 +211,7 @@ def test_the_images_of_an_opened_fit_can_be_fitted_again(
     assert tool.source.kind == "uniform"  # a beam that was found is not measured
 
 
-def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
-    window: Any, tool: Any, show: Any, fitted: Fit, messages: list[str]
-) -> None:
+def test_a_good_verdict_is_shown_and_a_bad_one_is_told(window, tool, show, fitted, messages):
     show(tool, fitted)
     assert "Determined" in tool.view.verdict.text()
     sound_style = tool.view.verdict.styleSheet()
@@ -239,7 +234,7 @@ def test_a_good_verdict_is_shown_and_a_bad_one_is_told(
     assert not tool.view.verdict.isVisible()
 
 
-def test_without_a_setup_strengths_are_asked_for(window: Any, open_widget: Any, run: Any) -> None:
+def test_without_a_setup_strengths_are_asked_for(window, open_widget, run):
     for name, strength in (("strong", 1.0), ("weak", 0.6)):
         noise = np.random.default_rng(1).normal(0, 0.01, SHAPE)
         window.add_image(synthetic_image(strength * TRUTH) + noise, name=name)
@@ -254,7 +249,7 @@ def test_without_a_setup_strengths_are_asked_for(window: Any, open_widget: Any, 
     assert unit_of(layer_of(window, "field")) == "px"
 
 
-def test_light_has_wavelengths_and_its_own_fields(window: Any, open_widget: Any) -> None:
+def test_light_has_wavelengths_and_its_own_fields(window, open_widget):
     green = OpticalSetup(wavelength=532e-9, object_image_distance=0.01, pixel_size=1e-6)
     red = green.model_copy(update={"wavelength": 810e-9})
     for setup in (green, red):
@@ -269,7 +264,7 @@ def test_light_has_wavelengths_and_its_own_fields(window: Any, open_widget: Any)
     assert inputs.setups == (green, red)
 
 
-def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
+def test_a_mistake_is_one_sentence(tool, messages):
     mistakes: list[tuple[Callable[[], None], Callable[[], None], str]] = [
         (
             lambda: type_in(tool, 1, BEAM, "fast"),
@@ -299,7 +294,7 @@ def test_a_mistake_is_one_sentence(tool: Any, messages: list[str]) -> None:
         mend()
 
 
-def test_what_other_widgets_change_is_followed(window: Any, tool: Any, qtbot: Any) -> None:
+def test_what_other_widgets_change_is_followed(window, tool, qtbot):
     tool.hide()
     for layer, energy in zip(window.layers, (15.0, 7.0), strict=True):
         store_setup(layer, SETUPS[0].model_copy(update={"energy": energy}), "typed elsewhere")
@@ -310,16 +305,14 @@ def test_what_other_widgets_change_is_followed(window: Any, tool: Any, qtbot: An
     assert tool.setup.origin == "typed elsewhere"
 
 
-def test_doubts_of_the_reader_are_told(window: Any, tool: Any) -> None:
+def test_doubts_of_the_reader_are_told(window, tool):
     window.layers[1].metadata = metadata_for(
         "shot", "", SETUPS[1], cautions=[Caution("film-scan", "it may be film")]
     )
     assert tool.request().origins["Warning"] == "'6.0 MeV': it may be film"
 
 
-def test_images_that_do_not_fit_are_refused(
-    window: Any, tool: Any, messages: list[str], qtbot: Any
-) -> None:
+def test_images_that_do_not_fit_are_refused(window, tool, messages, qtbot):
     window.add_image(np.ones((40, 64)), name="crop", metadata=metadata_for("shot", "", SETUPS[0]))
     for row in range(3):
         tool.images.item(row, 0).setCheckState(Qt.CheckState.Checked)
@@ -339,7 +332,7 @@ def test_images_that_do_not_fit_are_refused(
     assert tool.panel.status.text() == messages[-1]
 
 
-def enlarged(window: Any, times: int) -> None:
+def enlarged(window, times):
     """Make the images large enough that each stage takes a while."""
     rng = np.random.default_rng(6)
     for layer, image in zip(window.layers, images(noise=0), strict=True):
@@ -351,22 +344,22 @@ BEFORE = {"full size": {"smoothness": 5.0}, "samples": {"smoothness": 5.0, "max_
 """Options that make the stages before one shorter."""
 
 
-def threads() -> list[str]:
+def threads():
     return [thread.name for thread in threading.enumerate() if thread.name == "shadowinv"]
 
 
-def cancel(tool: Any, qtbot: Any) -> None:
+def cancel(tool, qtbot):
     tool.panel.button.click()
     qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
 
 
 @pytest.fixture
-def traced_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def traced_images(monkeypatch):
     """A list with an entry for each image whose rays have been traced."""
     traced: list[int] = []
     trace = RayModel.image
 
-    def image(*args: Any, **keywords: Any) -> Any:
+    def image(*args, **keywords):
         traced.append(1)
         return trace(*args, **keywords)
 
@@ -379,15 +372,8 @@ def traced_images(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     [(4, ["transport", "samples"]), (3, ["from near", "smoothness", "full size"])],
 )
 def test_each_stage_ends_soon_after_cancel(
-    window: Any,
-    tool: Any,
-    qtbot: Any,
-    messages: list[str],
-    times: int,
-    stages: list[str],
-    traced_images: list[int],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    window, tool, qtbot, messages, times, stages, traced_images, monkeypatch
+):
     monkeypatch.setattr(FitJob, "patience", math.inf)  # the fit has to end by itself
     enlarged(window, times)
     usual = {**QUICK, "samples": 1000, "max_iterations": 100}
@@ -414,9 +400,7 @@ def test_each_stage_ends_soon_after_cancel(
         assert tool.cost.text().startswith(f"2 images of {height} × {width} px: about ")
 
 
-def test_the_compiler_is_told_and_does_not_hold_up_cancelling(
-    window: Any, tool: Any, qtbot: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_compiler_is_told_and_does_not_hold_up_cancelling(window, tool, qtbot, monkeypatch):
     at_work = threading.Event()
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     monkeypatch.setattr(compilation.RayModel, "gradient", lambda *_: at_work.wait(20))
@@ -431,8 +415,8 @@ def test_the_compiler_is_told_and_does_not_hold_up_cancelling(
 
 
 def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
-    window: Any, tool: Any, qtbot: Any, messages: list[str], fitted: Fit
-) -> None:
+    window, tool, qtbot, messages, fitted
+):
     # As if it had been removed: drawing right after a removal crashes Mesa at times.
     job = replace(tool.request(), image=object(), companions=tuple(window.layers))
     result = Result(fitted, job.origins)
@@ -444,9 +428,8 @@ def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
     assert {str(layer.units[-1]) for layer in window.layers} == {"micrometer"}
 
 
-def test_closing_the_dock_ends_the_fit(
-    window: Any, tool: Any, qtbot: Any, messages: list[str], traced_images: list[int]
-) -> None:
+def test_closing_the_dock_ends_the_fit(window, tool, qtbot, messages, traced_images):
+    tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.restore({"samples": 1000})
     tool.panel.button.click()
     with qtbot.waitSignal(
@@ -467,9 +450,7 @@ def test_closing_the_dock_ends_the_fit(
     assert messages == []
 
 
-def test_other_answers_are_shown_beside_the_best(
-    window: Any, tool: Any, show: Any, fitted: Fit, qtbot: Any, messages: list[str]
-) -> None:
+def test_other_answers_are_shown_beside_the_best(window, tool, show, fitted, qtbot, messages):
     result = fitted
     show(tool, result)
     best = result.basins[0]
@@ -500,9 +481,7 @@ def test_other_answers_are_shown_beside_the_best(
     assert not any("from near" in layer.name for layer in window.layers)
 
 
-def test_refine_starts_from_the_last_inversion(
-    window: Any, open_widget: Any, qtbot: Any, messages: list[str]
-) -> None:
+def test_refine_starts_from_the_last_inversion(window, open_widget, qtbot, messages):
     shot = images()[0][MIDDLE]
     window.add_image(shot, name="shot", metadata=metadata_for("shot", "", SETUPS[0]))
     tool = open_widget("Invert")
@@ -551,12 +530,10 @@ def test_refine_starts_from_the_last_inversion(
     assert "Flux residual" in texts_of(tool.report)
 
 
-def test_the_menu_refines_an_inversion_of_a_file(
-    window: Any, qtbot: Any, in_loop: Any, tmp_path: Any, messages: list[str]
-) -> None:
+def test_the_menu_refines_an_inversion_of_a_file(window, qtbot, in_loop, tmp_path, messages):
     from napari._app_model import get_app_model
 
-    def refine() -> None:
+    def refine():
         get_app_model().commands.execute_command("napari-shadowinv.refine").result()
 
     path = tmp_path / "shot.shadowinv"
@@ -580,7 +557,7 @@ def test_the_menu_refines_an_inversion_of_a_file(
     assert "shows a fit: select a layer of an inversion" in messages[-1]
 
 
-def test_choices_are_kept_between_sessions(window: Any, tool: Any, open_widget: Any) -> None:
+def test_choices_are_kept_between_sessions(window, tool, open_widget):
     tool.fields.set_kind("B and E")
     tool.choices.restore({"brightness": "free", "noise": "poisson"})
     state = json.loads(json.dumps(tool.state()))
@@ -595,20 +572,20 @@ def test_choices_are_kept_between_sessions(window: Any, tool: Any, open_widget: 
     assert choices.options.max_iterations == QUICK["max_iterations"]
 
 
-def command(*words: Any) -> str:
+def command(*words):
     done = undrawn(*words)
     assert done.exit_code in (0, 3), done.output
     return " ".join(done.output.split())
 
 
-def assert_same(one: Fit, other: Fit) -> None:
+def assert_same(one, other):
     for first, second in zip(one.fields, other.fields, strict=True):
         np.testing.assert_array_equal(first.potential, second.potential)
         np.testing.assert_array_equal(first.displacement, second.displacement)
     np.testing.assert_array_equal(one.reprojection, other.reprojection)
 
 
-def save(viewer: Any, content: Fit, path: Path) -> None:
+def save(viewer, content, path):
     layers = [
         layer for layer in viewer.layers if getattr(result_of(layer), "content", None) is content
     ]
@@ -617,7 +594,7 @@ def save(viewer: Any, content: Fit, path: Path) -> None:
 
 
 @pytest.fixture
-def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+def files(tmp_path, monkeypatch):
     """Both images and their beam as files, in the current folder."""
     monkeypatch.chdir(tmp_path)
     beam = 300 * (1 + np.arange(SHAPE[1]) * np.ones(SHAPE) / 500)
@@ -632,7 +609,7 @@ def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return paths
 
 
-def opened(window: Any, open_widget: Any, files: list[Path]) -> Any:
+def opened(window, open_widget, files):
     """The tool with both images at their energies, and their beam."""
     for path in files:
         window.open(str(path), plugin="napari-shadowinv")
@@ -645,8 +622,8 @@ def opened(window: Any, open_widget: Any, files: list[Path]) -> Any:
 
 
 def test_window_and_command_make_the_same_fit_and_make_it_again(
-    window: Any, open_widget: Any, files: list[Path], run: Any, tmp_path: Path
-) -> None:
+    window, open_widget, files, run, tmp_path
+):
     tool = opened(window, open_widget, files)
     for row in (0, 1):
         type_in(tool, row, PSF, "0.6")
@@ -689,7 +666,7 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     assert after.setups == before.setups
 
 
-def test_what_the_table_rounds_is_taken_exactly(window: Any, open_widget: Any) -> None:
+def test_what_the_table_rounds_is_taken_exactly(window, open_widget):
     setups = [
         setup.model_copy(update={"energy": setup.energy + 1e-8 / 3, "pixel_size": 1e-6 / 3})
         for setup in SETUPS
@@ -701,7 +678,7 @@ def test_what_the_table_rounds_is_taken_exactly(window: Any, open_widget: Any) -
     assert inputs_of(tool).setups == tuple(setups)
 
 
-def pradreader(path: Path, *planes: Array) -> None:
+def pradreader(path, *planes):
     """Write an image, its source and its mask (0: use) as one file, with a complete geometry."""
     lines = ["# ls (cm): 0.13", "# ld (cm): 2", "# energy (MeV): 14.7"]
     blocks = [f"# {name} ({SHAPE[0]}, {SHAPE[1]})" for name in ("flux2D", "flux2D_ref", "mask")]
@@ -712,8 +689,8 @@ def pradreader(path: Path, *planes: Array) -> None:
 
 
 def test_what_a_file_holds_and_was_not_used_is_not_used_again(
-    window: Any, open_widget: Any, run: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    window, open_widget, run, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     hidden = np.zeros(SHAPE)
     hidden[:, :20] = 1
@@ -739,9 +716,7 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     assert single.request().shot.mask is None
 
 
-def test_a_source_of_another_file_is_not_taken_for_that_file(
-    window: Any, tool: Any, tmp_path: Path
-) -> None:
+def test_a_source_of_another_file_is_not_taken_for_that_file(window, tool, tmp_path):
     metadata = {"path": str(tmp_path / "a.h5"), "file": {"sha256": "1" * 64}}
     window.layers[0].metadata = metadata_for("shot", "", SETUPS[0], **metadata)
     beam = window.add_image(np.full(SHAPE, 300.0), metadata=metadata_for("source", "", **metadata))
@@ -751,15 +726,15 @@ def test_a_source_of_another_file_is_not_taken_for_that_file(
     assert (second.file, second.source.file) == ("", "")
 
 
-def lies_in_view(tool: Any, part: Any) -> bool:
+def lies_in_view(tool, part):
     top = part.mapTo(tool.area.viewport(), part.rect().topLeft()).y()
     bottom = part.mapTo(tool.area.viewport(), part.rect().bottomLeft()).y()
     return bool(part.isVisible() and top >= 0 and bottom < tool.area.viewport().height())
 
 
 def test_run_is_in_view_at_once_and_the_verdict_at_the_end(
-    window: Any, open_widget: Any, show: Any, fitted: Fit, qtbot: Any
-) -> None:
+    window, open_widget, show, fitted, qtbot
+):
     window.window._qt_window.resize(1366, 768)
     for setup, image in zip(SETUPS, images(), strict=True):
         metadata = metadata_for("shot", "", setup, setup_origin="came with pack.h5")
@@ -786,9 +761,7 @@ def test_run_is_in_view_at_once_and_the_verdict_at_the_end(
     assert tool.setup_section.text() == "Setup: 14.7 MeV proton, typed for 'image'"
 
 
-def test_a_recipe_tells_noise_and_point_spread(
-    window: Any, tool: Any, tmp_path: Path, messages: list[str]
-) -> None:
+def test_a_recipe_tells_noise_and_point_spread(window, tool, tmp_path, messages):
     path = tmp_path / "recipe.toml"
     choices = '[fit]\nfields = ["E", "B"]\nnoise = 3.5\nsource_size = 3e-6\nresolution = 4e-5\n'
     path.write_text(f"[[steps]]\nstep = 'bin'\nfactor = 2\n{choices}")
@@ -806,9 +779,7 @@ def test_a_recipe_tells_noise_and_point_spread(
     assert messages[-1].endswith("select the setup first, or give the point spread in px")
 
 
-def test_a_recipe_that_cannot_be_shown_changes_nothing(
-    tool: Any, messages: list[str], tmp_path: Path
-) -> None:
+def test_a_recipe_that_cannot_be_shown_changes_nothing(tool, messages, tmp_path):
     path, before = tmp_path / "recipe.toml", tool.state()
     for text, sentence in (
         ('[source]\nmethod = "polynomial"\n', "estimates the source"),

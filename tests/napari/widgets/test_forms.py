@@ -6,13 +6,11 @@ import json
 import math
 import tomllib
 from pathlib import Path
-from typing import Any
 
 import pytest
 import tomli_w
 from annotated_types import Ge, Gt, Le, Lt
 from magicgui.widgets import ComboBox, LineEdit
-from pydantic import BaseModel
 from qtpy.QtWidgets import QFileDialog
 
 from helpers.forms import enter
@@ -54,14 +52,14 @@ STATED = [
 ]
 
 
-def the_form(qtbot: Any, model: Any) -> ModelForm:
+def the_form(qtbot, model):
     form = InstrumentForm() if model is Instrument else ModelForm(model)
     qtbot.addWidget(form)
     return form
 
 
 @pytest.mark.parametrize("model", MODELS)
-def test_an_empty_form_states_nothing(qtbot: Any, model: Any) -> None:
+def test_an_empty_form_states_nothing(qtbot, model):
     form = the_form(qtbot, model)
     assert form.model() == model()
     assert not form.state().keys() - {"step", "method"}
@@ -72,7 +70,7 @@ def test_an_empty_form_states_nothing(qtbot: Any, model: Any) -> None:
 
 
 @pytest.mark.parametrize("stated", STATED, ids=lambda each: type(each).__name__)
-def test_stated_values_come_back_exactly(qtbot: Any, stated: BaseModel) -> None:
+def test_stated_values_come_back_exactly(qtbot, stated):
     form, later = (the_form(qtbot, type(stated)) for _ in range(2))
     form.restore(stated.model_dump())
     assert form.model() == stated
@@ -83,7 +81,7 @@ def test_stated_values_come_back_exactly(qtbot: Any, stated: BaseModel) -> None:
     assert not form.state().keys() - {"step", "method", "kind"}
 
 
-def test_numbers_are_typed_with_units_and_shown_with_prefixes(qtbot: Any) -> None:
+def test_numbers_are_typed_with_units_and_shown_with_prefixes(qtbot):
     form = the_form(qtbot, ProtonSetup)
     energy, distance = form.entries["energy"], form.entries["object_image_distance"]
     enter(energy, "14700 keV")
@@ -102,7 +100,7 @@ def test_numbers_are_typed_with_units_and_shown_with_prefixes(qtbot: Any) -> Non
 @pytest.mark.parametrize(
     ("text", "says"), [("little", "'little'"), ("3", "less than 1"), ("0.01", "")]
 )
-def test_the_model_refuses_what_was_typed(qtbot: Any, text: str, says: str) -> None:
+def test_the_model_refuses_what_was_typed(qtbot, text, says):
     form = the_form(qtbot, InversionOptions)
     enter(form.entries["floor"], text)
     assert form._problem.text().startswith("options: 'Floor' is" if says else "")
@@ -113,7 +111,7 @@ def test_the_model_refuses_what_was_typed(qtbot: Any, text: str, says: str) -> N
         form.model()
 
 
-def test_one_of_two_pixel_sizes_is_given(qtbot: Any, proton_setup: ProtonSetup) -> None:
+def test_one_of_two_pixel_sizes_is_given(qtbot, proton_setup):
     form = the_form(qtbot, ProtonSetup)
     form.restore(proton_setup.model_dump())
     enter(form.entries["detector_pixel_size"], "145 µm")
@@ -121,7 +119,7 @@ def test_one_of_two_pixel_sizes_is_given(qtbot: Any, proton_setup: ProtonSetup) 
     assert "pixel_size" not in form.state()
 
 
-def placeholders(form: InstrumentForm) -> dict[str, str]:
+def placeholders(form):
     """Return the texts in grey of the numbers that are empty."""
     lines = {name: entry.line for name, entry in form.entries.items()}
     return {
@@ -131,7 +129,7 @@ def placeholders(form: InstrumentForm) -> dict[str, str]:
     }
 
 
-def test_an_instrument_shows_its_defaults_in_grey(qtbot: Any) -> None:
+def test_an_instrument_shows_its_defaults_in_grey(qtbot):
     form = InstrumentForm()
     qtbot.addWidget(form)
     exact = placeholders(form)
@@ -153,7 +151,7 @@ def test_an_instrument_shows_its_defaults_in_grey(qtbot: Any) -> None:
     assert placeholders(form) == exact
 
 
-def test_choices_for_recipes_have_a_row_while_they_are_stated(qtbot: Any) -> None:
+def test_choices_for_recipes_have_a_row_while_they_are_stated(qtbot):
     form = ModelForm(InversionOptions)
     qtbot.addWidget(form)
     solver = form.entries["solver"].widget.native
@@ -165,8 +163,8 @@ def test_choices_for_recipes_have_a_row_while_they_are_stated(qtbot: Any) -> Non
 
 @pytest.mark.parametrize("name", ["proton_setup", "optical_setup"])
 def test_buttons_save_and_load_what_the_command_reads(
-    name: str, request: Any, qtbot: Any, tmp_path: Path, choose: Any, messages: list[str]
-) -> None:
+    name, request, qtbot, tmp_path, choose, messages
+):
     setup, picker = request.getfixturevalue(name), SetupPicker()
     qtbot.addWidget(picker)
     path = tmp_path / "setup.toml"
@@ -187,9 +185,7 @@ def test_buttons_save_and_load_what_the_command_reads(
     assert picker.setup() == setup
 
 
-def test_a_file_is_chosen_for_a_number_that_may_be_one(
-    qtbot: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_chosen_for_a_number_that_may_be_one(qtbot, monkeypatch):
     form = the_form(qtbot, Dark)
     monkeypatch.setattr(QFileDialog, "getOpenFileName", lambda *_, **__: ("dark.tif", ""))
     form.entries["level"].widget[1].native.click()
@@ -198,7 +194,7 @@ def test_a_file_is_chosen_for_a_number_that_may_be_one(
     assert form.model() == Dark(level=12.5)
 
 
-def test_a_picker_remembers_what_each_kind_holds(qtbot: Any) -> None:
+def test_a_picker_remembers_what_each_kind_holds(qtbot):
     picker, restored = (ModelPicker("Method", kinds_of(ESTIMATES)) for _ in range(2))
     for widget in (picker, restored):
         qtbot.addWidget(widget)
@@ -212,7 +208,7 @@ def test_a_picker_remembers_what_each_kind_holds(qtbot: Any) -> None:
     assert restored.model() == ESTIMATES["polynomial"](degree=7)  # type: ignore[call-arg]
 
 
-def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot: Any, settings_folder: Path) -> None:
+def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot, settings_folder):
     assert saved_state("test") == {}
     save_state("test", {"a": [1, math.inf], "b": "µm"})
     assert saved_state("test") == {"a": [1, math.inf], "b": "µm"}
@@ -227,7 +223,7 @@ def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot: Any, settings_fol
     assert "'many'" in form._problem.text()
 
 
-def test_contradictions_name_the_fields_by_their_labels(qtbot: Any) -> None:
+def test_contradictions_name_the_fields_by_their_labels(qtbot):
     form = the_form(qtbot, InversionOptions)
     enter(form.entries["flux"], "known")
     assert isinstance(form.entries["flux"].line, ComboBox)
@@ -236,7 +232,7 @@ def test_contradictions_name_the_fields_by_their_labels(qtbot: Any) -> None:
 
 
 @pytest.mark.parametrize("model", [InversionOptions, FitOptions, Instrument, *STEPS.values()])
-def test_bounds_name_each_field_by_its_label(model: type[BaseModel]) -> None:
+def test_bounds_name_each_field_by_its_label(model):
     for key, field in model.model_fields.items():
         if not any(isinstance(bound, Ge | Gt | Le | Lt) for bound in field.metadata):
             continue
@@ -247,7 +243,7 @@ def test_bounds_name_each_field_by_its_label(model: type[BaseModel]) -> None:
         assert f"'{key}'" not in str(refused.value)
 
 
-def is_refused(model: type[BaseModel], values: dict[str, Any]) -> bool:
+def is_refused(model, values):
     try:
         validate(model, values)
     except InputError:

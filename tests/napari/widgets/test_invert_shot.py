@@ -5,8 +5,6 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import h5py
@@ -42,7 +40,7 @@ PATIENCE = 60_000  # ms; a machine may have other things to do
 
 
 @pytest.fixture
-def tool(window: Any, open_widget: Callable[[str], Any], shot: Array) -> Any:
+def tool(window, open_widget, shot):
     window.add_image(shot, name="shot")
     widget = open_widget("Invert")
     widget.options.restore(FEW)
@@ -50,12 +48,12 @@ def tool(window: Any, open_widget: Callable[[str], Any], shot: Array) -> Any:
 
 
 @pytest.fixture
-def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+def slow(monkeypatch):
     """Make every run wait, as a large image would, until it is stopped or let go."""
     let_go = threading.Event()
     work = Job.work
 
-    def work_slowly(job: Job, on_progress: Any, should_stop: Any) -> Any:
+    def work_slowly(job, on_progress, should_stop):
         while not let_go.is_set() and not should_stop():
             time.sleep(0.01)
         return work(job, on_progress, should_stop)
@@ -64,24 +62,22 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     return let_go
 
 
-def computed(tool: Any) -> Any:
+def computed(tool):
     """Return the inversion of the controls, without its layers."""
     return run_job(tool.request())
 
 
-def settled(tool: Any) -> bool:
+def settled(tool):
     return not tool.panel.running and not tool._preview_timer.isActive()
 
 
-def test_the_window_thread_computes_nothing_during_a_run(
-    window: Any, tool: Any, qtbot: Any
-) -> None:
+def test_the_window_thread_computes_nothing_during_a_run(window, tool, qtbot):
     tool.options.restore({"n_sites": 2_000})
     qtbot.wait(300)
     tool.show_result = lambda *_: None
     rooms: set[str] = set()
 
-    def note_room(frame: Any, event: str, _: object) -> None:
+    def note_room(frame, event, _):
         if event == "call":
             rooms.add(".".join(str(frame.f_globals.get("__name__", "")).split(".")[:2]))
 
@@ -96,9 +92,7 @@ def test_the_window_thread_computes_nothing_during_a_run(
     assert not rooms & {f"napari_shadowinv.{room}" for room in computing}
 
 
-def test_an_image_deleted_during_the_run_is_told_once(
-    window: Any, tool: Any, slow: threading.Event, messages: list[str], qtbot: Any
-) -> None:
+def test_an_image_deleted_during_the_run_is_told_once(window, tool, slow, messages, qtbot):
     tool.panel.button.click()
     qtbot.waitUntil(lambda: tool.panel.button.text() == "Cancel", timeout=PATIENCE)
     window.layers.remove(window.layers["shot"])
@@ -110,9 +104,7 @@ def test_an_image_deleted_during_the_run_is_told_once(
     assert layer_of(window, "field").data.any()
 
 
-def test_one_click_inverts_the_image_in_si_units(
-    window: Any, tool: Any, run: Any, shot: Array, proton_setup: ProtonSetup
-) -> None:
+def test_one_click_inverts_the_image_in_si_units(window, tool, run, shot, proton_setup):
     tool.setup.show_setup(proton_setup.model_dump())
     run(tool)
     expected = invert(shot, options=InversionOptions(**FEW))
@@ -133,9 +125,7 @@ def test_one_click_inverts_the_image_in_si_units(
     assert not progress._all_instances
 
 
-def test_the_source_of_a_shot_a_layer_or_a_file_is_used(
-    window: Any, tool: Any, shot: Array, tmp_path: Path, proton_setup: ProtonSetup
-) -> None:
+def test_the_source_of_a_shot_a_layer_or_a_file_is_used(window, tool, shot, tmp_path, proton_setup):
     beam = 300 * (1 + np.linspace(0, 0.2, shot.shape[1]) + np.zeros(shot.shape))
     with h5py.File(tmp_path / "run.nxs", "w") as file:
         file["entry/beam"], file["entry/dark"] = beam, 0 * beam
@@ -159,7 +149,7 @@ def test_the_source_of_a_shot_a_layer_or_a_file_is_used(
     assert 0 < estimated.std() < 0.2 * estimated.mean()
 
 
-def test_what_a_file_brings_is_used_and_told(window: Any, tool: Any, shot: Array) -> None:
+def test_what_a_file_brings_is_used_and_told(window, tool, shot):
     mask = np.zeros(shot.shape, np.uint8)
     mask[:, :5] = 1
     window.add_labels(mask, metadata=metadata_for("mask", "", path="a.txt"))
@@ -174,14 +164,8 @@ def test_what_a_file_brings_is_used_and_told(window: Any, tool: Any, shot: Array
 
 
 def test_a_run_replaces_the_last_result_of_its_shot(
-    window: Any,
-    tool: Any,
-    run: Any,
-    shot: Array,
-    proton_setup: ProtonSetup,
-    messages: list[str],
-    qtbot: Any,
-) -> None:
+    window, tool, run, shot, proton_setup, messages, qtbot
+):
     run(tool)
     tool.view.more_layers.click()
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
@@ -233,16 +217,12 @@ USER_ERRORS = {
 
 
 def test_a_mistake_is_told_once_and_the_viewer_lives(
-    window: Any,
-    open_widget: Any,
-    messages: list[str],
-    qtbot: Any,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    window, open_widget, messages, qtbot, monkeypatch
+):
     tool = open_widget("Invert")
     tool.options.restore(FEW)
 
-    def expect(words: str) -> None:
+    def expect(words):
         """Press Run, and check that it sends one notification with these words."""
         messages.clear()
         tool.panel.button.click()
@@ -271,7 +251,7 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
     expect("0 × 0 pixels")
     tool.crop.layer = None
 
-    def broken(*_: Any, **__: Any) -> None:
+    def broken(*_, **__):
         raise ZeroDivisionError("a fault of the program's")
 
     monkeypatch.setattr(jobs, "run", broken)
@@ -279,8 +259,8 @@ def test_a_mistake_is_told_once_and_the_viewer_lives(
 
 
 def test_whole_numbers_and_the_finest_of_many_scales_are_inverted(
-    window: Any, tool: Any, shot: Array, run: Any, messages: list[str]
-) -> None:
+    window, tool, shot, run, messages
+):
     counts = np.round(shot).astype(np.uint16)
     tool.image.layer = window.add_image(counts, name="counts")
     np.testing.assert_allclose(computed(tool).image, counts)
@@ -298,9 +278,7 @@ def test_whole_numbers_and_the_finest_of_many_scales_are_inverted(
     assert field.name.startswith("± ")
 
 
-def test_the_result_lies_on_an_image_that_was_turned(
-    window: Any, tool: Any, shot: Array, run: Any, messages: list[str]
-) -> None:
+def test_the_result_lies_on_an_image_that_was_turned(window, tool, shot, run, messages):
     turned = window.add_image(
         shot, name="turned", rotate=30, shear=[0.2], scale=(2, 3), translate=(7, -4),
         affine=[[1, 0.1, 5], [0, 1.2, 6], [0, 0, 1]],
@@ -324,9 +302,7 @@ def test_the_result_lies_on_an_image_that_was_turned(
     assert [text.partition(":")[0] for text in messages] == ["Too uncertain"]
 
 
-def test_the_preview_follows_in_its_own_layers(
-    window: Any, tool: Any, qtbot: Any, messages: list[str]
-) -> None:
+def test_the_preview_follows_in_its_own_layers(window, tool, qtbot, messages):
     noise = np.random.default_rng(0).normal(0, 0.05, (200, 200))
     shot = (
         synthetic_image(toroid((200, 200), ProtonSetup.example(), 97, 30e-6).displacement) + noise
@@ -343,7 +319,7 @@ def test_the_preview_follows_in_its_own_layers(
     residual = result_of(field).content.report.image_residual
     assert percent(residual) in tool.panel.status.text()
 
-    def follows(change: Any) -> None:
+    def follows(change):
         """Wait until the layer follows a change."""
         qtbot.waitUntil(lambda: settled(tool), timeout=PATIENCE)
         qtbot.wait(100)  # the last picture is drawn
@@ -383,7 +359,7 @@ def test_the_preview_follows_in_its_own_layers(
     assert messages == []
 
 
-def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fits: Any) -> None:
+def test_it_fits_and_remembers(window, tool, qtbot, assert_it_fits):
     tool.options.restore({"seed": 5})
     tool.source.set_kind("interpolated")
     tool.setup.show_setup(ProtonSetup.example().model_dump())
@@ -404,9 +380,7 @@ def test_it_fits_and_remembers(window: Any, tool: Any, qtbot: Any, assert_it_fit
     assert again.steps.folded.text().startswith(steps)
 
 
-def test_doubts_stand_under_run_with_a_notification(
-    window: Any, tool: Any, run: Any, messages: list[str]
-) -> None:
+def test_doubts_stand_under_run_with_a_notification(window, tool, run, messages):
     tool.options.restore({**FEW, "max_iterations": 1})
     run(tool)
     assert "Failed" in tool.verdict.text()
@@ -431,9 +405,7 @@ def test_doubts_stand_under_run_with_a_notification(
     assert not tool.report.details.isExpanded()
 
 
-def test_menu_brings_a_hidden_tab_to_the_front(
-    window: Any, tool: Any, open_widget: Any, qtbot: Any
-) -> None:
+def test_menu_brings_a_hidden_tab_to_the_front(window, tool, open_widget, qtbot):
     qtbot.waitUntil(lambda: tool._dock is not None, timeout=PATIENCE)
     front = open_widget("Analyse")
     qtbot.waitUntil(lambda: tool.visibleRegion().isEmpty(), timeout=PATIENCE)
@@ -447,9 +419,7 @@ def test_menu_brings_a_hidden_tab_to_the_front(
     assert not dock.isVisible()
 
 
-def test_camera_fits_after_units_change(
-    window: Any, tool: Any, run: Any, proton_setup: ProtonSetup
-) -> None:
+def test_camera_fits_after_units_change(window, tool, run, proton_setup):
     run(tool)
     tool.setup.show_setup(proton_setup.model_dump())
     run(tool)
@@ -461,9 +431,7 @@ def test_camera_fits_after_units_change(
     assert camera.zoom == pytest.approx(zoom)
 
 
-def test_a_layer_of_an_estimated_source_was_not_measured(
-    tool: Any, window: Any, qtbot: Any
-) -> None:
+def test_a_layer_of_an_estimated_source_was_not_measured(tool, window, qtbot):
     """An estimate has the error of an unmeasured beam; a layer that was opened has not."""
     tool.source.set_kind("polynomial")
     tool.show_source.click()
@@ -480,9 +448,7 @@ def test_a_layer_of_an_estimated_source_was_not_measured(
     assert tool.recipe().instrument == Instrument()
 
 
-def test_the_beam_under_a_painted_mask_is_predicted_with_its_error(
-    window: Any, open_widget: Any, run: Any
-) -> None:
+def test_the_beam_under_a_painted_mask_is_predicted_with_its_error(window, open_widget, run):
     blob = gaussian_blob((64, 64), -6.0, 4.0)
     window.add_image(np.random.default_rng(0).poisson(500 * synthetic_image(blob.displacement)))
     tool = open_widget("Invert")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,7 @@ import pytest
 from helpers.forms import enter
 from helpers.layers import layer_of
 from helpers.reports import texts_of
-from napari_shadowinv import InversionOptions, ProtonSetup, invert
+from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.physics.forward import synthetic_image
@@ -28,24 +26,24 @@ SHAPE = (24, 28)
 
 
 @pytest.fixture(scope="module")
-def stack() -> Array:
+def stack():
     """Four shots of a blob that grows and wanders."""
     blobs = [gaussian_blob(SHAPE, 2.0 + i, 4.0, (10, 12 + i)) for i in range(4)]
     return np.stack([100 * synthetic_image(blob.displacement) for blob in blobs])
 
 
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
+def out(tmp_path):
     return tmp_path / "run.shadowinv.zarr"
 
 
 @pytest.fixture
-def tool(window: Any, open_widget: Callable[[str], Any], stack: Array, out: Path) -> Any:
+def tool(window, open_widget, stack, out):
     window.add_image(stack, name="shots")
     return prepared(open_widget("Invert"), out)
 
 
-def prepared(widget: Any, out: Path) -> Any:
+def prepared(widget, out):
     widget.options.restore(FEW)
     widget.store.folder.restore({"path": str(out)})
     widget.store.run.restore({"workers": 1})
@@ -53,28 +51,28 @@ def prepared(widget: Any, out: Path) -> Any:
 
 
 @pytest.fixture
-def run(qtbot: Any) -> Callable[[Any], None]:
+def run(qtbot):
     """Press Run and wait until run and layers are complete."""
 
-    def pressed(tool: Any) -> None:
+    def pressed(tool):
         tool.panel.button.click()
         qtbot.waitUntil(lambda: at_rest(tool), timeout=PATIENCE)
 
     return pressed
 
 
-def at_rest(tool: Any) -> bool:
+def at_rest(tool):
     return not (tool.panel.running or tool.stack_view.busy)
 
 
 @pytest.fixture
-def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+def held(monkeypatch):
     """Hold each run at its third shot, as a large image would, until it is stopped or let go."""
     let_go = threading.Event()
     original = _worker.run_prepared
     count = iter(range(1000))
 
-    def holding(*args: Any, should_stop: Any = None, **kwargs: Any) -> Any:
+    def holding(*args, should_stop=None, **kwargs):
         if next(count) >= 2:
             while not let_go.is_set() and not should_stop():
                 time.sleep(0.01)
@@ -84,27 +82,21 @@ def held(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     return let_go
 
 
-def written(out: Path) -> dict[str, int]:
+def written(out):
     """When each shot's potential was written."""
     chunks = out / "potential" / "c"
     return {path.name: (path / "0" / "0").stat().st_mtime_ns for path in sorted(chunks.iterdir())}
 
 
-def running() -> list[str]:
+def running():
     """Names of the threads of the run and its shots."""
     names = [thread.name for thread in threading.enumerate()]
     return [name for name in names if name.startswith(("shot", "shadowinv"))]
 
 
 def test_a_stack_layer_becomes_a_store_and_layers(
-    window: Any,
-    tool: Any,
-    run: Any,
-    stack: Array,
-    out: Path,
-    messages: list[str],
-    proton_setup: ProtonSetup,
-) -> None:
+    window, tool, run, stack, out, messages, proton_setup
+):
     tool.setup.show_setup(proton_setup.model_dump())
     tool.store.run.restore({"workers": 2})
     run(tool)
@@ -132,8 +124,8 @@ def test_a_stack_layer_becomes_a_store_and_layers(
 
 
 def test_a_corrupt_file_is_listed_and_the_others_are_done(
-    window: Any, tool: Any, run: Any, stack: Array, out: Path, tmp_path: Path, messages: list[str]
-) -> None:
+    window, tool, run, stack, out, tmp_path, messages
+):
     for index, image in enumerate(stack):
         np.save(tmp_path / f"shot_{index}.npy", image)
     content = (tmp_path / "shot_1.npy").read_bytes()
@@ -165,14 +157,8 @@ def test_a_corrupt_file_is_listed_and_the_others_are_done(
 
 
 def test_cancelled_in_the_middle_it_goes_on_from_there(
-    window: Any,
-    tool: Any,
-    run: Any,
-    out: Path,
-    qtbot: Any,
-    held: threading.Event,
-    messages: list[str],
-) -> None:
+    window, tool, run, out, qtbot, held, messages
+):
     tool.panel.button.click()
     qtbot.waitUntil(lambda: tool.panel.bar.value() == 2, timeout=PATIENCE)
     assert tool.panel.bar.maximum() == 4
@@ -213,14 +199,7 @@ def test_cancelled_in_the_middle_it_goes_on_from_there(
     assert messages == []
 
 
-def test_closing_the_window_ends_the_run(
-    make_napari_viewer: Any,
-    qtbot: Any,
-    stack: Array,
-    out: Path,
-    held: threading.Event,
-    messages: list[str],
-) -> None:
+def test_closing_the_window_ends_the_run(make_napari_viewer, qtbot, stack, out, held, messages):
     viewer = make_napari_viewer(show=True)
     viewer.add_image(stack, name="shots")
     _, widget = viewer.window.add_plugin_dock_widget("napari-shadowinv", "Invert")
@@ -234,16 +213,9 @@ def test_closing_the_window_ends_the_run(
 
 
 def test_a_mistake_is_told_once_and_nothing_is_lost(
-    window: Any,
-    tool: Any,
-    run: Any,
-    out: Path,
-    messages: list[str],
-    qtbot: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def expect(words: str) -> None:
+    window, tool, run, out, messages, qtbot, tmp_path, monkeypatch
+):
+    def expect(words):
         messages.clear()
         tool.panel.button.click()
         qtbot.waitUntil(lambda: bool(messages) and at_rest(tool), timeout=PATIENCE)
@@ -271,7 +243,7 @@ def test_a_mistake_is_told_once_and_nothing_is_lost(
     assert sorted(path.name for path in tmp_path.glob("*.zarr")) == [out.name]
 
 
-def test_overwriting_takes_a_box_that_counts_once(tool: Any, run: Any, out: Path) -> None:
+def test_overwriting_takes_a_box_that_counts_once(tool, run, out):
     run(tool)
     before = written(out)
     tool.options.restore({**FEW, "seed": 7})

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from napari.components import ViewerModel
 
 from napari_shadowinv import FitOptions, Recipe, read, write
 from napari_shadowinv._napari.layer_metadata import is_estimate, metadata_for, role_of
@@ -27,7 +24,7 @@ OBJECT = synthetic_image(ellipse_pair(SHAPE).displacement) * NOISE[0]
 BEAM, LATER = NOISE[1:] * (1 + np.linspace(0, 0.3, SHAPE[1]))
 
 
-def boxes(tool: Any) -> tuple[str, str]:
+def boxes(tool):
     source = tool.source.layer
     return tool.image.layer.name, tool.source.kind if source is None else source.name
 
@@ -42,9 +39,7 @@ def boxes(tool: Any) -> tuple[str, str]:
         ("s7", "flat-field"), ("2026-05-01", "2026-05-01 blank"), ("p", "backgrounds"),
     ],
 )  # fmt: skip
-def test_a_pair_fills_both_boxes(
-    viewer: ViewerModel, opened: Any, shot: str, beam: str, beam_first: bool, window_first: bool
-) -> None:
+def test_a_pair_fills_both_boxes(viewer, opened, shot, beam, beam_first, window_first):
     tool = opened(Invert) if window_first else None
     images = {shot: OBJECT, beam: BEAM}
     for name in (beam, shot) if beam_first else (shot, beam):
@@ -52,7 +47,7 @@ def test_a_pair_fills_both_boxes(
     assert boxes(tool or opened(Invert)) == (shot, beam)
 
 
-def test_a_name_counts_more_than_structure(viewer: ViewerModel, opened: Any) -> None:
+def test_a_name_counts_more_than_structure(viewer, opened):
     """A beam through a mesh has more structure than a weak object."""
     mesh = 1 + 0.5 * (np.indices(SHAPE).sum(axis=0) // 16 % 2)
     for name, image in {"shot": BEAM, "ref": mesh, "dark": 0.01 * OBJECT}.items():
@@ -71,15 +66,13 @@ def test_a_name_counts_more_than_structure(viewer: ViewerModel, opened: Any) -> 
         {"dark": 0.01 * BEAM},
     ],
 )
-def test_nothing_is_guessed_where_two_are_possible(
-    viewer: ViewerModel, opened: Any, others: dict[str, Any]
-) -> None:
+def test_nothing_is_guessed_where_two_are_possible(viewer, opened, others):
     for name, image in {**others, "shot": OBJECT}.items():
         viewer.add_image(image, name=name)
     assert boxes(opened(Invert)) == ("shot", "uniform")
 
 
-def test_a_choice_is_never_overruled(viewer: ViewerModel, opened: Any) -> None:
+def test_a_choice_is_never_overruled(viewer, opened):
     viewer.add_image(OBJECT, name="shot")
     tool = opened(Invert)
     tool.source.set_kind("polynomial")
@@ -92,7 +85,7 @@ def test_a_choice_is_never_overruled(viewer: ViewerModel, opened: Any) -> None:
     assert tool.image.layer.name == "ref"
 
 
-def test_a_layer_may_have_the_name_of_another_entry(viewer: ViewerModel, opened: Any) -> None:
+def test_a_layer_may_have_the_name_of_another_entry(viewer, opened):
     viewer.add_image(OBJECT, name="shot")
     beam = viewer.add_image(BEAM, name="uniform")
     tool = opened(Invert)
@@ -102,9 +95,7 @@ def test_a_layer_may_have_the_name_of_another_entry(viewer: ViewerModel, opened:
     assert tool.source.choice.current_choice == "layer uniform"
 
 
-def test_without_its_beam_an_image_has_the_source_from_before(
-    viewer: ViewerModel, opened: Any
-) -> None:
+def test_without_its_beam_an_image_has_the_source_from_before(viewer, opened):
     tool = opened(Invert)
     viewer.add_image(OBJECT, name="shot")
     beam = viewer.add_image(BEAM, name="ref")
@@ -114,7 +105,7 @@ def test_without_its_beam_an_image_has_the_source_from_before(
     assert boxes(tool) == ("shot", "uniform")
 
 
-def test_an_estimate_is_not_taken_before_it_is_chosen(viewer: ViewerModel, opened: Any) -> None:
+def test_an_estimate_is_not_taken_before_it_is_chosen(viewer, opened):
     viewer.add_image(OBJECT, name="shot")
     tool = opened(Invert)
     made_from = {"estimate": "polynomial"}
@@ -125,7 +116,7 @@ def test_an_estimate_is_not_taken_before_it_is_chosen(viewer: ViewerModel, opene
     assert estimate in tool.source.offered
 
 
-def test_a_stack_is_taken_with_its_beam(viewer: ViewerModel, opened: Any) -> None:
+def test_a_stack_is_taken_with_its_beam(viewer, opened):
     viewer.add_image(np.stack([OBJECT, OBJECT]), name="run")
     viewer.add_image(BEAM, name="reference")
     tool = opened(Invert)
@@ -134,9 +125,7 @@ def test_a_stack_is_taken_with_its_beam(viewer: ViewerModel, opened: Any) -> Non
 
 
 @pytest.mark.parametrize(("images", "kind"), [(1, Invert), (2, FitImages)])
-def test_a_fit_from_a_file_has_its_beam(
-    viewer: ViewerModel, opened: Any, tmp_path: Any, images: int, kind: Any
-) -> None:
+def test_a_fit_from_a_file_has_its_beam(viewer, opened, tmp_path, images, kind):
     options = FitOptions(max_iterations=2, samples=0)
     strength = [1.0, 0.5][:images]
     recorded = [OBJECT * BEAM * noise for noise in NOISE[:images]]
@@ -156,12 +145,12 @@ def test_a_fit_from_a_file_has_its_beam(
     assert len(marks) == 1
 
 
-def image_of(viewer: ViewerModel) -> Any:
+def image_of(viewer):
     (image,) = [layer for layer in viewer.layers if role_of(layer) == "image"]
     return image
 
 
-def test_an_estimate_becomes_a_layer(viewer: ViewerModel, opened: Any, qtbot: Any) -> None:
+def test_an_estimate_becomes_a_layer(viewer, opened, qtbot):
     shot = viewer.add_image(OBJECT, name="shot", scale=(2, 2), translate=(5, 7))
     tool = opened(Invert)
     assert tool.show_source.parentWidget().isHidden()

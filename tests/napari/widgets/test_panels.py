@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import time
-from typing import Any
 
 import pytest
 from qtpy.QtCore import Qt
@@ -20,10 +19,10 @@ PATIENCE = 60_000  # ms
 class Work:
     """Work of 200 steps, each of which reports its progress."""
 
-    def __init__(self, total: int | None) -> None:
+    def __init__(self, total):
         self.total = total
 
-    def __call__(self, on_progress: Any, should_stop: Any) -> None:
+    def __call__(self, on_progress, should_stop):
         for step in range(200):
             if should_stop():
                 return
@@ -32,21 +31,19 @@ class Work:
 
 
 @pytest.fixture
-def panel(window: Any, qtbot: Any) -> Run:
+def panel(window, qtbot):
     run_panel = Run("Run", "Do it.")
     window.window.add_dock_widget(run_panel, name="work", area="right")
     qtbot.wait(500)
     return run_panel
 
 
-def finish(panel: Run, qtbot: Any) -> None:
+def finish(panel, qtbot):
     qtbot.waitUntil(lambda: not panel.running, timeout=PATIENCE)
 
 
 @pytest.mark.parametrize("total", [None, 200])
-def test_a_run_seldom_makes_the_window_be_drawn(
-    panel: Run, window: Any, qtbot: Any, total: int | None
-) -> None:
+def test_a_run_seldom_makes_the_window_be_drawn(panel, window, qtbot, total):
     """Each composition of the canvas takes 20 ms of a core without a graphics card."""
     composed: list[str] = []  # the line of text at each composition
     canvas = window.window._qt_viewer.canvas.native
@@ -63,10 +60,8 @@ def test_a_run_seldom_makes_the_window_be_drawn(
     assert panel.bar.maximum() > 0
 
 
-def test_what_went_wrong_stays_until_the_next_run(
-    panel: Run, qtbot: Any, messages: list[str]
-) -> None:
-    def mistaken(*_: Any) -> None:
+def test_what_went_wrong_stays_until_the_next_run(panel, qtbot, messages):
+    def mistaken(*_):
         raise InputError("the film has no grain: expected some; take another one")
 
     panel.start(mistaken)
@@ -85,9 +80,7 @@ def test_what_went_wrong_stays_until_the_next_run(
     assert not status.isVisible()
 
 
-def test_docks_of_this_plugin_share_their_place_as_tabs(
-    window: Any, open_widget: Any, qtbot: Any
-) -> None:
+def test_docks_of_this_plugin_share_their_place_as_tabs(window, open_widget, qtbot):
     main = window.window._qt_window
     tools = [open_widget(name) for name in ("Invert", "Analyse", "Simulate")]
     docks = [next(d for d in main.findChildren(QDockWidget) if d.isAncestorOf(t)) for t in tools]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,7 @@ from qtpy.QtWidgets import QApplication
 from helpers.command_line import undrawn
 from helpers.forms import enter
 from helpers.jobs import run_job
-from napari_shadowinv import InputError, Instrument, InversionOptions, ProtonSetup, read
+from napari_shadowinv import InputError, Instrument, InversionOptions, read
 from napari_shadowinv._napari.form import StepsSection
 from napari_shadowinv._napari.layer_metadata import (
     frame_of,
@@ -39,7 +37,6 @@ from napari_shadowinv.preprocessing import (
     PolynomialEstimate,
     Recipe,
     Rotate,
-    Step,
     UniformEstimate,
 )
 from napari_shadowinv.provenance import Provenance
@@ -50,10 +47,10 @@ PATIENCE = 60_000  # ms
 
 
 @pytest.fixture
-def opened(opened: Callable[[Any], Any]) -> Callable[..., Any]:
+def opened(opened):
     """Make a widget of a class, with few sites."""
 
-    def make(kind: Any = Invert) -> Any:
+    def make(kind=Invert):
         widget = opened(kind)
         widget.options.restore({"n_sites": 300})
         return widget
@@ -62,19 +59,19 @@ def opened(opened: Callable[[Any], Any]) -> Callable[..., Any]:
 
 
 @pytest.fixture
-def shot_file(shot: Array, tmp_path: Path) -> Path:
+def shot_file(shot, tmp_path):
     np.save(tmp_path / "shot.npy", shot)
     return tmp_path / "shot.npy"
 
 
 @pytest.fixture
-def image(viewer: ViewerModel, shot_file: Path) -> Any:
+def image(viewer, shot_file):
     """The shot as a layer, read from its file."""
     (layer,) = viewer.open(str(shot_file), plugin="napari")
     return layer
 
 
-def by_command(*arguments: Any) -> None:
+def by_command(*arguments):
     done = undrawn(*arguments)
     assert done.exit_code == 0, done.output
 
@@ -82,7 +79,7 @@ def by_command(*arguments: Any) -> None:
 # The list of steps
 
 
-def test_steps_are_added_moved_and_removed(qtbot: Any) -> None:
+def test_steps_are_added_moved_and_removed(qtbot):
     section = StepsSection()
     qtbot.addWidget(section)
     changes: list[None] = []
@@ -114,7 +111,7 @@ def test_steps_are_added_moved_and_removed(qtbot: Any) -> None:
     assert section.steps() == (Bin(factor=2),)
 
 
-def test_a_range_that_is_none_is_refused_where_it_is_typed(qtbot: Any) -> None:
+def test_a_range_that_is_none_is_refused_where_it_is_typed(qtbot):
     section = StepsSection()
     qtbot.addWidget(section)
     rows = section.add("crop").form.entries["y"]
@@ -149,9 +146,7 @@ PLACED = {
         (Rotate(angle=90), Crop(y=(3, None)), Bin(factor=2), Rotate(angle=-25)),
     ],
 )
-def test_a_result_lies_on_its_image_after_all_steps(
-    viewer: ViewerModel, steps: tuple[Step, ...], place: str
-) -> None:
+def test_a_result_lies_on_its_image_after_all_steps(viewer, steps, place):
     image = viewer.add_image(np.ones((48, 60)), **PLACED[place])
     recipe = Recipe(steps=steps)
     matrix = recipe.matrix((48, 60))
@@ -166,8 +161,8 @@ def test_a_result_lies_on_its_image_after_all_steps(
 
 
 def test_a_result_of_larger_pixels_is_in_the_units_of_these(
-    viewer: ViewerModel, opened: Any, run: Any, image: Any, shot: Array, proton_setup: ProtonSetup
-) -> None:
+    viewer, opened, run, image, shot, proton_setup
+):
     tool = opened()
     tool.setup.show_setup(proton_setup.model_dump())
     tool.steps.show_steps((Bin(factor=2),))
@@ -190,9 +185,8 @@ STEPS_FIRST = (Crop(y=(4, 44), x=(10, 58)), HotPixelFilter(threshold=9.0), Bin(f
 
 
 def test_the_command_does_what_the_window_saves(
-    viewer: ViewerModel, opened: Any, run: Any, image: Any, shot_file: Path, tmp_path: Path,
-    proton_setup: ProtonSetup,
-) -> None:  # fmt: skip
+    viewer, opened, run, image, shot_file, tmp_path, proton_setup
+):
     tool = opened()
     tool._draw_crop()
     tool.crop.layer.add_rectangles(np.array([[4, 10], [4, 57], [43, 57], [43, 10]]))
@@ -225,9 +219,7 @@ def test_the_command_does_what_the_window_saves(
     np.testing.assert_array_equal(*pixels)
 
 
-def test_copied_python_makes_the_same_result(
-    viewer: ViewerModel, opened: Any, run: Any, image: Any, proton_setup: ProtonSetup
-) -> None:
+def test_copied_python_makes_the_same_result(viewer, opened, run, image, proton_setup):
     clipboard = QApplication.clipboard()
     clipboard.setText("")
     tool = opened()
@@ -254,9 +246,8 @@ def test_copied_python_makes_the_same_result(
 
 
 def test_the_selected_result_is_repeated_from_its_files(
-    viewer: ViewerModel, opened: Any, image: Any, shot_file: Path, run: Any, qtbot: Any,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    viewer, opened, image, shot_file, run, qtbot, monkeypatch
+):
     said: list[str] = []
     monkeypatch.setattr(_files, "show_info", said.append)
     tool = opened(Invert)
@@ -282,9 +273,8 @@ def test_the_selected_result_is_repeated_from_its_files(
 
 
 def test_the_window_does_what_the_command_saves(
-    viewer: ViewerModel, opened: Any, image: Any, shot: Array, shot_file: Path, tmp_path: Path,
-    proton_setup: ProtonSetup,
-) -> None:  # fmt: skip
+    viewer, opened, image, shot, shot_file, tmp_path, proton_setup
+):
     np.save(tmp_path / "beam.npy", 300 + 20 * np.linspace(0, 1, shot.shape[1]) + 0 * shot)
     (tmp_path / "setup.toml").write_text(
         'kind = "proton"\nenergy = 14.7\nsource_object_distance = 0.01\n'
@@ -311,9 +301,7 @@ def test_the_window_does_what_the_command_saves(
     assert mine.provenance.image.source.shape == shot.shape
 
 
-def test_a_recipe_comes_back_from_its_file(
-    viewer: ViewerModel, opened: Any, image: Any, shot: Array, tmp_path: Path
-) -> None:
+def test_a_recipe_comes_back_from_its_file(viewer, opened, image, shot, tmp_path):
     tool = opened()
     recipe = Recipe(
         steps=(Bin(factor=2), Crop(x=(3, None)), Rotate(angle=-7.5)),
@@ -336,8 +324,8 @@ def test_a_recipe_comes_back_from_its_file(
 
 
 def test_a_source_that_is_no_file_is_written_beside_the_recipe(
-    viewer: ViewerModel, opened: Any, image: Any, shot: Array, shot_file: Path, tmp_path: Path
-) -> None:
+    viewer, opened, image, shot, shot_file, tmp_path
+):
     beam = 300 + np.random.default_rng(0).random(shot.shape)
     tool = opened()
     tool.source.layer = viewer.add_image(beam, name="beam", metadata=metadata_for("source", ""))
@@ -350,9 +338,7 @@ def test_a_source_that_is_no_file_is_written_beside_the_recipe(
     np.testing.assert_array_equal(inversion.displacement, reloaded.displacement)
 
 
-def test_a_stack_is_inverted_by_a_saved_recipe(
-    viewer: ViewerModel, opened: Any, shot: Array, tmp_path: Path, qtbot: Any
-) -> None:
+def test_a_stack_is_inverted_by_a_saved_recipe(viewer, opened, shot, tmp_path, qtbot):
     usable = np.ones(shot.shape, bool)
     usable[:4, :6] = False
     recipe = Recipe(steps=(Crop(y=(2, 46)), Bin(factor=2)), mask=tmp_path / "mask.png", options=FEW)
@@ -383,8 +369,8 @@ def test_a_stack_is_inverted_by_a_saved_recipe(
 
 
 def test_what_cannot_be_loaded_or_saved_is_one_sentence_and_changes_nothing(
-    viewer: ViewerModel, opened: Any, image: Any, tmp_path: Path, messages: list[str]
-) -> None:
+    viewer, opened, image, tmp_path, messages
+):
     tool = opened()
     tool.steps.add("bin")
     before, layers = tool.recipe(), list(viewer.layers)
@@ -420,7 +406,7 @@ def test_what_cannot_be_loaded_or_saved_is_one_sentence_and_changes_nothing(
     assert (tmp_path / "new_mask.png").read_text() == "somebody's"
 
 
-def test_the_menu_asks_for_a_file(opened: Any, image: Any, tmp_path: Path, choose: Any) -> None:
+def test_the_menu_asks_for_a_file(opened, image, tmp_path, choose):
     choose(tmp_path / "how.toml")
     tool = opened()
     load, save, *_ = tool.recipes.menu().actions()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from types import SimpleNamespace
-from typing import Any
 
 from napari_shadowinv._napari.run import Outcome, Run
 
@@ -13,7 +12,7 @@ from napari_shadowinv._napari.run import Outcome, Run
 class Heard(Run):
     """A button that remembers how its work ended."""
 
-    def __init__(self, qtbot: Any) -> None:
+    def __init__(self, qtbot):
         super().__init__("Run", "")
         qtbot.addWidget(self)
         self.outcomes: list[Outcome] = []
@@ -23,18 +22,18 @@ class Heard(Run):
 class Stubborn:
     """Work that checks whether to stop only when allowed to."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.may_look = threading.Event()
         self.stopped = threading.Event()
 
-    def __call__(self, on_progress: Any, should_stop: Any) -> str:
+    def __call__(self, on_progress, should_stop):
         self.may_look.wait(30)
         if should_stop():
             self.stopped.set()
         return "late"
 
 
-def test_work_that_does_not_stop_is_left_alone(qtbot: Any) -> None:
+def test_work_that_does_not_stop_is_left_alone(qtbot):
     panel = Heard(qtbot)
     work = Stubborn()
     panel.start(work, tag="first")
@@ -50,7 +49,7 @@ def test_work_that_does_not_stop_is_left_alone(qtbot: Any) -> None:
     assert panel.outcomes[1:] == [Outcome("next", tag="second")]
 
 
-def test_work_that_must_be_finished_is_waited_for(qtbot: Any) -> None:
+def test_work_that_must_be_finished_is_waited_for(qtbot):
     panel = Heard(qtbot)
     work, job = Stubborn(), SimpleNamespace(patience=math.inf)
     panel.start(work, job)

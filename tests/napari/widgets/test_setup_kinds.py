@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from napari_shadowinv._napari.widgets._image_table import ImageTable, beam_column
 from napari_shadowinv._napari.widgets._inputs import SetupPicker, fields_of
 
 
-def test_form_reads_a_new_kind(xray_setup: Any, qtbot: Any) -> None:
+def test_form_reads_a_new_kind(xray_setup, qtbot):
     picker = SetupPicker()
     qtbot.addWidget(picker)
     soft = xray_setup.example()
@@ -19,12 +17,12 @@ def test_form_reads_a_new_kind(xray_setup: Any, qtbot: Any) -> None:
     assert picker.setup() == soft
 
 
-def test_fields_to_fit_are_those_of_a_new_kind(xray_setup: Any) -> None:
+def test_fields_to_fit_are_those_of_a_new_kind(xray_setup):
     assert fields_of("x-ray") == {"electrons": ("electron density (phase ∝ λ²)", None)}
     assert beam_column("x-ray").heading == "Energy (keV)"
 
 
-def test_table_of_images_has_the_quantity_of_a_new_kind(xray_setup: Any, qtbot: Any) -> None:
+def test_table_of_images_has_the_quantity_of_a_new_kind(xray_setup, qtbot):
     from napari.components import ViewerModel
 
     viewer = ViewerModel()

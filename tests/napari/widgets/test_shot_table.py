@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -24,12 +20,12 @@ SETUP = ProtonSetup(
 ENERGIES = (6.0, 14.7, 30.0)
 
 
-def at(energy: float) -> ProtonSetup:
+def at(energy):
     return SETUP.model_copy(update={"energy": energy})
 
 
 @pytest.fixture
-def pack(tmp_path: Path) -> Path:
+def pack(tmp_path):
     """One toroid on three films, and a table that leaves the last one out."""
     for number, energy in enumerate(ENERGIES):
         displacement = toroid(SHAPE, at(energy), 25.0, 80e-6).displacement
@@ -40,7 +36,7 @@ def pack(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def tool(window: Any, open_widget: Callable[[str], Any], pack: Path) -> Any:
+def tool(window, open_widget, pack):
     tool = open_widget("Invert")
     tool.options.restore({"tolerance": 1e-3})
     tool.store.run.restore({"workers": 1})
@@ -51,7 +47,7 @@ def tool(window: Any, open_widget: Callable[[str], Any], pack: Path) -> Any:
     return tool
 
 
-def run(tool: Any, qtbot: Any) -> StackStore:
+def run(tool, qtbot):
     tool.panel.button.click()
     qtbot.waitUntil(
         lambda: not (tool.panel.running or tool.stack_view.busy),
@@ -60,7 +56,7 @@ def run(tool: Any, qtbot: Any) -> StackStore:
     return StackStore(tool.store.path)
 
 
-def test_a_table_is_inverted(window: Any, tool: Any, qtbot: Any, messages: list[str]) -> None:
+def test_a_table_is_inverted(window, tool, qtbot, messages):
     store = run(tool, qtbot)
     assert messages == []
     assert store.names == ("film0.npy", "film1.npy")
@@ -79,8 +75,8 @@ def test_a_table_is_inverted(window: Any, tool: Any, qtbot: Any, messages: list[
     np.testing.assert_allclose(second / second.max(), in_si / in_si.max(), atol=1e-6)
 
 
-def test_mistakes_are_told(tool: Any, qtbot: Any, messages: list[str], pack: Path) -> None:
-    def expect(words: str) -> None:
+def test_mistakes_are_told(tool, qtbot, messages, pack):
+    def expect(words):
         before = len(messages)
         tool.panel.button.click()
         qtbot.waitUntil(lambda: not tool.panel.running, timeout=60_000)

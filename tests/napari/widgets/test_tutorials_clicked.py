@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,27 +20,26 @@ from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets._panels import ReportView
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE
-from simulated_pack import Truth
 
 PAGES = Path(__file__).parents[3] / "docs" / "tutorials"
 PLUGIN = "Shadowinv"
 PATIENCE_MS = 300_000
 
 
-def page(name: str) -> str:
+def page(name):
     return (PAGES / name).read_text(encoding="utf-8")
 
 
-def plain(text: str) -> str:
+def plain(text):
     """The text of a menu's entry or a button without its marks."""
     return re.sub(r"[&…]|\.\.\.", "", text).strip()
 
 
 @pytest.fixture
-def choose(window: Any, qtbot: Any) -> Callable[[str], None]:
+def choose(window, qtbot):
     """Choose an entry of napari's menus, written as on the pages."""
 
-    def trigger(path: str) -> None:
+    def trigger(path):
         owner: Any = window.window._qt_window.menuBar()
         *menus, entry = (plain(part) for part in path.split(">"))
         for name in menus:
@@ -61,10 +59,10 @@ def choose(window: Any, qtbot: Any) -> Callable[[str], None]:
 
 
 @pytest.fixture
-def press(qtbot: Any) -> Callable[[Any, str], None]:
+def press(qtbot):
     """Press the visible button of a widget that has this text."""
 
-    def click(tool: Any, text: str) -> None:
+    def click(tool, text):
         (button,) = [
             button
             for button in tool.findChildren(QtWidgets.QAbstractButton)
@@ -78,17 +76,17 @@ def press(qtbot: Any) -> Callable[[Any, str], None]:
 
 
 @pytest.fixture
-def answer_dialogs(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], None]:
+def answer_dialogs(monkeypatch):
     """Answer all dialogs that ask for a file with this path."""
 
-    def answer(path: Path) -> None:
+    def answer(path):
         for name in ("getSaveFileName", "getOpenFileName"):
             monkeypatch.setattr(QtWidgets.QFileDialog, name, lambda *_, **__: (str(path), ""))
 
     return answer
 
 
-def tool_of(window: Any, title: str) -> Any:
+def tool_of(window, title):
     """The widget that a menu has opened."""
     (tool,) = [
         dock.widget()
@@ -98,7 +96,7 @@ def tool_of(window: Any, title: str) -> Any:
     return tool
 
 
-def select(tool: Any, text: str, label: str = "") -> None:
+def select(tool, text, label=""):
     """Choose an entry of the one list that offers it, or of the list with this label."""
     (box,) = [
         box
@@ -111,14 +109,14 @@ def select(tool: Any, text: str, label: str = "") -> None:
     box.activated.emit(box.currentIndex())
 
 
-def labels_beside(box: Any) -> set[str]:
+def labels_beside(box):
     """Texts of the labels in the same row."""
     direct = Qt.FindChildOption.FindDirectChildrenOnly
     labels = box.parentWidget().findChildren(QtWidgets.QLabel, options=direct)
     return {label.text() for label in labels}
 
 
-def editor_of(tool: Any, title: str) -> Any:
+def editor_of(tool, title):
     """The editor beside a label of the form that is shown."""
     for form in tool.findChildren(QtWidgets.QFormLayout):
         for row in range(form.rowCount()):
@@ -130,14 +128,14 @@ def editor_of(tool: Any, title: str) -> Any:
     raise AssertionError(f"no field {title!r}")
 
 
-def enter(tool: Any, title: str, text: str) -> None:
+def enter(tool, title, text):
     """Type a value, such as "1.3 mm", and leave the field."""
     line = editor_of(tool, title)
     line.setText(text)
     line.editingFinished.emit()
 
 
-def check(tool: Any, text: str) -> None:
+def check(tool, text):
     """Check the visible box with this text."""
     (box,) = [
         box
@@ -148,36 +146,29 @@ def check(tool: Any, text: str) -> None:
     assert box.isChecked()
 
 
-def wait_for_layers(tool: Any, qtbot: Any) -> None:
+def wait_for_layers(tool, qtbot):
     """Wait until a run has ended and its layers are there; the Run button stands there again."""
     qtbot.waitUntil(lambda: tool.panel.button.text() == "Run", timeout=PATIENCE_MS)
     qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE_MS)
     qtbot.wait(50)
 
 
-def layer_of(window: Any, role: str) -> Any:
+def layer_of(window, role):
     """Return the topmost layer with a role."""
     return [layer for layer in window.layers if role_of(layer) == role][-1]
 
 
-def overlay_text(window: Any) -> str:
+def overlay_text(window):
     """The text in the corner of the canvas."""
     return str(_text_overlay(window).text)
 
 
-def report_of(tool: Any) -> str:
+def report_of(tool):
     reports = tool.findChildren(ReportView)
     return "\n".join(f"{title} {text}" for report in reports for title, text in report.rows)
 
 
-def save_reload(
-    window: Any,
-    tool: Any,
-    path: Path,
-    press: Any,
-    answer_dialogs: Any,
-    button: str = "Save result…",
-) -> None:
+def save_reload(window, tool, path, press, answer_dialogs, button="Save result…"):
     """Save the result, close everything and open the file."""
     answer_dialogs(path)
     press(tool, button)
@@ -187,8 +178,8 @@ def save_reload(
 
 
 def test_first_shadowgram_is_clicked_to_its_end(
-    window: Any, choose: Any, press: Any, answer_dialogs: Any, qtbot: Any, tmp_path: Path
-) -> None:
+    window, choose, press, answer_dialogs, qtbot, tmp_path
+):
     text = page("first-shadowgram.md")
     choose(f"File > Open Sample > {PLUGIN} > Toroidal field below caustics")
     assert [layer.name for layer in window.layers if layer.visible] == ["toroid"]
@@ -241,14 +232,8 @@ def test_first_shadowgram_is_clicked_to_its_end(
 
 
 def test_proton_radiograph_is_clicked_to_its_end(
-    window: Any,
-    choose: Any,
-    press: Any,
-    answer_dialogs: Any,
-    qtbot: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    window, choose, press, answer_dialogs, qtbot, tmp_path, monkeypatch
+):
     text = page("proton-radiograph.md")
     monkeypatch.chdir(tmp_path)
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
@@ -294,9 +279,7 @@ def test_proton_radiograph_is_clicked_to_its_end(
     assert float(layer_of(window, "field").data.max()) == pytest.approx(peak, abs=0.06)
 
 
-def test_no_reference_is_clicked_to_its_end(
-    window: Any, choose: Any, press: Any, answer_dialogs: Any, qtbot: Any, tmp_path: Path
-) -> None:
+def test_no_reference_is_clicked_to_its_end(window, choose, press, answer_dialogs, qtbot, tmp_path):
     rows = re.findall(
         r"^\| ([a-z].*?) \| ([\d.]+) \| \d+ \| [\d.]+ \|", page("no-reference.md"), re.M
     )
@@ -339,14 +322,8 @@ def test_no_reference_is_clicked_to_its_end(
 
 
 def test_two_energies_are_clicked_to_their_end(
-    window: Any,
-    choose: Any,
-    press: Any,
-    answer_dialogs: Any,
-    qtbot: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    window, choose, press, answer_dialogs, qtbot, tmp_path, monkeypatch
+):
     text = page("two-energies.md")
     monkeypatch.setattr(_panels, "_REDRAW_MS", PATIENCE_MS)  # the curve once, at the end
     choose(f"File > Open Sample > {PLUGIN} > Two energies, beam not recorded")
@@ -382,17 +359,11 @@ def test_two_energies_are_clicked_to_their_end(
 
 
 def test_film_pack_is_clicked_to_its_end(
-    window: Any,
-    choose: Any,
-    press: Any,
-    answer_dialogs: Any,
-    qtbot: Any,
-    tmp_path: Path,
-    film_pack: Truth,
-) -> None:
+    window, choose, press, answer_dialogs, qtbot, tmp_path, film_pack
+):
     """With three simulated films instead of the real ones."""
 
-    def wait() -> None:
+    def wait():
         qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE_MS)
         busy = (tool.results, tool.fit_images)
         qtbot.waitUntil(lambda: not any(layers.busy for layers in busy), timeout=PATIENCE_MS)
@@ -441,14 +412,7 @@ def test_film_pack_is_clicked_to_its_end(
     np.testing.assert_array_equal(np.asarray(layer_of(window, "fluence").data), values)
 
 
-def test_stack_is_clicked_to_its_end(
-    window: Any,
-    choose: Any,
-    press: Any,
-    qtbot: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_stack_is_clicked_to_its_end(window, choose, press, qtbot, tmp_path, monkeypatch):
     text = page("stack.md")
     monkeypatch.chdir(tmp_path)
     choose(f"File > Open Sample > {PLUGIN} > Plasma wave, 20 optical shots")
@@ -477,13 +441,8 @@ def test_stack_is_clicked_to_its_end(
 
 
 def test_film_without_reference_is_clicked_to_its_verdict(
-    window: Any,
-    choose: Any,
-    press: Any,
-    qtbot: Any,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    window, choose, press, qtbot, tmp_path, monkeypatch
+):
     text = page("film-without-reference.md")
     monkeypatch.chdir(tmp_path)
     block = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -20,24 +17,24 @@ PATIENCE = 60_000  # ms
 SHAPE = (24, 28)
 
 
-def put(folder: Path, index: int) -> None:
+def put(folder, index):
     blob = gaussian_blob(SHAPE, 2.0 + index, 4.0, (10, 12 + index))
     np.save(folder / f"shot_{index}.npy", 100 * synthetic_image(blob.displacement))
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     (tmp_path / "live").mkdir()
     return tmp_path / "live"
 
 
 @pytest.fixture
-def out(tmp_path: Path) -> Path:
+def out(tmp_path):
     return tmp_path / "live.shadowinv.zarr"
 
 
 @pytest.fixture
-def tool(open_widget: Any, folder: Path, out: Path) -> Any:
+def tool(open_widget, folder, out):
     tool = open_widget("Invert")
     tool.options.restore({"n_sites": 100})
     tool.image.set_kind("folder")
@@ -48,12 +45,12 @@ def tool(open_widget: Any, folder: Path, out: Path) -> Any:
 
 
 def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
-    window: Any, tool: Any, folder: Path, out: Path, qtbot: Any, messages: list[str]
-) -> None:
-    def shown(count: int) -> Any:
+    window, tool, folder, out, qtbot, messages
+):
+    def shown(count):
         """Wait until the field has this many shots, and return it."""
 
-        def is_there() -> bool:
+        def is_there():
             roles = [role_of(layer) for layer in window.layers]
             return "field" in roles and len(layer_of(window, "field").data) == count
 
@@ -104,8 +101,8 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
 
 
 def test_it_fits_and_a_refused_watch_has_its_reason_under_the_button(
-    tool: Any, qtbot: Any, messages: list[str], assert_it_fits: Any, tmp_path: Path, out: Path
-) -> None:
+    tool, qtbot, messages, assert_it_fits, tmp_path, out
+):
     assert_it_fits(tool)
     (tmp_path / "notes.txt").write_text("no folder")
     reasons = {
