@@ -8,6 +8,7 @@ import pytest
 from napari_shadowinv.analysis.paths import (
     Profile,
     interpolate,
+    measure_peak,
     sample_path,
     sample_strip,
     table_text,
@@ -81,3 +82,24 @@ def test_the_table_tells_what_is_averaged() -> None:
     assert table_text(np.zeros(1), "µm", [profile]).splitlines()[0] == (
         'distance (µm),"height (nm), mean over 5 px"'
     )
+
+
+def test_measures_of_a_gaussian_are_those_of_its_formula() -> None:
+    distance = np.linspace(0.0, 100.0, 4001)
+    measures = measure_peak(distance, -3.0 * np.exp(-((distance - 40) ** 2) / (2 * 5.0**2)))
+    assert measures is not None
+    assert (measures.peak, measures.position) == (-3.0, 40.0)
+    assert measures.width == pytest.approx(5 * np.sqrt(8 * np.log(2)), rel=1e-3)
+    assert measures.area == pytest.approx(-3 * 5 * np.sqrt(2 * np.pi), rel=1e-6)
+    assert "width (FWHM) 11.77 µm, area -37.6 T·µm" in measures.text("T", "µm")
+
+
+def test_width_beyond_the_line_is_told_as_such() -> None:
+    distance = np.linspace(0.0, 10.0, 11)
+    values = np.where(distance > 8, np.nan, 5.0 - 0.1 * distance)
+    measures = measure_peak(distance, values)
+    assert measures is not None
+    assert np.isnan(measures.width)
+    assert measures.area == pytest.approx(8 * 4.6)
+    assert "width (FWHM) beyond the line" in measures.text("T", "µm")
+    assert measure_peak(distance, np.full(11, np.nan)) is None

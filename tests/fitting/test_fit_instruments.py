@@ -14,12 +14,14 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.facts import Verdict
 from napari_shadowinv.fitting import Fit, fit
+from napari_shadowinv.fitting.rays import RayModel
 from napari_shadowinv.options import FitOptions, Instrument
 from napari_shadowinv.shot import Shot, shots_of
 
 SIZE = (48, 56)
 STRENGTHS = [1, 0.6]
 NOISE = 0.03
+STAGES = ("from near", "transport", "smoothness", "full size", "samples")
 RING = bump(3.0, 5.5, (23, 29), tall=1.2)
 
 
@@ -270,12 +272,38 @@ def test_a_fit_ends_at_once_when_asked(shots: list[FloatArray], after: int) -> N
     assert calls == after
 
 
+@pytest.mark.parametrize("stage", STAGES)
+def test_each_stage_of_a_fit_ends_soon_after_it_is_asked(
+    shots: list[FloatArray], stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached: list[str] = []
+    traced: list[int] = []
+    trace = RayModel.image
+
+    def count(*args: Any, **keywords: Any) -> Any:
+        if stage in reached:
+            traced.append(1)
+        return trace(*args, **keywords)
+
+    monkeypatch.setattr(RayModel, "image", count)
+    options = FitOptions(samples=2, max_iterations=10, spacing=0.25, threads=1)
+    with pytest.raises(InversionCancelled):
+        fit(
+            shots_of(noisy(shots, NOISE), strength=STRENGTHS, noise=NOISE),
+            options=options,
+            on_progress=lambda news: reached.append(news.message),
+            should_stop=lambda: stage in reached,
+        )
+    assert reached[-1] == stage
+    assert len(traced) <= 8 * len(shots)  # a line search of the step under way
+
+
 def test_each_step_is_told_with_its_stage_and_objective() -> None:
     reports: list[Progress] = []
     image = noisy([counted(bump(0.4, 7, (23, 29)), SIZE)], NOISE)
     options = FitOptions(samples=2, max_iterations=10, spacing=0.25, threads=1)
     fit(shots_of(image, noise=NOISE), options=options, on_progress=reports.append)
-    for stage in ("from near", "transport", "smoothness", "full size", "samples"):
+    for stage in STAGES:
         objectives = [news.objective for news in reports if news.message == stage]
         assert objectives
         assert all(isinstance(value, float) for value in objectives)

@@ -1,12 +1,9 @@
 """Tests of the plugin need napari; those with a window also a display."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -107,7 +104,7 @@ def messages(monkeypatch):
     """The texts of napari's notifications."""
     from napari.utils import notifications
 
-    texts: list[str] = []
+    texts = []
     monkeypatch.setattr(
         notifications.notification_manager,
         "dispatch",
@@ -122,8 +119,8 @@ def in_loop(qtbot):
     from qtpy.QtCore import QTimer
 
     def call(function, *args):
-        answers: list[Any] = []
-        errors: list[Exception] = []
+        answers = []
+        errors = []
 
         def answer():
             try:

@@ -1,7 +1,5 @@
 """One-click commands of the layer menus."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -9,12 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.shifted_pair import shifted_pair
-from napari_shadowinv import (
-    InputError,
-    InversionOptions,
-    add_to_viewer,
-    invert,
-)
+from napari_shadowinv import InputError, InversionOptions, add_to_viewer, invert
 from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
@@ -63,16 +56,13 @@ def test_the_shot_that_is_shown_is_taken_of_a_stack(viewer, shot):
     assert keywords["name"] == "shot 1 high-pass σ=4.8 px"
 
 
-def test_hot_pixels_are_replaced_and_counted(viewer, noisy):
-    ((data, keywords, _),) = commands.remove_hot_pixels(add_shot(viewer, noisy))
+def test_filters_take_hot_pixels_and_slopes(viewer, noisy):
+    layer = add_shot(viewer, noisy)
+    ((data, keywords, _),) = commands.remove_hot_pixels(layer)
     assert keywords["name"] == "shot without 1 hot or dead pixels"
     assert data[10, 20] < 700
-    changed = data != noisy
-    assert changed.sum() == 1
-
-
-def test_high_pass_takes_the_slope_and_keeps_the_mean(viewer, noisy):
-    ((data, _, _),) = commands.high_pass(add_shot(viewer, noisy))
+    assert (data != noisy).sum() == 1
+    ((data, _, _),) = commands.high_pass(layer)
     assert data.mean() == pytest.approx(noisy.mean())
     slope = data[:, -10:].mean() - data[:, :10].mean()
     assert abs(slope) < 60  # 167 before
@@ -87,23 +77,23 @@ def test_the_estimate_is_a_source_of_the_same_flux(viewer, shot, proton_setup):
     assert data.std() < 0.5 * shot.std()
 
 
-@pytest.mark.parametrize(
-    "command", [commands.invert_uniform, commands.high_pass, commands.estimate_source]
-)
-def test_a_wrong_layer_is_one_sentence(viewer, command):
-    with pytest.raises(InputError, match="no layer is selected: select an image"):
-        command(None)
-    with pytest.raises(InputError, match="'Points' is of type Points: select a grey image"):
-        command(viewer.add_points(np.zeros((2, 2))))
-    with pytest.raises(InputError, match="'colours' is a colour image: select a grey image"):
-        command(viewer.add_image(np.zeros((5, 6, 3)), rgb=True, name="colours"))
-
-
-def test_what_shows_no_inversion_is_not_refined(viewer, shot):
-    with pytest.raises(InputError, match="no layer is selected: select a layer of an inversion"):
-        commands.refine(None)
-    with pytest.raises(InputError, match="'shot' shows no result: select a layer of an inversion"):
-        commands.refine(add_shot(viewer, shot))
+def test_a_wrong_layer_is_one_sentence(viewer, shot):
+    points = viewer.add_points(np.zeros((2, 2)))
+    colours = viewer.add_image(np.zeros((5, 6, 3)), rgb=True, name="colours")
+    grey = {
+        None: "no layer is selected: select an image",
+        points: "'Points' is of type Points: select a grey image",
+        colours: "'colours' is a colour image: select a grey image",
+    }
+    inversion = {
+        None: "no layer is selected: select a layer of an inversion",
+        add_shot(viewer, shot): "'shot' shows no result: select a layer of an inversion",
+    }
+    takes_grey = commands.invert_uniform, commands.high_pass, commands.estimate_source
+    for command, refusals in (*((each, grey) for each in takes_grey), (commands.refine, inversion)):
+        for layer, words in refusals.items():
+            with pytest.raises(InputError, match=words):
+                command(layer)
 
 
 def test_an_inversion_is_refined_from_any_of_its_layers(viewer, shot, proton_setup):

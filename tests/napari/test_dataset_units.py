@@ -1,7 +1,5 @@
 """Variables of a result given to napari as they are: napari takes scale and units from them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pint
 import pytest

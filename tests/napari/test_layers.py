@@ -1,22 +1,33 @@
 """Layers of a result: content, placement, and the order in which they appear."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from helpers.layers import by_role
-from napari_shadowinv import add_to_viewer
+from helpers.fits import FIELDS, SETUPS, SHAPE, WHY
+from helpers.layers import by_role, in_its_unit
+from napari_shadowinv import add_to_viewer, write
 from napari_shadowinv._napari.layer_metadata import (
+    Frame,
+    Result,
+    displacement_of,
+    layer_key,
     result_of,
     role_of,
     setup_of,
     unit_of,
 )
-from napari_shadowinv._napari.layers import direction_colours, inversion_layers, sample_arrows
+from napari_shadowinv._napari.layers import (
+    add_layers,
+    direction_colours,
+    fit_layers,
+    inversion_layers,
+    sample_arrows,
+)
+from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv.cautions import Caution
+from napari_shadowinv.facts import Assessment, Verdict
 
 
 def test_all_of_a_result_is_there_on_request(viewer, solved, proton_setup):
@@ -37,10 +48,8 @@ def test_values_are_those_of_the_result_in_the_unit_that_the_layer_names(
 ):
     layers = by_role(add_to_viewer(viewer, solved, proton_setup, all_layers=True))
     field = proton_setup.path_integrated_b(solved.displacement)
-    factor = {"mT·m": 1e3, "µT·m": 1e6, "T·m": 1.0}[unit_of(layers["field"])]
-    np.testing.assert_allclose(layers["field"].data, factor * np.hypot(*field))
-    np.testing.assert_allclose(layers["field y"].data, factor * field[0])
-    np.testing.assert_allclose(layers["field x"].data, factor * field[1])
+    for role, values in (("field", np.hypot(*field)), ("field y", field[0]), ("field x", field[1])):
+        np.testing.assert_allclose(layers[role].data, in_its_unit(layers["field"], values))
     metres = {"m": 1.0, "mm": 1e3, "µm": 1e6, "nm": 1e9}[unit_of(layers["potential"])]
     np.testing.assert_allclose(
         layers["potential"].data, metres * proton_setup.potential(solved.potential)
@@ -51,6 +60,9 @@ def test_values_are_those_of_the_result_in_the_unit_that_the_layer_names(
     np.testing.assert_array_equal(layers["reprojection"].data, solved.reprojection)
     np.testing.assert_array_equal(layers["caustic"].data > 0, solved.caustic)
     np.testing.assert_array_equal(layers["sites"].data, solved.cells.sites)
+    # They share the arrays of the result.
+    assert np.shares_memory(layers["reprojection"].data, solved.reprojection)
+    assert np.shares_memory(layers["sites"].data, solved.cells.sites)
 
 
 def test_light_shows_the_deflection_angle(viewer, solved, optical_setup):
@@ -70,32 +82,30 @@ def test_signed_layers_have_symmetric_limits_and_a_white_middle(viewer, solved):
     assert layers["field"].contrast_limits[0] == 0
 
 
-def test_pixels_are_lengths_at_the_object(viewer, solved, proton_setup):
-    for layer in add_to_viewer(viewer, solved, proton_setup):
+def test_pixels_are_lengths_at_the_object_or_pixels(viewer, solved, proton_setup):
+    for layer in add_to_viewer(viewer, solved):
+        assert {str(unit) for unit in layer.units} == {"pixel"}
+        np.testing.assert_array_equal(layer.scale, 1)
+    viewer.layers.clear()
+    for layer in add_to_viewer(viewer, solved, proton_setup, origins={"Setup": "typed"}):
         np.testing.assert_allclose(layer.scale, 1.5)
         assert {str(unit) for unit in layer.units} == {"micrometer"}
         assert layer.axis_labels == ("y", "x")
         assert setup_of(layer) == proton_setup
+        # Each knows the whole result.
+        result = result_of(layer)
+        assert result.content.cells is solved.cells
+        assert result.content.setup == proton_setup
+        assert result.origins == {"Setup": "typed"}
     # The centre of pixel (0, 0) is at the origin, for images as for sites.
     height, width = solved.potential.shape
-    np.testing.assert_allclose(
-        viewer.layers[0].extent.world, [[0, 0], [1.5 * (height - 1), 1.5 * (width - 1)]]
-    )
+    corners = [[0, 0], [1.5 * (height - 1), 1.5 * (width - 1)]]
+    np.testing.assert_allclose(viewer.layers[0].extent.world, corners)
     assert {tuple(layer.translate) for layer in viewer.layers} == {(0.0, 0.0)}
-
-
-def test_without_a_setup_lengths_are_pixels(viewer, solved):
-    for layer in add_to_viewer(viewer, solved):
-        assert {str(unit) for unit in layer.units} == {"pixel"}
-        np.testing.assert_array_equal(layer.scale, 1)
-
-
-def test_a_binned_crop_lies_on_its_original(solved, proton_setup):
-    layers = inversion_layers(
-        solved, proton_setup, scale=(3.0, 3.0), translate=(7.5, 9.0), units=("um", "um")
-    )
-    for _, keywords, _ in layers:
-        assert (keywords["scale"], keywords["translate"]) == ((3.0, 3.0), (7.5, 9.0))
+    # A binned crop lies on its original.
+    place = {"scale": (3.0, 3.0), "translate": (7.5, 9.0), "units": ("um", "um")}
+    for _, keywords, _ in inversion_layers(solved, proton_setup, **place):
+        assert {name: keywords[name] for name in place} == place
 
 
 def test_arrows_are_true_displacements_on_a_grid_that_can_be_read(viewer, solved):
@@ -107,6 +117,13 @@ def test_arrows_are_true_displacements_on_a_grid_that_can_be_read(viewer, solved
     lengths = arrows.length * np.hypot(*steps.T) / spacing
     assert np.percentile(lengths, 94) < 1
     assert 0.9 < lengths.max() < 2
+    # No field makes no arrow.
+    names = ("displacement", "potential", "residual")
+    zeros = {name: np.zeros_like(getattr(solved, name)) for name in names}
+    cells = replace(solved.cells, displacement=np.zeros_like(solved.cells.displacement))
+    layers = by_role(add_to_viewer(viewer, replace(solved, **zeros, cells=cells)))
+    assert len(layers["arrows"].data) == 0
+    assert layers["field"].contrast_limits == [0, 1]
 
 
 def test_hue_is_the_direction_and_brightness_the_length():
@@ -129,52 +146,25 @@ def test_about_twenty_arrows_lie_along_the_longer_side(shape):
     assert len(np.unique(data[:, 0, int(np.argmax(shape))])) >= 15
 
 
-def test_no_field_makes_no_arrow(viewer, solved):
-    still = replace(
-        solved,
-        displacement=np.zeros_like(solved.displacement),
-        potential=np.zeros_like(solved.potential),
-        residual=np.zeros_like(solved.residual),
-        cells=replace(solved.cells, displacement=np.zeros_like(solved.cells.displacement)),
-    )
-    layers = by_role(add_to_viewer(viewer, still))
-    assert len(layers["arrows"].data) == 0
-    assert layers["field"].contrast_limits == [0, 1]
-
-
-def test_features_of_the_sites_agree_with_the_report(viewer, solved):
+def test_sites_have_the_numbers_of_the_report_and_are_coloured_by_displacement(
+    viewer, solved, monkeypatch
+):
     sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
-    features = sites.features
+    features, cells = sites.features, solved.cells
     assert list(features) == ["weight", "mass", "displacement", "flux residual"]
-    np.testing.assert_array_equal(features["weight"], solved.cells.weights)
+    np.testing.assert_array_equal(features["weight"], cells.weights)
     np.testing.assert_allclose(features["mass"].sum(), solved.source.sum())
-    np.testing.assert_allclose(features["displacement"], np.hypot(*solved.cells.displacement.T))
+    np.testing.assert_allclose(features["displacement"], np.hypot(*cells.displacement.T))
     worst = np.abs(features["flux residual"]).max()
     np.testing.assert_allclose(worst, solved.report.residual, rtol=1e-6)
-
-
-def test_sites_are_coloured_by_displacement(viewer, solved):
-    sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
-    order = np.argsort(sites.features["displacement"])
-    brightness = sites.face_color[order][:, :3].sum(axis=1)
+    brightness = sites.face_color[np.argsort(features["displacement"])][:, :3].sum(axis=1)
     assert brightness[-1] > brightness[0] + 1
-
-
-def test_many_sites_are_thinned_and_the_name_says_so(viewer, solved, monkeypatch):
+    # Many are thinned, and the name says so.
     monkeypatch.setattr("napari_shadowinv._napari.layers._MAX_SHOWN_SITES", 200)
     sites = by_role(add_to_viewer(viewer, solved, all_layers=True))["sites"]
-    np.testing.assert_array_equal(sites.data, solved.cells.sites[::3])
+    np.testing.assert_array_equal(sites.data, cells.sites[::3])
     assert sites.name == "✓ sites (1 in 3)"
-    np.testing.assert_array_equal(sites.features["weight"], solved.cells.weights[::3])
-
-
-def test_each_layer_knows_the_whole_result(viewer, solved, proton_setup):
-    for layer in add_to_viewer(viewer, solved, proton_setup, origins={"Setup": "typed"}):
-        result = result_of(layer)
-        assert result is not None
-        assert result.content.cells is solved.cells
-        assert result.content.setup == proton_setup
-        assert result.origins == {"Setup": "typed"}
+    np.testing.assert_array_equal(sites.features["weight"], cells.weights[::3])
 
 
 def test_an_uneven_source_has_its_layer(viewer, solved):
@@ -182,12 +172,6 @@ def test_an_uneven_source_has_its_layer(viewer, solved):
     uneven = replace(solved, source=source)
     layer_data = {role_of(keywords): data for data, keywords, _ in inversion_layers(uneven)}
     assert layer_data["source"] is source
-
-
-def test_layers_share_the_arrays_of_a_result(viewer, solved):
-    layers = by_role(add_to_viewer(viewer, solved, all_layers=True))
-    assert np.shares_memory(layers["reprojection"].data, solved.reprojection)
-    assert np.shares_memory(layers["sites"].data, solved.cells.sites)
 
 
 def test_layers_are_added_one_at_a_time_the_visible_ones_first(viewer, solved, qtbot):
@@ -244,12 +228,11 @@ def test_doubtful_result_has_the_doubt_in_its_names(solved):
     marks = {((), True): "✓", (EDGE, True): "?", (EDGE, False): "✗"}
     for (warnings, converged), mark in marks.items():
         report = replace(solved.report, cautions=warnings, converged=converged)
-        for _, keywords, _ in inversion_layers(replace(solved, report=report), name="a"):
+        marked = replace(solved, report=report)
+        for _, keywords, _ in inversion_layers(marked, name="a"):
             assert keywords["name"].startswith(f"{mark} ")
             assert keywords["name"].endswith(" – a")
-        names = [
-            keywords["name"] for _, keywords, _ in inversion_layers(replace(solved, report=report))
-        ]
+        names = [keywords["name"] for _, keywords, _ in inversion_layers(marked)]
         assert f"{mark} |d| (px)" in names
 
 
@@ -268,3 +251,71 @@ def test_structures_of_an_inversion_are_outlined_on_its_significance(viewer, sol
         assert structures.data[row, column] == regions.labels[row, column]
         assert (around == 0).any()
     assert not {"significance", "structures"} & set(by_role(add_to_viewer(viewer, certain)))
+
+
+def opened(viewer, path):
+    viewer.layers.clear()
+    viewer.open(str(path), plugin="napari-shadowinv")
+    slots = [layer_key(layer) for layer in viewer.layers]
+    assert len(set(slots)) == len(slots)
+    return dict(zip(slots, viewer.layers, strict=True))
+
+
+def more(viewer, layers):
+    """All layers of a result of which only the main ones are shown."""
+    missing = add_layers(viewer, missing_layers(viewer, layers["field"]))
+    return layers | {layer_key(layer): layer for layer in missing}
+
+
+def test_a_file_of_the_command_shows_all_of_a_fit(viewer, two_fields, tmp_path, messages):
+    layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
+    layers = more(viewer, layers)
+    in_each = ["potential", "field y", "field x", "direction", "field", "uncertainty", "arrows"]
+    in_each += ["significance", "structures"]
+    of_fields = ["field arrows", *(f"{role}{part}" for role in in_each for part in ("", " E"))]
+    of_answers = [f"{role} {name} 1" for role in ("field", "arrows") for name in "BE"]
+    of_images = ["reprojection", "residual"]
+    assert set(layers) == {*of_fields, *of_answers, *of_images, "image 1", "image 2"}
+    assert {slot for slot, layer in layers.items() if layer.visible} == {"field", "arrows"}
+    for slot in of_images:
+        assert layers[slot].data.shape == (2, *SHAPE)
+        assert tuple(map(str, layers[slot].units)) == ("pixel", "micrometer", "micrometer")
+        assert tuple(layers[slot].scale) == pytest.approx((1, 1.5, 1.5))
+    np.testing.assert_array_equal(layers["reprojection"].data, two_fields.reprojection)
+    for number, (pixels, setup) in enumerate(zip(two_fields.images, SETUPS, strict=True), 1):
+        np.testing.assert_array_equal(layers[f"image {number}"].data, pixels)
+        assert setup_of(layers[f"image {number}"]) == setup
+    for slot, fitted_field in zip(("field", "field E"), two_fields.fields, strict=True):
+        np.testing.assert_array_equal(displacement_of(layers[slot]), fitted_field.displacement)
+    assert unit_of(layers["field"]).endswith("T·m")
+    assert unit_of(layers["field E"]).endswith("V")
+    assert unit_of(layers["uncertainty E"]) == unit_of(layers["field E"])
+    assert "from near" in layers["field B 1"].name
+    half = np.abs(displacement_of(layers["field B 1"])).max() / np.abs(FIELDS["B"][1]).max()
+    assert half == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_doubt_is_told_when_a_file_is_opened(viewer, doubtful, solved, tmp_path, messages):
+    layers = opened(viewer, write(tmp_path / "pack.shadowinv", doubtful))
+    assert messages == [f"pack.shadowinv: the fit's verdict is 'one of several': {WHY}"]
+    assert layers["field"].name == "? |∫B×dz| (µT·m) – pack"
+    good = replace(doubtful, assessment=Assessment(Verdict.DETERMINED, "all starts lead to one"))
+    layers = opened(viewer, write(tmp_path / "good.shadowinv", good))
+    assert len(messages) == 1
+    assert layers["field"].name == "✓ |∫B×dz| (µT·m) – good"
+    report = replace(solved.report, cautions=(Caution("not-converged", "it did not converge"),))
+    opened(viewer, write(tmp_path / "shot.shadowinv", replace(solved, report=report)))
+    assert messages[1:] == ["shot.shadowinv: it did not converge"]
+
+
+def test_a_beam_is_shown_once_unless_images_have_different_ones(doubtful):
+    def beam(content):
+        layers = fit_layers(Result(content), Frame(), "a")
+        return next((data for data, about, _ in layers if role_of(about) == "source"), None)
+
+    assert beam(doubtful) is None
+    uneven = 1 + np.arange(SHAPE[1]) * np.ones(SHAPE) / 100
+    proportional = np.stack([uneven, 1.3 * uneven])
+    np.testing.assert_array_equal(beam(replace(doubtful, source=proportional)), uneven)
+    different = np.stack([uneven, uneven[:, ::-1]])
+    np.testing.assert_array_equal(beam(replace(doubtful, source=different)), different)

@@ -1,8 +1,6 @@
 """The manifest, and the imports that it causes."""
 
-from __future__ import annotations
-
-from importlib.metadata import version
+from importlib.metadata import entry_points, version
 from pathlib import Path
 
 import napari_shadowinv
@@ -18,6 +16,8 @@ NEW_MENUS = {"napari/layers/metadata"}
 def test_it_is_valid_and_each_command_can_be_imported(manifest):
     manifest.validate_imports()
     assert manifest.name == "napari-shadowinv"
+    (entry,) = entry_points(group="napari.manifest", name=manifest.name)
+    assert entry.value == "napari_shadowinv:napari.yaml"
 
 
 # The manifest leaves them out, so that nobody has to choose a reader.
@@ -49,18 +49,15 @@ def test_napari_itself_opens_what_is_left_to_it():
     assert {f"*{suffix}" for suffix in OPENED_BY_NAPARI} <= patterns
 
 
-def test_its_menus_exist(manifest):
+def test_its_menus_exist_and_are_short(manifest):
     from napari._app_model.constants._menus import MenuId
 
-    menus = set(manifest.contributions.menus)
+    menus = manifest.contributions.menus
     layers = ("measure", "filter", "transform", "register", "metadata")
-    assert menus == {"napari/file/acquire", *(f"napari/layers/{name}" for name in layers)}
-    missing = menus - {str(menu) for menu in MenuId.contributables()}
+    assert set(menus) == {"napari/file/acquire", *(f"napari/layers/{name}" for name in layers)}
+    missing = set(menus) - {str(menu) for menu in MenuId.contributables()}
     assert missing == (NEW_MENUS if version("napari").startswith("0.7.") else set())
-
-
-def test_a_menu_is_short(manifest):
-    assert max(map(len, manifest.contributions.menus.values())) <= 4
+    assert max(map(len, menus.values())) <= 4
 
 
 def test_every_command_is_used_and_every_use_is_a_command(manifest):
@@ -76,14 +73,7 @@ def test_every_command_is_used_and_every_use_is_a_command(manifest):
     assert ids == set(used)
 
 
-def test_the_installed_plugin_is_this_manifest():
-    from importlib.metadata import entry_points
-
-    (entry,) = entry_points(group="napari.manifest", name="napari-shadowinv")
-    assert entry.value == "napari_shadowinv:napari.yaml"
-
-
-def test_reading_the_manifest_and_asking_the_reader_stays_light(alone, tmp_path):
+def test_manifest_reader_and_public_function_stay_light(alone, tmp_path):
     for name in ("foreign.h5", "foreign.mat", "foreign.tif"):
         (tmp_path / name).write_bytes(b"\x89HDF\r\n\x1a\n" + b"\0" * 90)
     heavy = alone(
@@ -97,6 +87,16 @@ assert get_reader("foreign.h5") is None
 assert get_reader("paper.pdf") is None
 get_reader("foreign.mat"), get_reader("foreign.tif"), get_reader(".")
 print([m for m in sys.modules if m in ("qtpy", "PyQt6", "PySide6", "numba", "napari", "dask")])
+"""
+    )
+    assert heavy.strip() == "[]"
+    heavy = alone(
+        """
+import sys
+import napari_shadowinv
+from napari_shadowinv.io import formats
+napari_shadowinv.add_to_viewer
+print([m for m in sys.modules if m in ("napari", "qtpy", "dask")])
 """
     )
     assert heavy.strip() == "[]"
@@ -133,16 +133,3 @@ except ModuleNotFoundError as error:
 """
     )
     assert printed.split() == ["400", "napari"]
-
-
-def test_the_public_function_does_not_import_napari(alone):
-    printed = alone(
-        """
-import sys
-import napari_shadowinv
-from napari_shadowinv.io import formats
-napari_shadowinv.add_to_viewer
-print([m for m in sys.modules if m in ("napari", "qtpy", "dask")])
-"""
-    )
-    assert printed.strip() == "[]"

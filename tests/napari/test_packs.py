@@ -1,10 +1,7 @@
 """Film packs as layers, without a window."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +9,7 @@ from napari.layers import Layer
 
 from napari_shadowinv import write
 from napari_shadowinv._napari import packs
-from napari_shadowinv._napari.layer_metadata import (
-    frame_for,
-    role_of,
-    setup_of,
-    usable_of,
-)
+from napari_shadowinv._napari.layer_metadata import frame_for, role_of, setup_of, usable_of
 from napari_shadowinv._napari.viewer_sync import connect_viewer
 
 PLUGIN = "napari-shadowinv"
@@ -32,7 +24,7 @@ def opened(viewer, file):
     return {str(role_of(layer)): layer for layer in viewer.open(file, plugin=PLUGIN)}
 
 
-def test_a_pack_opens_as_stacks_of_films(viewer, pack_doses, file):
+def test_a_pack_opens_as_stacks_of_films(viewer, pack_doses, file, tmp_path):
     layers = opened(viewer, file)
     assert list(layers) == ["dose", "fluence", "unusable"]
     assert [layer.visible for layer in layers.values()] == [False, True, False]
@@ -44,12 +36,10 @@ def test_a_pack_opens_as_stacks_of_films(viewer, pack_doses, file):
     np.testing.assert_array_equal(layers["fluence"].data, pack_doses.fluence)
     np.testing.assert_array_equal(layers["dose"].data, pack_doses.dose)
     np.testing.assert_array_equal(layers["unusable"].data == 0, pack_doses.usable)
-
-
-def test_a_pack_without_setup_has_the_pixels_of_its_scans(viewer, pack_doses, tmp_path):
-    file = write(tmp_path / "bare.shadowinv", replace(pack_doses, setups=()))
-    fluence = opened(viewer, file)["fluence"]
-    np.testing.assert_allclose(fluence.scale[1:], 1e6 * pack_doses.pixel_size)
+    # Without a setup it has the pixels of its scans.
+    bare = write(tmp_path / "bare.shadowinv", replace(pack_doses, setups=()))
+    scale = opened(viewer, bare)["fluence"].scale
+    np.testing.assert_allclose(scale[1:], 1e6 * pack_doses.pixel_size)
 
 
 def test_the_film_in_view_is_named_and_has_its_own_contrast(viewer, file, pack_doses):
@@ -108,21 +98,11 @@ def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_doses):
     assert [layer.name for layer in layers] == [f"film 1, {first}", f"film 3, {last}"]
     for layer, k in zip(layers, (0, 2), strict=True):
         usable = lost.usable[k]
-        setup: Any = setup_of(layer)
+        setup = setup_of(layer)
         assert setup.energy == lost.energies[k]
         np.testing.assert_array_equal(usable_of(layer), usable)
         np.testing.assert_array_equal(layer.data, np.where(usable, lost.fluence[k], 0))
         np.testing.assert_allclose(layer.scale, 1e6 * setup.object_pixel_size)
-
-
-def test_faint_layers_with_the_dose_of_the_last_film_are_marked(pack_doses):
-    flat = deepcopy(pack_doses)
-    usable = flat.usable
-    for scale, is_measured in ((2.5, False), (4.0, True)):
-        # Electrons leave 0.1 Gy in the last film; what protons and they leave before it.
-        for k, dose in enumerate((10.0, 0.1 * scale, 0.1)):
-            flat.dose[k] = np.where(usable[k], dose, np.nan)
-        assert list(flat.spectrum().is_measured) == [True, is_measured, False]
 
 
 def test_layers_that_are_no_measurement_are_marked(pack_doses):
@@ -131,3 +111,9 @@ def test_layers_that_are_no_measurement_are_marked(pack_doses):
     faint.fluence_error[0] = faint.fluence[0]
     faint.usable[1] = False
     assert not faint.spectrum().is_measured.any()
+    # Electrons leave 0.1 Gy in the last film; what protons and they leave before it.
+    flat = deepcopy(pack_doses)
+    for scale, is_measured in ((2.5, False), (4.0, True)):
+        for k, dose in enumerate((10.0, 0.1 * scale, 0.1)):
+            flat.dose[k] = np.where(flat.usable[k], dose, np.nan)
+        assert list(flat.spectrum().is_measured) == [True, is_measured, False]

@@ -1,15 +1,14 @@
 """Layers of other scales, places and axes cover the pixels of an image that they are seen on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from napari.layers import Image, Labels, Shapes
 
 from napari_shadowinv._napari.placement import labels_on, matrix_between, pixel_mapper, source_on
 from napari_shadowinv._napari.shots import source_of_shot
-from napari_shadowinv._napari.widgets._layers import crop_of, mask_of
+from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.preprocessing import Crop
 
 TURN = np.deg2rad(30.0)
 ROTATION = np.array([[np.cos(TURN), -np.sin(TURN)], [np.sin(TURN), np.cos(TURN)]])
@@ -50,26 +49,59 @@ def test_labels_mask_the_pixels_that_they_cover(image_place, place):
     assert 0 < on_image.sum() < on_image.size
 
 
-def test_labels_of_one_plane_mask_all_shots_of_a_stack():
+def test_labels_of_one_plane_mask_all_shots_of_a_stack_and_lengths_count_in_their_units():
     stack = Image(np.ones((4, 20, 30)), scale=(1, 2, 2), translate=(0, 1, 1))
     labels = painted((40, 60), slice(10, 20), slice(0, 60))
     rows = np.flatnonzero(labels_on(labels, stack)[:, 0])
     assert list(rows) == [5, 6, 7, 8, 9]  # centres at 1 + 2 k
-
-
-def test_lengths_are_compared_in_their_units():
     image = Image(np.ones((20, 30)), scale=(2, 2), units="um")
     labels = painted((20, 30), slice(0, 5), slice(0, 30), scale=(0.001, 0.001), units="mm")
     assert list(np.flatnonzero(labels_on(labels, image)[:, 0])) == [0, 1, 2]  # centres at 0, 2, 4
     np.testing.assert_allclose(pixel_mapper(image, labels)(np.array([[0.004, 0.01]])), [[2, 5]])
 
 
-def test_a_mask_beside_the_image_or_of_planes_is_refused():
-    image = Image(np.ones((20, 30)), name="shot")
-    with pytest.raises(InputError, match="beside the image 'shot'"):
-        mask_of(painted((9, 9), slice(9), slice(9), translate=(50, 0)), image, True)
-    with pytest.raises(InputError, match="expected one plane"):
-        mask_of(Labels(np.ones((3, 20, 30), int)), image, True)
+def test_what_is_painted_or_drawn_is_unusable_or_the_only_usable():
+    image, labels = Image(np.ones((10, 12)), name="shot"), Labels(np.zeros((10, 12), int))
+    assert mask_of(labels, image, True) is None
+    labels.data[2, 3] = 5
+    usable = mask_of(labels, image, True)
+    assert usable.sum() == 119
+    assert not usable[2, 3]
+    assert mask_of(labels, image, False).sum() == 1
+    larger = Image(np.ones((20, 30)), scale=(2.0, 2.0))
+    rectangle = Shapes([np.array([[8, 8], [8, 20], [16, 20], [16, 8]])], shape_type="rectangle")
+    usable = mask_of(rectangle, larger, True)
+    assert not usable[5:8, 5:10].any()
+    assert usable[:3].all()
+    for mask, words in (
+        (painted((9, 9), slice(9), slice(9), translate=(50, 0)), "beside the image 'shot'"),
+        (Labels(np.ones((3, 10, 12), int)), "expected one plane"),
+        (Labels(np.ones((9, 9), int)), "they must match"),
+    ):
+        with pytest.raises(InputError, match=words):
+            mask_of(mask, image, True)
+
+
+@pytest.mark.parametrize(
+    ("layer", "words"),
+    [
+        (None, "File → Open"),
+        (Image(np.ones((8, 8, 3)), rgb=True), "colour"),
+        (Image(np.ones((4, 8, 8))), "Split Stack"),
+    ],
+)
+def test_layers_that_are_no_single_image_are_refused(layer, words):
+    with pytest.raises(InputError, match=words):
+        image_of(layer)
+
+
+def test_a_drawn_crop_follows_the_scale_of_its_image():
+    image = Image(np.ones((20, 30)), scale=(2.0, 2.0), translate=(10.0, 0.0))
+    rectangle = Shapes([np.array([[14, 8], [14, 40], [30, 40], [30, 8]])], shape_type="rectangle")
+    assert crop_of(rectangle, image) == Crop(y=(2, 11), x=(4, 21))
+    beyond = Shapes([np.array([[-90, -90], [-90, 90], [90, 90], [90, -90]])])
+    assert crop_of(beyond, image) == Crop(y=(0, 20), x=(0, 30))
+    assert crop_of(Shapes(ndim=2), image) is None
 
 
 def test_a_rectangle_on_a_turned_image_crops_its_pixels():
@@ -77,8 +109,7 @@ def test_a_rectangle_on_a_turned_image_crops_its_pixels():
     corners = np.array([[9.6, 4.6], [9.6, 20.4], [25.4, 20.4], [25.4, 4.6]])
     world = 2 * corners @ ROTATION.T + (5, 7)
     crop = crop_of(Shapes([world], shape_type="polygon"), image)
-    assert crop is not None
-    assert (crop.y, crop.x) == ((10, 26), (5, 21))
+    assert crop == Crop(y=(10, 26), x=(5, 21))
 
 
 def test_a_source_is_moved_by_whole_pixels_only():
@@ -86,33 +117,30 @@ def test_a_source_is_moved_by_whole_pixels_only():
     image = Image(np.ones((20, 30)), scale=(2, 2), translate=(6, 8), name="shot")
     whole = Image(beam, scale=(2, 2), name="ref")
     np.testing.assert_array_equal(source_on(whole, beam, image), beam[3:23, 4:34])
-    whole.translate = (1, 0)  # half a pixel
-    with pytest.raises(InputError, match=r"50 × 40 px \(scale 2\), the image 'shot' 30 × 20 px"):
-        source_on(whole, beam, image)
-    whole.translate = (8, 0)  # covers only a part
-    with pytest.raises(InputError, match="only a part"):
-        source_on(whole, beam, image)
+    for translate, words in (
+        ((1, 0), r"50 × 40 px \(scale 2\), the image 'shot' 30 × 20 px"),  # half a pixel
+        ((8, 0), "only a part"),
+    ):
+        whole.translate = translate
+        with pytest.raises(InputError, match=words):
+            source_on(whole, beam, image)
+    # A setup has placed the shot; the reference was opened later, in pixels.
+    square, beam = Image(np.ones((20, 20)), scale=(1.5, 1.5), units="um"), np.eye(20)
+    assert source_on(Image(beam), beam, square) is beam
 
 
-@pytest.mark.parametrize("place", [{"scale": (2, 2)}, {"rotate": 90.0}, {"scale": (1, -1)}])
-def test_a_source_of_other_pixels_is_refused(place):
-    image, beam = Image(np.ones((20, 20)), name="shot"), Image(np.ones((20, 20)), **place)
-    with pytest.raises(InputError, match="pixels that lie on each other"):
-        source_on(beam, beam.data, image)
-
-
-def test_sizes_at_one_place_must_match():
-    image, beam = Image(np.ones((20, 20)), name="shot"), Image(np.ones((22, 24)), name="ref")
-    with pytest.raises(InputError, match="'ref' has 24 × 22 px, the image 'shot' 20 × 20 px"):
-        source_on(beam, beam.data, image)
-    with pytest.raises(InputError, match="they must match"):
-        labels_on(Labels(np.ones((9, 9), int)), image)
-
-
-def test_a_source_without_place_is_taken_pixel_by_pixel():
-    """A setup has placed the shot; the reference was opened later, in pixels."""
-    image, beam = Image(np.ones((20, 20)), scale=(1.5, 1.5), units="um"), np.eye(20)
-    assert source_on(Image(beam), beam, image) is beam
+@pytest.mark.parametrize(
+    ("beam", "words"),
+    [
+        (Image(np.ones((20, 20)), scale=(2, 2)), "pixels that lie on each other"),
+        (Image(np.ones((20, 20)), rotate=90.0), "pixels that lie on each other"),
+        (Image(np.ones((20, 20)), scale=(1, -1)), "pixels that lie on each other"),
+        (Image(np.ones((22, 24)), name="ref"), "'ref' has 24 × 22 px, the image 'shot' 20 × 20 px"),
+    ],
+)
+def test_a_source_of_other_pixels_is_refused(beam, words):
+    with pytest.raises(InputError, match=words):
+        source_on(beam, beam.data, Image(np.ones((20, 20)), name="shot"))
 
 
 def test_a_cut_source_is_no_longer_its_file(tmp_path):

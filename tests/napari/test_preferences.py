@@ -1,7 +1,5 @@
 """Preferences of the plugin in napari, and what follows them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from napari.layers import Image

@@ -1,13 +1,11 @@
 """Sample data: available at once, with setup and source, and with the intended content."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
+from helpers.layers import by_role
 from napari_shadowinv import OpticalSetup, ProtonSetup, read
 from napari_shadowinv._napari import samples
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, source_of
@@ -16,43 +14,35 @@ from napari_shadowinv.io import public_images
 SHOTS = ("toroid", "toroid_with_caustics", "four_toroids", "coaxial_line")
 
 
-@pytest.mark.parametrize("name", [*SHOTS, "two_energies", "wakefield_run"])
-def test_each_opens_with_its_setup(viewer, name):
-    layers = viewer.open_sample("napari-shadowinv", name)
-    assert layers
-    for layer in layers:
+@pytest.mark.parametrize("name", [*SHOTS, "wakefield_run"])
+def test_each_opens_with_its_setup_and_a_beam_that_has_its_light(viewer, name):
+    layers = by_role(viewer.open_sample("napari-shadowinv", name))
+    for layer in layers.values():
         assert isinstance(setup_of(layer), (ProtonSetup, OpticalSetup))
         assert {str(unit) for unit in layer.units[-2:]} == {"micrometer"}
-
-
-@pytest.mark.parametrize("name", [*SHOTS, "wakefield_run"])
-def test_the_beam_is_known_and_has_the_light_of_the_shot(viewer, name):
-    layers = {role_of(layer): layer for layer in viewer.open_sample("napari-shadowinv", name)}
-    beam: Any = source_of(layers["shot"])
+    beam = source_of(layers["shot"])
     np.testing.assert_array_equal(layers["source"].data, beam)
     # Only what is thrown out of the image is missing.
     share = np.asarray(layers["shot"].data[..., :, :]).mean() / beam.mean()
     assert 0.95 < share < 1.005
 
 
-def test_the_beams_of_single_toroids_are_flat_and_so_known():
-    for make in (samples.toroid, samples.toroid_with_caustics):
-        assert np.ptp(make()[0][0]) == 0
-
-
-def test_caustics_are_where_the_name_promises_them():
-    *_, (image, _, _) = samples.toroid_with_caustics()
-    below = samples.toroid()[-1][0]
+def test_caustics_are_where_the_name_promises_them_in_flat_beams():
+    (beam, (below, _, _)), (other, (image, _, _)) = (
+        (make()[0][0], make()[-1]) for make in (samples.toroid, samples.toroid_with_caustics)
+    )
+    assert np.ptp(beam) == np.ptp(other) == 0
     assert image.max() > 8 * image.mean()
     assert below.max() < 8 * below.mean()
 
 
 def test_two_energies_are_one_object_in_one_beam_that_is_not_told(viewer):
     films = viewer.open_sample("napari-shadowinv", "two_energies")
-    setups: Any = [setup_of(film) for film in films]
+    setups = [setup_of(film) for film in films]
     assert [setup.energy for setup in setups] == [14.7, 3.0]
     assert setups[0].object_pixel_size == setups[1].object_pixel_size
     assert [role_of(film) for film in films] == ["shot", "shot"]
+    assert {str(unit) for film in films for unit in film.units[-2:]} == {"micrometer"}
     assert all(source_of(film) is None for film in films)
     # Corners show the beam: uneven by tens of per cent, and alike in both films but for a factor.
     ends = slice(None, 12), slice(-12, None)
@@ -100,7 +90,7 @@ def test_without_a_network_the_menu_says_so_once(
 
 def test_the_burner_comes_with_its_reference(viewer, burner, monkeypatch):
     monkeypatch.setattr(samples, "fetch_burner", lambda: burner[:2])
-    layers = {role_of(layer): layer for layer in viewer.open_sample("napari-shadowinv", "burner")}
+    layers = by_role(viewer.open_sample("napari-shadowinv", "burner"))
     reference, frame = (read(path).image for path in burner[:2])
     np.testing.assert_array_equal(layers["shot"].data, frame)
     np.testing.assert_array_equal(source_of(layers["shot"]), reference)

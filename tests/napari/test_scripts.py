@@ -1,7 +1,5 @@
 """The scripts for napari that a user copies."""
 
-from __future__ import annotations
-
 import os
 import runpy
 import subprocess

@@ -1,9 +1,5 @@
 """Synchronisation with a viewer: events, the colour bar, images that are opened next to results."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 
 from napari_shadowinv import add_to_viewer
@@ -13,7 +9,7 @@ from napari_shadowinv._napari.viewer_sync import connect, connect_layers, withou
 
 def test_each_layer_is_followed_until_it_is_disconnected(viewer):
     first = viewer.add_image(np.ones((4, 5)))
-    calls: list[Any] = []
+    calls = []
     names = "name", "paint"  # images have no event `paint`
     disconnect = connect_layers(viewer.layers, names, lambda event: calls.append(event.source))
     second = viewer.add_image(np.ones((4, 5)))
@@ -30,7 +26,7 @@ def test_the_list_behind_a_proxy_is_the_same_each_time(viewer):
 
     proxies = [PublicOnlyProxy(viewer) for _ in range(2)]
     assert all(without_proxy(proxy.layers) is viewer.layers for proxy in proxies)
-    calls: list[Any] = []
+    calls = []
     connect(proxies[0].layers, "inserted", calls.append)
     layer = viewer.add_image(np.ones((4, 5)))
     assert calls[0].value is layer
@@ -100,15 +96,10 @@ def test_an_image_of_the_same_size_lies_on_the_result(
     (opened,) = viewer.open(tmp_path / "other.txt", plugin="napari-shadowinv")
     assert frame_of(opened) == frame
     assert {str(unit) for layer in viewer.layers for unit in layer.units[-2:]} == {"micrometer"}
-
-
-def test_an_image_of_another_size_is_told_how_to_get_a_scale(
-    viewer, solved, proton_setup, messages
-):
-    add_to_viewer(viewer, solved, proton_setup, name="a")
-    image = viewer.add_image(np.ones((30, 52)), name="other")
+    # One of another size is told how to get a scale.
+    image = viewer.add_image(np.ones((30, 52)), name="smaller")
     assert tuple(image.scale) == (1, 1)
-    assert "'other' is in pixels, the results are in µm" in messages[-1]
+    assert "'smaller' is in pixels, the results are in µm" in messages[-1]
     assert "Invert" in messages[-1]
 
 

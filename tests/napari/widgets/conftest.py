@@ -1,14 +1,16 @@
 """A real window with the plugin's widgets, independent of the user's settings."""
 
-from __future__ import annotations
-
 import gc
+import threading
+import time
 from importlib import import_module
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
+from helpers.windows import PATIENCE, at_rest, running_threads
+from napari_shadowinv._napari.form import PROBLEM_STYLE
+from napari_shadowinv._napari.run import _Mailbox
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -78,7 +80,7 @@ def open_widget(window):
 @pytest.fixture
 def opened(viewer, qtbot):
     """Make a widget of a class, as a session does when its menu is used first."""
-    widgets: list[Any] = []
+    widgets = []
 
     def make(kind):
         widgets.append(kind(viewer))
@@ -93,33 +95,99 @@ def opened(viewer, qtbot):
 
 
 @pytest.fixture
-def assert_it_fits(window, qtbot):
-    """Check that a widget needs no sideways scrolling, and has no gaps, in windows of any size."""
-    from qtpy.QtCore import Qt
+def wait(qtbot):
+    """Wait until a condition holds."""
+    return lambda condition: qtbot.waitUntil(condition, timeout=PATIENCE)
 
-    def check(tool):
-        for size in ((1280, 800), (2560, 1440)):
-            window.window._qt_window.resize(*size)
-            qtbot.wait(50)
-            qtbot.waitUntil(lambda: tool.area.horizontalScrollBar().maximum() == 0)
-            assert tool.area.widget().minimumSizeHint().width() <= tool.area.viewport().width()
-            spread = tool.area.widget().layout().expandingDirections()
-            assert not spread & Qt.Orientation.Vertical
+
+@pytest.fixture
+def rest(wait):
+    """Wait until the work of a window has ended and its layers are there."""
+    return lambda tool: wait(lambda: at_rest(tool))
+
+
+@pytest.fixture
+def run(rest):
+    """Press Run or another button, wait until the layers are there, and return the result."""
+
+    def pressed(tool, button=None):
+        outcomes = []
+        tool.panel.ended.connect(outcomes.append)
+        (button or tool.panel.button).click()
+        rest(tool)
+        (outcome,) = outcomes
+        assert outcome.error is None
+        return getattr(outcome.value, "content", outcome.value)
+
+    return pressed
+
+
+@pytest.fixture
+def refused(wait, qtbot, messages):
+    """Press Run, and check that it is refused in one sentence, which stays below the button.
+
+    Something else than Run may be done, too.
+    """
+
+    def check(tool, words, do=None):
+        layers, usual = list(tool.viewer.layers), tool.panel.button.text()
+        messages.clear()
+        (do or tool.panel.button.click)()
+        wait(lambda: bool(messages) and not tool.panel.running)
+        qtbot.wait(20)
+        (text,) = messages
+        assert words in text
+        assert "\n" not in text
+        status, button = tool.panel.status, tool.panel.button
+        assert status.text() == text
+        assert status.styleSheet() == PROBLEM_STYLE
+        assert not status.isHidden()
+        assert (button.text(), button.isEnabled()) == (usual, True)
+        assert list(tool.viewer.layers) == layers
 
     return check
 
 
 @pytest.fixture
-def run(qtbot):
-    """Press Run and wait until the layers are there."""
+def held(monkeypatch):
+    """Hold all work, as a large image would, until it is asked to stop or let go."""
+    let_go, fill = threading.Event(), _Mailbox.fill
 
-    def pressed(tool):
-        before = getattr(tool, "results", None)
-        tool.panel.button.click()
-        qtbot.waitUntil(lambda: getattr(tool, "results", None) is not before, timeout=60_000)
-        qtbot.waitUntil(lambda: not tool.results.busy, timeout=60_000)
+    def hold(box, work):
+        def later(on_progress, should_stop):
+            while not (let_go.is_set() or should_stop()):
+                time.sleep(0.01)
+            return work(on_progress, should_stop)
 
-    return pressed
+        fill(box, later)
+
+    monkeypatch.setattr(_Mailbox, "fill", hold)
+    return let_go
+
+
+@pytest.fixture
+def cancelled(wait, rest, qtbot, messages):
+    """Press Run and Cancel, and check that the work ends and leaves nothing behind."""
+
+    def check(tool, begun=lambda: True):
+        layers = list(tool.viewer.layers)
+        button = tool.panel.button
+        usual = button.text()
+        button.click()
+        assert button.text() == "Cancel"
+        wait(begun)
+        button.click()
+        assert (button.text(), button.isEnabled()) == ("Cancelling…", False)
+        rest(tool)
+        wait(lambda: not running_threads())
+        qtbot.wait(50)
+        assert (button.text(), button.isEnabled()) == (usual, True)
+        assert tool.panel.status.text().startswith("Cancelled")
+        assert tool.panel.bar.isHidden()
+        assert list(tool.viewer.layers) == layers
+        assert messages == []
+
+    return check
 
 
 @pytest.fixture
@@ -128,7 +196,7 @@ def choose(monkeypatch):
     from qtpy.QtWidgets import QFileDialog, QMessageBox
 
     def answer(path, replace=False):
-        def ask(parent, title, proposal, filters, **_):
+        def ask(parent, title, proposal="", filters="", **_):
             return str(path), filters.split(";;")[0]
 
         button = QMessageBox.StandardButton.Yes if replace else QMessageBox.StandardButton.No
@@ -137,9 +205,3 @@ def choose(monkeypatch):
         monkeypatch.setattr(QMessageBox, "question", lambda *_: button)
 
     return answer
-
-
-def running_threads():
-    import threading
-
-    return [thread for thread in threading.enumerate() if thread.name == "shadowinv"]

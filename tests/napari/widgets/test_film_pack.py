@@ -1,12 +1,8 @@
 """The widget that converts scans of a film pack to fluences, mostly without a window."""
 
-from __future__ import annotations
-
 import csv
-import shutil
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,26 +23,10 @@ from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.film import read_corners
 from napari_shadowinv.film_doses import FilmDoses
 
-PATIENCE = 60_000  # ms
-
 
 @pytest.fixture
-def tool(viewer, qtbot):
-    widget = FilmPack(viewer)
-    qtbot.addWidget(widget)
-    return widget
-
-
-@pytest.fixture
-def wait(qtbot):
-    def until_at_rest(tool):
-        qtbot.waitUntil(
-            lambda: not (tool.panel.running or tool.results.busy or tool.fit_images.busy),
-            timeout=PATIENCE,
-        )
-        qtbot.wait(20)
-
-    return until_at_rest
+def tool(opened):
+    return opened(FilmPack)
 
 
 @pytest.fixture
@@ -60,63 +40,51 @@ def scratch_of(tool):
     return list(tool._scratch.rglob("*"))
 
 
-def test_a_run_shows_the_fluences_of_the_films(window, open_widget, film_pack, pack_doses, wait):
+def mean_fluences(doses, rows=np.s_[:], columns=np.s_[:]):
+    """The mean of each film's usable pixels."""
+    films = doses.fluence[:, rows, columns].astype(float)
+    used = np.where(doses.usable[:, rows, columns], films, np.nan)
+    return np.nanmean(used, axis=(1, 2))
+
+
+def test_a_run_shows_the_fluences_of_the_films(window, open_widget, film_pack, pack_doses, run):
     tool = open_widget("Film pack")
     tool.file.restore({"file": str(film_pack.pack)})
-    tool.panel.button.click()
-    wait(tool)
-    assert [layer.name for layer in window.layers] == [
-        "dose (Gy) – trio",
-        "fluence (1/(m² MeV)) – trio",
-        "unusable – trio",
-    ]
+    run(tool)
+    names = [f"{title} – trio" for title in ("dose (Gy)", "fluence (1/(m² MeV))", "unusable")]
+    assert [layer.name for layer in window.layers] == names
     fluence = layer_of(window, "fluence")
     np.testing.assert_array_equal(fluence.data, pack_doses.fluence)
     assert window.layers.selection.active is fluence
     assert tool.packs.layer is fluence
     first, _, last = (f"{energy:.3g}" for energy in pack_doses.energies)
     assert texts_of(tool.report)["Films"] == f"3, {first} to {last} MeV"
-    used = pack_doses.usable
-    means = [
-        plane[mask].astype(float).mean() for plane, mask in zip(fluence.data, used, strict=True)
-    ]
-    np.testing.assert_allclose(tool.spectrum.fluence, means)
+    np.testing.assert_allclose(tool.spectrum.fluence, mean_fluences(pack_doses))
     hatched = [patch for patch in tool.plot.figure.axes[0].patches if patch.get_hatch()]
     assert len(hatched) == 1
     low, high = hatched[0].get_x(), hatched[0].get_x() + hatched[0].get_width()
     assert low <= tool.spectrum.energies[-1] <= high
     # The same pack again takes the place of its result.
-    tool.panel.button.click()
-    wait(tool)
+    run(tool)
     assert len(window.layers) == 3
 
 
-def test_the_spectrum_follows_the_region(evaluated, pack_doses, qtbot):
+def test_the_spectrum_follows_the_region(evaluated, pack_doses, wait):
     tool = evaluated
     tool._draw_region()
     scale = tool.packs.layer.scale[1:]
     assert tool.regions.layer.name == "region – trio"
 
-    def mean(rows, columns):
-        used = pack_doses.usable[:, rows, columns]
-        fluence = pack_doses.fluence[:, rows, columns]
-        return [film[mask].astype(float).mean() for film, mask in zip(fluence, used, strict=True)]
-
     region = tool.regions.layer
     np.testing.assert_allclose(region.scale, scale)
     region.add_rectangles([[19.6, 29.6], [49.4, 59.4]])
-    qtbot.waitUntil(
-        lambda: np.allclose(tool.spectrum.fluence, mean(np.s_[20:50], np.s_[30:60])),
-        timeout=PATIENCE,
-    )
-    region.data = [region.data[0] + [10, 20]]
-    qtbot.waitUntil(
-        lambda: np.allclose(tool.spectrum.fluence, mean(np.s_[30:60], np.s_[50:80])),
-        timeout=PATIENCE,
-    )
+    for rows, columns in ((np.s_[20:50], np.s_[30:60]), (np.s_[30:60], np.s_[50:80])):
+        means = mean_fluences(pack_doses, rows, columns)
+        wait(lambda: np.allclose(tool.spectrum.fluence, means))  # noqa: B023
+        region.data = [region.data[0] + [10, 20]]
 
 
-def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, wait, qtbot):
+def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, run, wait):
     tool, names = evaluated, {layer.name for layer in viewer.layers}
     layer_of(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
     viewer.dims.set_current_step(0, 1)
@@ -129,11 +97,10 @@ def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, wait,
     moved = corners + np.array([[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
     tool.corners.polygon.data = [moved[1]]
     viewer.dims.set_current_step(0, 2)
-    qtbot.waitUntil(lambda: tool.corners.scan.name == "scan of film 3", timeout=PATIENCE)
+    wait(lambda: tool.corners.scan.name == "scan of film 3")
     np.testing.assert_allclose(tool.corners.polygon.data[0], corners[2], atol=1e-4)
     tool.corners.polygon.data = [moved[2]]
-    tool.panel.button.click()
-    wait(tool)
+    run(tool)
     doses = tool._selected()[1]
     assert doses is not pack_doses
     table = read_corners(doses.pack.corners)
@@ -152,22 +119,17 @@ def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, wait,
     assert {layer.name for layer in viewer.layers} == names  # those of the file, updated
 
 
-def test_a_polygon_that_is_no_film_is_one_sentence(viewer, evaluated):
-    tool = evaluated
-    tool.show_corners.click()
-    polygon = tool.corners.polygon
-    polygon.data = [polygon.data[0][[0, 2, 1, 3]]]
-    before = len(viewer.layers)
-    tool.panel.button.click()
-    assert "do not go around a film" in tool.panel.status.text()
-    polygon.data = [polygon.data[0][:3]]
-    tool.panel.button.click()
-    assert "with 3 corners: expected one polygon with the four" in tool.panel.status.text()
-    polygon.data = []
-    tool.panel.button.click()
-    assert "has 0 shapes: expected one polygon" in tool.panel.status.text()
-    assert len(viewer.layers) == before
-    assert not tool.panel.running
+def test_a_polygon_that_is_no_film_is_refused(evaluated, refused):
+    evaluated.show_corners.click()
+    polygon = evaluated.corners.polygon
+    (film,) = polygon.data
+    for shapes, words in (
+        ([film[[0, 2, 1, 3]]], "do not go around a film"),
+        ([film[:3]], "with 3 corners: expected one polygon with the four"),
+        ([], "has 0 shapes: expected one polygon"),
+    ):
+        polygon.data = shapes
+        refused(evaluated, words)
 
 
 def test_an_opened_result_does_not_keep_the_file_of_another_one(viewer, tool, pack_doses, tmp_path):
@@ -177,7 +139,7 @@ def test_an_opened_result_does_not_keep_the_file_of_another_one(viewer, tool, pa
     assert tool.request().pack == pack_doses.pack
 
 
-def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, wait, tmp_path, monkeypatch):
+def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, run, tmp_path, choose):
     tool = evaluated
     tool.show_corners.click()
     tool.paint.click()
@@ -189,8 +151,7 @@ def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, wait, tmp_pa
     spot = np.s_[1, 30:36, 40:48]
     assert pack_doses.usable[spot].all()
     marks.data[spot] = BY_HAND
-    tool.panel.button.click()
-    wait(tool)
+    run(tool)
     doses = tool._selected()[1]
     usable = doses.usable
     assert not usable[spot].any()
@@ -200,7 +161,7 @@ def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, wait, tmp_pa
     assert (marks.data == BY_HAND).sum() == 48
     # What was corrected goes with a file.
     file = tmp_path / "mended.shadowinv"
-    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *_, **__: (str(file), ""))
+    choose(file)
     tool.save.click()
     again = FilmDoses.from_dataset(read(file))
     np.testing.assert_array_equal(again.usable, usable)
@@ -209,94 +170,61 @@ def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, wait, tmp_pa
     assert not read(mask).image[30:36, 40:48].any()
     # Rubbed out, they count again.
     marks.data[spot] = 0
-    tool.panel.button.click()
-    wait(tool)
+    run(tool)
     assert tool._selected()[1].usable[spot].all()
 
 
-def test_cancelling_leaves_nothing(viewer, evaluated, monkeypatch, wait, qtbot):
-    written: list[list[Path]] = []
+def test_cancelling_removes_what_was_written_for_the_run(
+    viewer, evaluated, cancelled, monkeypatch, wait
+):
+    written = []
 
-    def work_slowly(pack, *, on_progress, should_stop):
-        written.append(scratch_of(tool))
-        for _ in range(PATIENCE // 10):
-            if should_stop():
-                raise InversionCancelled
+    def work(pack, *, on_progress, should_stop):
+        written.extend(path.name for path in scratch_of(evaluated) if path.is_file())
+        while not should_stop():
             time.sleep(0.01)
+        raise InversionCancelled
 
-    tool = evaluated
-    monkeypatch.setattr(packs, "run_film", work_slowly)
+    monkeypatch.setattr(packs, "run_film", work)
     layer_of(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
-    before = list(viewer.layers)
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(written), timeout=PATIENCE)
-    assert [path.name for path in written[0] if path.is_file()] == ["mask_01.tif"]
-    tool.panel.button.click()
-    wait(tool)
-    qtbot.waitUntil(lambda: not scratch_of(tool), timeout=PATIENCE)
-    assert tool.panel.status.text() == "Cancelled."
-    assert list(viewer.layers) == before
+    cancelled(evaluated, lambda: bool(written))
+    assert written == ["mask_01.tif"]
+    wait(lambda: not scratch_of(evaluated))
 
 
-def test_mistakes_are_one_sentence_in_the_widget(viewer, tool, film_pack, tmp_path, wait):
-    lost = tmp_path / "lost.toml"
-    lost.write_text(film_pack.pack.read_text())
-    for name in ("HDV2.csv", "unexposed.tif"):
-        shutil.copy(film_pack.folder / name, tmp_path)
-    for path, said in (
-        ("", "No pack is selected"),
-        (lost, "film_01.tif does not exist"),
-    ):
-        tool.file.restore({"file": str(path)})
-        tool.panel.button.click()
-        wait(tool)
-        text = tool.panel.status.text()
-        assert said in text
-        assert "internal error" not in text
-    assert not viewer.layers
-
-
-def test_films_become_images_that_can_be_fitted(viewer, evaluated, qtbot, pack_doses, wait):
+def test_films_become_images_that_can_be_fitted(viewer, opened, evaluated, pack_doses, rest):
     evaluated.to_fit.click()
-    wait(evaluated)
+    rest(evaluated)
     images = [layer for layer in viewer.layers if role_of(layer) == "shot"]
-    assert [layer.name for layer in images] == [
-        f"film {k}, {energy:.3g} MeV" for k, energy in enumerate(pack_doses.energies, 1)
-    ]
-    fit = FitImages(viewer)
-    qtbot.addWidget(fit)
+    names = [f"film {k}, {energy:.3g} MeV" for k, energy in enumerate(pack_doses.energies, 1)]
+    assert [layer.name for layer in images] == names
+    fit = opened(FitImages)
     fit.source.set_kind("unknown")
     job = fit.request()
     for shot, layer in zip(job.shots, images, strict=True):
         np.testing.assert_array_equal(shot.mask, usable_of(layer))
         assert shot.setup == setup_of(layer)
-    invert = Invert(viewer)
-    qtbot.addWidget(invert)
+    invert = opened(Invert)
     invert.image.layer = images[1]
     request = invert.request()
     np.testing.assert_array_equal(request.shot.mask, pack_doses.usable[1])
     assert request.recipe.setup == setup_of(images[1])
 
 
-def test_layers_are_written_with_a_table(evaluated, tmp_path, monkeypatch, messages):
+def test_layers_are_written_with_a_table(evaluated, tmp_path, monkeypatch, refused):
     folder = tmp_path / "layers"
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_, **__: str(folder))
     evaluated.write.click()
     with (folder / "layers.csv").open(newline="") as file:
-        assert [row["file"] for row in csv.DictReader(file)] == [
-            "layer_01.tif",
-            "layer_02.tif",
-            "layer_03.tif",
-        ]
-    evaluated.write.click()
-    assert "exists" in evaluated.panel.status.text()
+        files = [row["file"] for row in csv.DictReader(file)]
+    assert files == [f"layer_0{number}.tif" for number in (1, 2, 3)]
+    refused(evaluated, "exists", evaluated.write.click)
 
 
-def test_without_a_setup_films_know_how_strongly_they_are_displaced(viewer, pack_doses, qtbot):
+def test_without_a_setup_films_know_how_strongly_they_are_displaced(viewer, opened, pack_doses):
     bare = replace(pack_doses, setups=())
     add_layers(viewer, film_layers(bare, Frame(), "trio"))
-    fit = FitImages(viewer)
-    qtbot.addWidget(fit)
+    fit = opened(FitImages)
     fit.source.set_kind("unknown")
     strengths = pack_doses.strengths
     in_fit = [shot.strength[0] for shot in fit.request().shots]

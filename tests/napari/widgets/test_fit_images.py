@@ -1,13 +1,8 @@
-"""The widget that fits several images, and Refine of the widget for one, in a real window."""
+"""The widget that fits several images, and Refine of the widget for one."""
 
-from __future__ import annotations
-
-import json
 import math
 import threading
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +12,7 @@ from scipy.ndimage import zoom
 from helpers.command_line import undrawn
 from helpers.fit_images import of_each
 from helpers.forms import enter
-from helpers.layers import layer_of
+from helpers.layers import in_its_unit, layer_of
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read, write
 from napari_shadowinv._napari.jobs import Finished, FitJob
@@ -25,14 +20,15 @@ from napari_shadowinv._napari.layer_metadata import (
     Result,
     metadata_for,
     result_of,
-    role_of,
     setup_of,
     store_setup,
     unit_of,
 )
 from napari_shadowinv._napari.layers import fit_layers
+from napari_shadowinv._napari.widgets import _panels
+from napari_shadowinv._napari.widgets.fit_images import FitImages
+from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit, compilation, fit
 from napari_shadowinv.fitting.rays import RayModel
@@ -45,8 +41,7 @@ from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.shot import Shot, shots_of
 
-Array = np.ndarray[Any, Any]
-PATIENCE = 120_000  # ms
+REDRAW_MS = _panels._REDRAW_MS  # ms
 SHAPE = (48, 64)
 LENGTHS = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2, "pixel_size": 1.5e-6}
 ENERGIES = (14.7, 6.0)
@@ -67,13 +62,14 @@ def images(noise=0.01):
 @pytest.fixture(autouse=True)
 def _curve_at_the_end(monkeypatch):
     """Draw the curve once: repeated drawing would take as long as these fits."""
+    monkeypatch.setattr(_panels, "_REDRAW_MS", 120_000)
 
 
 @pytest.fixture
-def tool(window, open_widget):
+def tool(viewer, opened):
     for energy, setup, image in zip(ENERGIES, SETUPS, images(), strict=True):
-        window.add_image(image, name=f"{energy} MeV", metadata=metadata_for("shot", "", setup))
-    widget = open_widget("Fit several images")
+        viewer.add_image(image, name=f"{energy} MeV", metadata=metadata_for("shot", "", setup))
+    widget = opened(FitImages)
     widget.options.restore(QUICK)
     return widget
 
@@ -86,34 +82,16 @@ def fitted():
 
 
 @pytest.fixture
-def show(qtbot):
+def show(rest):
     """Show a fit as if the widget had made it."""
 
     def shown(tool, found):
         job = tool.request()
-        result = Result(found, job.origins)
-        layer_data = fit_layers(result, job.frame, job.name)
+        layer_data = fit_layers(Result(found, job.origins), job.frame, job.name)
         tool.show_result(Finished(found, layer_data), job)
-        qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
+        rest(tool)
 
     return shown
-
-
-@pytest.fixture
-def run(qtbot):
-    """Press Run, wait until the layers are there, and return the result."""
-
-    def pressed(widget):
-        answers: list[Any] = []
-        widget.panel.ended.connect(answers.append)
-        widget.panel.button.click()
-        qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
-        assert answers[0].error is None
-        assert not answers[0].cancelled
-        qtbot.waitUntil(lambda: not widget.results.busy, timeout=PATIENCE)
-        return answers[0].value.content
-
-    return pressed
 
 
 def inputs_of(tool):
@@ -131,22 +109,21 @@ def type_in(tool, row, column, text):
     tool.images.item(row, column).setText(text)
 
 
-def test_the_table_is_filled_from_the_layers(window, tool, assert_it_fits):
-    window.add_image(np.ones((20, 30)), name="another size")
-    window.add_image(np.ones((*SHAPE, 3)), name="colour", rgb=True)
-    window.add_image(np.ones(SHAPE), name="beam", metadata=metadata_for("source", ""))
+def test_the_table_is_filled_from_the_layers(viewer, tool):
+    viewer.add_image(np.ones((20, 30)), name="another size")
+    viewer.add_image(np.ones((*SHAPE, 3)), name="colour", rgb=True)
+    viewer.add_image(np.ones(SHAPE), name="beam", metadata=metadata_for("source", ""))
     assert texts(tool, 0) == ["14.7 MeV", "6.0 MeV", "another size"]
     assert texts(tool, BEAM) == ["14.7", "6", ""]
     assert tool.images.horizontalHeaderItem(BEAM).text() == "Energy (MeV)"
     assert texts(tool, GAIN)[:2] == ["1", "1"]
     assert texts(tool, PSF)[:2] == ["0", "0"]
     assert tool.setup.setup() == SETUPS[0]
-    window.layers["6.0 MeV"].name = "slow"
+    viewer.layers["6.0 MeV"].name = "slow"
     assert texts(tool, 0)[1] == "slow"
-    assert_it_fits(tool)
 
 
-def test_what_is_asked_for_is_what_the_controls_show(window, tool):
+def test_what_is_asked_for_is_what_the_controls_show(viewer, tool):
     type_in(tool, 1, BEAM, "7 MeV")
     type_in(tool, 1, GAIN, "1.2")
     type_in(tool, 1, PSF, "0.8 px")
@@ -159,8 +136,8 @@ def test_what_is_asked_for_is_what_the_controls_show(window, tool):
     assert of_each(inputs.shots, "noise") == ["poisson", "poisson"]
     assert inputs.choices.options == FitOptions(**QUICK)
     # The image's own setup stays; what was typed stays with its layer, not with the widget.
-    assert setup_of(window.layers["6.0 MeV"]) == SETUPS[1]
-    window.add_image(np.ones((20, 30)))
+    assert setup_of(viewer.layers["6.0 MeV"]) == SETUPS[1]
+    viewer.add_image(np.ones((20, 30)))
     assert texts(tool, BEAM)[:2] == ["14.7", "7"]
     tool.choices.restore({"brightness": "free"})
     assert of_each(inputs_of(tool).shots, "brightness") == ["free", "free"]
@@ -171,31 +148,32 @@ def test_what_is_asked_for_is_what_the_controls_show(window, tool):
     assert texts(tool, BEAM)[0] == "15"
 
 
-def test_the_field_is_recovered_in_si_units(window, tool, run, qtbot):
+def test_the_field_is_recovered_in_si_units(viewer, tool, run, rest):
     tool.options.restore({"samples": 2, "max_iterations": 5, "spacing": 0.25})
     tool.instrument.restore({"beam_rms": 0.0})
     result = run(tool)
     assert result.verdict is Verdict.DETERMINED
     error = result.fields[0].displacement - TRUTH
     assert np.sqrt((error**2).mean() / (TRUTH**2).mean()) < 0.1
-    field = layer_of(window, "field")
+    field = layer_of(viewer, "field")
     assert field.visible
     assert unit_of(field).endswith("T·m")
-    factor = {"µT·m": 1e6, "mT·m": 1e3, "T·m": 1.0}[unit_of(field)]
-    strength = factor * np.hypot(*SETUPS[0].path_integrated_b(result.fields[0].displacement))
+    fitted = result.fields[0]
+    strength = in_its_unit(field, np.hypot(*SETUPS[0].path_integrated_b(fitted.displacement)))
     np.testing.assert_allclose(field.data, strength, rtol=1e-6, atol=1e-6 * strength.max())
-    sigma = factor * np.hypot(*SETUPS[0].path_integrated_b(result.fields[0].errors.per_pixel))
-    uncertainty = layer_of(window, "uncertainty")
+    per_pixel = SETUPS[0].path_integrated_b(fitted.errors.per_pixel)
+    sigma = in_its_unit(field, np.hypot(*per_pixel))
+    uncertainty = layer_of(viewer, "uncertainty")
     np.testing.assert_allclose(uncertainty.data, sigma, rtol=1e-6)
     assert unit_of(uncertainty) == unit_of(field)
     tool.view.more_layers.click()
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    np.testing.assert_array_equal(layer_of(window, "reprojection").data, result.reprojection)
-    residual = layer_of(window, "residual").data
+    rest(tool)
+    np.testing.assert_array_equal(layer_of(viewer, "reprojection").data, result.reprojection)
+    residual = layer_of(viewer, "residual").data
     assert residual.shape == (2, *SHAPE)
     np.testing.assert_allclose(residual[1], 100 * result.residual[1] / result.images[1].mean())
     assert tuple(field.scale) == pytest.approx((1.5, 1.5))
-    assert tuple(window.layers["6.0 MeV"].scale) == pytest.approx((1.5, 1.5))
+    assert tuple(viewer.layers["6.0 MeV"].scale) == pytest.approx((1.5, 1.5))
     # It can be messages, projected and saved like the result of an inversion.
     assert result_of(field).content.setup == SETUPS[0]
     report = texts_of(tool.view.report)
@@ -203,20 +181,20 @@ def test_the_field_is_recovered_in_si_units(window, tool, run, qtbot):
     assert report["Setup"].startswith("particles")
 
 
-def test_the_images_of_an_opened_fit_can_be_fitted_again(window, tool, fitted, tmp_path):
-    window.layers.clear()
-    window.open(write(tmp_path / "pair.shadowinv", fitted), plugin="napari-shadowinv")
+def test_the_images_of_an_opened_fit_can_be_fitted_again(viewer, tool, fitted, tmp_path):
+    viewer.layers.clear()
+    viewer.open(write(tmp_path / "pair.shadowinv", fitted), plugin="napari-shadowinv")
     assert [shot.setup for shot in tool.request().shots] == list(fitted.setups)
     assert tool.request().name == "pair fit"
     assert tool.source.kind == "uniform"  # a beam that was found is not measured
 
 
-def test_a_good_verdict_is_shown_and_a_bad_one_is_told(window, tool, show, fitted, messages):
+def test_a_good_verdict_is_shown_and_a_bad_one_is_told(viewer, tool, show, fitted, messages):
     show(tool, fitted)
     assert "Determined" in tool.view.verdict.text()
     sound_style = tool.view.verdict.styleSheet()
     assert messages == []
-    count = len(window.layers)
+    count = len(viewer.layers)
     explanation = "the forward model does not explain image 2"
     show(tool, replace(fitted, assessment=Assessment(Verdict.MISFIT, explanation)))
     assert "Does not fit" in tool.view.verdict.text()
@@ -226,35 +204,33 @@ def test_a_good_verdict_is_shown_and_a_bad_one_is_told(window, tool, show, fitte
     assert message.startswith("Does not fit: peak ")
     assert message.endswith(f"; {explanation}")
     # The layers of the same images' earlier fit are replaced.
-    assert len(window.layers) == count
+    assert len(viewer.layers) == count
     tool._last.keep_earlier.setChecked(True)
     show(tool, fitted)
-    assert len(window.layers) > count
+    assert len(viewer.layers) > count
     tool.images.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
-    assert not tool.view.verdict.isVisible()
+    assert tool.view.verdict.isHidden()
 
 
-def test_without_a_setup_strengths_are_asked_for(window, open_widget, run):
+def test_without_a_setup_strengths_are_asked_for(viewer, opened, run):
     for name, strength in (("strong", 1.0), ("weak", 0.6)):
         noise = np.random.default_rng(1).normal(0, 0.01, SHAPE)
-        window.add_image(synthetic_image(strength * TRUTH) + noise, name=name)
-    tool = open_widget("Fit several images")
+        viewer.add_image(synthetic_image(strength * TRUTH) + noise, name=name)
+    tool = opened(FitImages)
     tool.options.restore(QUICK)
     assert tool.images.horizontalHeaderItem(BEAM).text() == "Strength"
-    with pytest.raises(InputError, match="'weak' has no strength"):
-        tool.request()
     type_in(tool, 1, BEAM, "0.6")
     result = run(tool)
     assert result.strengths.ravel().tolist() == [1.0, 0.6]
-    assert unit_of(layer_of(window, "field")) == "px"
+    assert unit_of(layer_of(viewer, "field")) == "px"
 
 
-def test_light_has_wavelengths_and_its_own_fields(window, open_widget):
+def test_light_has_wavelengths_and_its_own_fields(viewer, opened):
     green = OpticalSetup(wavelength=532e-9, object_image_distance=0.01, pixel_size=1e-6)
     red = green.model_copy(update={"wavelength": 810e-9})
     for setup in (green, red):
-        window.add_image(np.ones(SHAPE), name=setup.probe, metadata=metadata_for("shot", "", setup))
-    tool = open_widget("Fit several images")
+        viewer.add_image(np.ones(SHAPE), name=setup.probe, metadata=metadata_for("shot", "", setup))
+    tool = opened(FitImages)
     assert texts(tool, BEAM) == ["532 nm", "810 nm"]
     keys = list(tool.fields.choice.choices)
     assert keys == ["plasma", "phase", "plasma and phase"]
@@ -264,273 +240,105 @@ def test_light_has_wavelengths_and_its_own_fields(window, open_widget):
     assert inputs.setups == (green, red)
 
 
-def test_a_mistake_is_one_sentence(tool, messages):
-    mistakes: list[tuple[Callable[[], None], Callable[[], None], str]] = [
-        (
-            lambda: type_in(tool, 1, BEAM, "fast"),
-            lambda: type_in(tool, 1, BEAM, "6"),
-            "Energy of '6.0 MeV': received 'fast', expected a number in MeV",
-        ),
-        (
-            lambda: type_in(tool, 1, BEAM, "-2"),
-            lambda: type_in(tool, 1, BEAM, "6"),
-            "the setup of '6.0 MeV': 'Energy' is -2",
-        ),
-    ]
-    for row, sentence in ((1, "1 image is checked"), (0, "No images are checked")):
-        tool.images.item(row, 0).setCheckState(Qt.CheckState.Unchecked)
-        tool.panel.button.click()
-        assert messages[-1].startswith(sentence)
-    for row in (0, 1):
-        tool.images.item(row, 0).setCheckState(Qt.CheckState.Checked)
-    for spoil, mend, sentence in mistakes:
-        messages.clear()
-        spoil()
-        tool.panel.button.click()
-        assert not tool.panel.running
-        (text,) = messages
-        assert text[1:].startswith(sentence[1:])  # apart from its capital
-        assert tool.panel.status.text() == text
-        mend()
-
-
-def test_what_other_widgets_change_is_followed(window, tool, qtbot):
+def test_what_other_widgets_change_is_followed(viewer, tool, wait):
     tool.hide()
-    for layer, energy in zip(window.layers, (15.0, 7.0), strict=True):
+    for layer, energy in zip(viewer.layers, (15.0, 7.0), strict=True):
         store_setup(layer, SETUPS[0].model_copy(update={"energy": energy}), "typed elsewhere")
     tool.show()
-    qtbot.waitUntil(tool.isVisible, timeout=PATIENCE)
+    wait(tool.isVisible)
     assert texts(tool, BEAM) == ["15", "7"]
     assert [setup.energy for setup in inputs_of(tool).setups] == [15.0, 7.0]
     assert tool.setup.origin == "typed elsewhere"
 
 
-def test_doubts_of_the_reader_are_told(window, tool):
-    window.layers[1].metadata = metadata_for(
-        "shot", "", SETUPS[1], cautions=[Caution("film-scan", "it may be film")]
-    )
-    assert tool.request().origins["Warning"] == "'6.0 MeV': it may be film"
-
-
-def test_images_that_do_not_fit_are_refused(window, tool, messages, qtbot):
-    window.add_image(np.ones((40, 64)), name="crop", metadata=metadata_for("shot", "", SETUPS[0]))
-    for row in range(3):
-        tool.images.item(row, 0).setCheckState(Qt.CheckState.Checked)
-    tool.panel.button.click()
-    assert "'crop' has shape (40, 64), '14.7 MeV' (48, 64)" in messages[-1]
-    # What only the fit itself can see reaches the window in the same way.
-    tool.images.item(2, 0).setCheckState(Qt.CheckState.Unchecked)
-    window.layers["6.0 MeV"].data = np.full(SHAPE, np.nan)
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
-    assert messages[-1].startswith("'6.0 MeV' has 3072 pixels that are NaN")
-    window.layers["6.0 MeV"].data = window.layers["14.7 MeV"].data.copy()
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
-    assert messages[-1] == "'14.7 MeV' and '6.0 MeV' are the same: give each image once"
-    assert len(messages) == 3
-    assert tool.panel.status.text() == messages[-1]
-
-
-def enlarged(window, times):
-    """Make the images large enough that each stage takes a while."""
-    rng = np.random.default_rng(6)
-    for layer, image in zip(window.layers, images(noise=0), strict=True):
-        large = zoom(image, times, order=1)
-        layer.data = large * rng.normal(1, 0.01, large.shape)
-
-
-BEFORE = {"full size": {"smoothness": 5.0}, "samples": {"smoothness": 5.0, "max_iterations": 1}}
-"""Options that make the stages before one shorter."""
-
-
-def threads():
-    return [thread.name for thread in threading.enumerate() if thread.name == "shadowinv"]
-
-
-def cancel(tool, qtbot):
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
-
-
-@pytest.fixture
-def traced_images(monkeypatch):
-    """A list with an entry for each image whose rays have been traced."""
-    traced: list[int] = []
-    trace = RayModel.image
-
-    def image(*args, **keywords):
-        traced.append(1)
-        return trace(*args, **keywords)
-
-    monkeypatch.setattr(RayModel, "image", image)
-    return traced
-
-
-@pytest.mark.parametrize(
-    ("times", "stages"),
-    [(4, ["transport", "samples"]), (3, ["from near", "smoothness", "full size"])],
-)
-def test_each_stage_ends_soon_after_cancel(
-    window, tool, qtbot, messages, times, stages, traced_images, monkeypatch
-):
+def test_a_fit_that_is_far_on_ends_soon_after_cancel(viewer, tool, cancelled, monkeypatch):
     monkeypatch.setattr(FitJob, "patience", math.inf)  # the fit has to end by itself
-    enlarged(window, times)
-    usual = {**QUICK, "samples": 1000, "max_iterations": 100}
-    before = list(window.layers)
-    for stage in stages:
-        tool.options.restore(usual | BEFORE.get(stage, {}))
-        tool.panel.button.click()
-        with qtbot.waitSignal(
-            tool.panel.progressed,
-            timeout=PATIENCE,
-            check_params_cb=lambda news: news.message == stage,  # noqa: B023
-        ):
-            pass
-        if stage == "samples":
-            qtbot.waitUntil(lambda: "stage 3 of 3" in tool.panel.status.text(), timeout=PATIENCE)
-        traced_images.clear()
-        cancel(tool, qtbot)
-        assert len(traced_images) <= 8 * len(before)  # a line search of the step under way
-        assert tool.panel.status.text() == "Cancelled."
-        qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
-        assert list(window.layers) == before
-        assert messages == []
-        height, width = window.layers[0].data.shape
-        assert tool.cost.text().startswith(f"2 images of {height} × {width} px: about ")
+    traced, trace = [], RayModel.image
+    monkeypatch.setattr(RayModel, "image", lambda *a, **k: traced.append(1) or trace(*a, **k))
+    rng = np.random.default_rng(6)
+    for layer, plane in zip(viewer.layers, images(noise=0), strict=True):
+        large = zoom(plane, 4, order=1)
+        layer.data = large * rng.normal(1, 0.01, large.shape)
+    tool.view._redraw_timer.setInterval(REDRAW_MS)
+    tool.options.restore({**QUICK, "samples": 1000, "max_iterations": 1})
+
+    def draws_samples():
+        traced.clear()
+        is_told = tool.panel.status.text().startswith("Fitting: stage 3 of 3")
+        is_last = any(stage == "samples" for stage, _ in tool.panel.tag.history)
+        return is_last and is_told and not tool.view.curve.isHidden()
+
+    cancelled(tool, draws_samples)
+    assert len(traced) <= 8 * len(ENERGIES)  # a line search of the step under way
+    height, width = viewer.layers[0].data.shape
+    assert tool.cost.text().startswith(f"2 images of {height} × {width} px: about ")
 
 
-def test_the_compiler_is_told_and_does_not_hold_up_cancelling(window, tool, qtbot, monkeypatch):
+def test_the_compiler_is_told_and_does_not_hold_up_cancelling(tool, wait, rest, monkeypatch):
     at_work = threading.Event()
     monkeypatch.setattr(compilation, "is_compiled", lambda: False)
     monkeypatch.setattr(compilation.RayModel, "gradient", lambda *_: at_work.wait(20))
     tool.panel.button.click()
-    qtbot.waitUntil(lambda: "Compiling" in tool.panel.status.text(), timeout=PATIENCE)
+    wait(lambda: "Compiling" in tool.panel.status.text())
     assert "once, for a minute or so" in tool.panel.status.text()
-    cancel(tool, qtbot)
+    tool.panel.button.click()
+    rest(tool)
     assert not at_work.is_set()
     at_work.set()
-    qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
-    assert not [layer for layer in window.layers if role_of(layer) == "field"]
+    assert tool.results.layers == []
 
 
-def test_a_result_whose_first_image_is_gone_is_shown_and_placed(
-    window, tool, qtbot, messages, fitted
-):
-    # As if it had been removed: drawing right after a removal crashes Mesa at times.
-    job = replace(tool.request(), image=object(), companions=tuple(window.layers))
-    result = Result(fitted, job.origins)
-    tool.show_result(Finished(result.content, fit_layers(result, job.frame, job.name)), job)
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    assert messages == ["'14.7 MeV' was deleted during its fit; the result is shown anyway"]
-    # Pixels beside micrometres would take the scale bar's unit away.
-    assert tuple(window.layers["6.0 MeV"].scale) == pytest.approx((1.5, 1.5))
-    assert {str(layer.units[-1]) for layer in window.layers} == {"micrometer"}
-
-
-def test_closing_the_dock_ends_the_fit(window, tool, qtbot, messages, traced_images):
-    tool.view._redraw_timer.setInterval(REDRAW_MS)
-    tool.options.restore({"samples": 1000})
-    tool.panel.button.click()
-    with qtbot.waitSignal(
-        tool.panel.progressed,
-        timeout=PATIENCE,
-        check_params_cb=lambda news: news.objective is not None,
-    ):
-        pass
-    stop = tool.panel._box.stop
-    window.window.remove_dock_widget(tool)
-    tool.deleteLater()
-    qtbot.waitUntil(stop.is_set, timeout=PATIENCE)
-    traced_images.clear()
-    qtbot.waitUntil(lambda: not threads(), timeout=PATIENCE)
-    assert len(traced_images) <= 8 * len(ENERGIES)
-    qtbot.wait(100)
-    window.add_image(np.ones((8, 8)))
-    assert messages == []
-
-
-def test_other_answers_are_shown_beside_the_best(window, tool, show, fitted, qtbot, messages):
+def test_other_answers_are_shown_beside_the_best(viewer, tool, show, fitted, messages):
     result = fitted
     show(tool, result)
     best = result.basins[0]
-    alternative = replace(
-        best,
-        start="from near",
-        objective=1.02 * best.objective,
-        distance=0.5,
-        displacement=0.5 * best.displacement,
-    )
-    doubtful = replace(
-        result,
-        basins=(best, alternative),
-        assessment=Assessment(Verdict.SEVERAL, "2 different fields"),
-    )
+    half = {"distance": 0.5, "displacement": 0.5 * best.displacement}
+    alternative = replace(best, start="from near", objective=1.02 * best.objective, **half)
+    several = Assessment(Verdict.SEVERAL, "2 different fields")
+    doubtful = replace(result, basins=(best, alternative), assessment=several)
     show(tool, doubtful)
     assert len(messages) == 1
     assert "from near: objective +2 %" in texts_of(tool.view.report)["Alternative"]
-    field = layer_of(window, "field", "from near")
+    field = layer_of(viewer, "field", "from near")
     assert not field.visible
     assert field.data.shape == SHAPE
     coarse = np.hypot(*SETUPS[0].path_integrated_b(alternative.displacement[0]))
-    factor = {"µT·m": 1e6, "mT·m": 1e3, "T·m": 1.0}[unit_of(field)]
+    coarse = in_its_unit(field, coarse)
     # Its pixels lie between pairs of the image's.
-    pairs = field.data.reshape(24, 2, 32, 2).mean(axis=(1, 3)) / factor
+    pairs = field.data.reshape(24, 2, 32, 2).mean(axis=(1, 3))
     assert np.abs(pairs - coarse)[2:-2, 2:-2].max() < 0.1 * coarse.max()
     show(tool, result)
-    assert not any("from near" in layer.name for layer in window.layers)
+    assert not any("from near" in layer.name for layer in viewer.layers)
 
 
-def test_refine_starts_from_the_last_inversion(window, open_widget, qtbot, messages):
+def test_refine_starts_from_the_last_inversion(viewer, opened, run, refused):
     shot = images()[0][MIDDLE]
-    window.add_image(shot, name="shot", metadata=metadata_for("shot", "", SETUPS[0]))
-    tool = open_widget("Invert")
+    viewer.add_image(shot, name="shot", metadata=metadata_for("shot", "", SETUPS[0]))
+    tool = opened(Invert)
     tool.options.restore({"n_sites": 600})
-    tool.refine_button.click()
-    assert "there is no inversion of this image" in messages.pop().lower()
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: bool(tool.results.layers), timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
-    inversion = result_of(layer_of(window, "field")).content
+    refused(tool, "here is no inversion of this image", tool.refine_button.click)
+    inversion = run(tool)
     enter(tool.refine_form.entries["psf"], 0.5)
-    answers: list[Any] = []
-    tool.panel.ended.connect(answers.append)
-    tool.refine_button.click()
-    assert tool.panel.button.text() == "Cancel"
-    qtbot.waitUntil(lambda: bool(answers), timeout=PATIENCE)
-    result = answers[0].value.content
-    refined_shot = Shot(
-        inversion.image,
-        setup=SETUPS[0],
-        source=inversion.source,
-        mask=inversion.mask,
-        psf=0.5,
-        start=inversion.potential,
-    )
-    expected = fit([refined_shot])
+    result = run(tool, tool.refine_button)
+    inputs = {"source": inversion.source, "mask": inversion.mask, "start": inversion.potential}
+    expected = fit([Shot(inversion.image, setup=SETUPS[0], psf=0.5, **inputs)])
     np.testing.assert_allclose(result.fields[0].potential, expected.fields[0].potential)
     assert any(basin.start == "given" for basin in result.basins)
-    qtbot.waitUntil(lambda: bool(tool.view.verdict.text()), timeout=PATIENCE)
-    names = [layer.name for layer in window.layers]
-    qtbot.waitUntil(
-        lambda: any(
-            "refined" in layer.name and role_of(layer) == "arrows" for layer in window.layers
-        ),
-        timeout=PATIENCE,
-    )
-    assert any(name[2:].startswith("|∫B×dz| (mT·m) – shot") for name in names), names
-    refined = layer_of(window, "field", "refined")
+    assert tool.view.verdict.text()
+    refined = layer_of(viewer, "field", "refined")
+    assert refined.name[2:].startswith("|∫B×dz| (mT·m) – shot")
     assert refined.data.shape == shot.shape
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
     assert refined.visible
+    assert layer_of(viewer, "arrows", "refined")
     # A new inversion is not hidden by what was made of the one before.
-    tool.panel.button.click()
-    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE)
+    run(tool)
     assert not refined.visible
     assert "Flux residual" in texts_of(tool.report)
 
 
-def test_the_menu_refines_an_inversion_of_a_file(window, qtbot, in_loop, tmp_path, messages):
+def test_the_menu_refines_an_inversion_of_a_file(
+    window, rest, in_loop, tmp_path, messages, refused
+):
     from napari._app_model import get_app_model
 
     def refine():
@@ -548,28 +356,11 @@ def test_the_menu_refines_an_inversion_of_a_file(window, qtbot, in_loop, tmp_pat
     assert tool.panel.running
     in_loop(refine)
     assert messages[-1].startswith("Invert is running")
-    qtbot.waitUntil(lambda: bool(tool.view.verdict.text()), timeout=PATIENCE)
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE)
+    rest(tool)
     assert layer_of(window, "field", "shot refined").visible
     assert texts_of(tool.view.report)["Start"] == "the inversion of 'shot'"
     window.layers.selection.active = layer_of(window, "field", "refined")
-    tool.refine_button.click()
-    assert "shows a fit: select a layer of an inversion" in messages[-1]
-
-
-def test_choices_are_kept_between_sessions(window, tool, open_widget):
-    tool.fields.set_kind("B and E")
-    tool.choices.restore({"brightness": "free", "noise": "poisson"})
-    state = json.loads(json.dumps(tool.state()))
-    tool.fields.set_kind("B")
-    tool.choices.restore({})
-    del state["setup"]  # a matter of the image
-    tool.restore(state)
-    choices = tool.request().choices
-    assert choices.fields == ("B", "E")
-    assert choices.brightness == "free"
-    assert choices.noise == "poisson"
-    assert choices.options.max_iterations == QUICK["max_iterations"]
+    refused(tool, "shows a fit: select a layer of an inversion", tool.refine_button.click)
 
 
 def command(*words):
@@ -603,35 +394,37 @@ def files(tmp_path, monkeypatch):
     noise = np.random.default_rng(4).normal(0, 3, (2, *SHAPE))
     for path, plane in zip(paths, [*np.add(planes, noise), beam], strict=True):
         np.savetxt(path, plane)
-    (tmp_path / "setup.toml").write_text(
-        'kind = "proton"\nenergy = 14.7\n' + "\n".join(f"{k} = {v}" for k, v in LENGTHS.items())
-    )
     return paths
 
 
-def opened(window, open_widget, files):
-    """The tool with both images at their energies, and their beam."""
-    for path in files:
-        window.open(str(path), plugin="napari-shadowinv")
-    tool = open_widget("Fit several images")
-    tool.options.restore(QUICK)
-    tool.source.layer = window.layers["beam"]
-    tool.setup.show_setup(SETUPS[0].model_dump())
-    type_in(tool, 1, BEAM, "6")
-    return tool
+@pytest.fixture
+def of_files(viewer, opened):
+    """Open files, and the tool with both images at their energies."""
+
+    def make(*paths):
+        for path in paths:
+            viewer.open(str(path), plugin="napari-shadowinv")
+        tool = opened(FitImages)
+        tool.options.restore(QUICK)
+        tool.setup.show_setup(SETUPS[0].model_dump())
+        type_in(tool, 1, BEAM, "6")
+        return tool
+
+    return make
 
 
 def test_window_and_command_make_the_same_fit_and_make_it_again(
-    window, open_widget, files, run, tmp_path
+    viewer, of_files, files, run, tmp_path
 ):
-    tool = opened(window, open_widget, files)
+    tool = of_files(*files)
+    tool.source.layer = viewer.layers["beam"]
     for row in (0, 1):
         type_in(tool, row, PSF, "0.6")
     tool.choices.restore({"brightness": "free", "noise": "poisson"})
     tool.steps.add("crop", {"y": (0, 48), "x": (4, 64)})
     painted = np.zeros(SHAPE, np.uint8)
     painted[:4, :6] = 1
-    tool.masks.layer = window.add_labels(painted, name="dust")
+    tool.masks.layer = viewer.add_labels(painted, name="dust")
     tool.recipes.save(tmp_path / "recipe.toml")
     before = inputs_of(tool)
     result = run(tool)
@@ -639,7 +432,7 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     assert [image.file for image in provenance.images] == ["fast.txt", "slow.txt"]
     assert [image.source.file for image in provenance.images] == ["beam.txt"] * 2
     assert all(image.sha256 and image.source.sha256 for image in provenance.images)
-    save(window, result, tmp_path / "window.shadowinv")
+    save(viewer, result, tmp_path / "window.shadowinv")
     output = command("rerun", "window.shadowinv", "--out", "again.shadowinv")
     assert "changed nothing" in output
     assert "bit for bit" in output
@@ -655,7 +448,7 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     tool.choices.restore({})
     tool.steps.show_steps([])
     tool.masks.layer = None
-    window.layers.remove("beam")
+    viewer.layers.remove("beam")
     tool.recipes.load(tmp_path / "recipe.toml")
     after = inputs_of(tool)
     assert after.provenance.recipe == before.provenance.recipe
@@ -666,14 +459,14 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     assert after.setups == before.setups
 
 
-def test_what_the_table_rounds_is_taken_exactly(window, open_widget):
+def test_what_the_table_rounds_is_taken_exactly(viewer, opened):
     setups = [
         setup.model_copy(update={"energy": setup.energy + 1e-8 / 3, "pixel_size": 1e-6 / 3})
         for setup in SETUPS
     ]
     for setup in setups:
-        window.add_image(np.ones(SHAPE), metadata=metadata_for("shot", "", setup))
-    tool = open_widget("Fit several images")
+        viewer.add_image(np.ones(SHAPE), metadata=metadata_for("shot", "", setup))
+    tool = opened(FitImages)
     assert texts(tool, BEAM) == ["14.7", "6"]
     assert inputs_of(tool).setups == tuple(setups)
 
@@ -689,7 +482,7 @@ def pradreader(path, *planes):
 
 
 def test_what_a_file_holds_and_was_not_used_is_not_used_again(
-    window, open_widget, run, tmp_path, monkeypatch
+    viewer, opened, of_files, run, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
     hidden = np.zeros(SHAPE)
@@ -697,33 +490,34 @@ def test_what_a_file_holds_and_was_not_used_is_not_used_again(
     beam = 300 + np.arange(SHAPE[1]) + np.zeros(SHAPE)
     for name, image in zip(("a.txt", "b.txt"), images(), strict=True):
         pradreader(tmp_path / name, image, beam, hidden)
-        window.open(name, plugin="napari-shadowinv")
-    tool = open_widget("Fit several images")
-    tool.options.restore(QUICK)
-    tool.setup.show_setup(SETUPS[0].model_dump())
-    type_in(tool, 1, BEAM, "6")
+    tool = of_files("a.txt", "b.txt")
     assert tool.masks.layer is not None
     tool.masks.layer = None
     result = run(tool)
     assert result.mask.all()
-    save(window, result, tmp_path / "window.shadowinv")
+    save(viewer, result, tmp_path / "window.shadowinv")
     assert "bit for bit" in command("rerun", "window.shadowinv", "--out", "again.shadowinv")
-    single = open_widget("Invert")
-    single.image.layer = window.layers["b"]
+    single = opened(Invert)
+    single.image.layer = viewer.layers["b"]
     single.masks.layer = None
-    single.source.layer = window.layers["a source"]
+    single.source.layer = viewer.layers["a source"]
     assert single.request().shot.source.path is None
     assert single.request().shot.mask is None
 
 
-def test_a_source_of_another_file_is_not_taken_for_that_file(window, tool, tmp_path):
-    metadata = {"path": str(tmp_path / "a.h5"), "file": {"sha256": "1" * 64}}
-    window.layers[0].metadata = metadata_for("shot", "", SETUPS[0], **metadata)
-    beam = window.add_image(np.full(SHAPE, 300.0), metadata=metadata_for("source", "", **metadata))
-    tool.source.layer = beam
-    first, second = inputs_of(tool).provenance.images
-    assert (first.file, first.source.file) == ("a.h5", "a.h5")
-    assert (second.file, second.source.file) == ("", "")
+def test_what_a_reader_tells_of_its_file_counts_for_that_file_only(viewer, tool, tmp_path):
+    facts = {"path": str(tmp_path / "a.h5"), "file": {"sha256": "1" * 64}}
+    doubt = Caution("film-scan", "it may be film")
+    first, second = viewer.layers
+    first.metadata = metadata_for("shot", "", SETUPS[0], **facts)
+    second.metadata = metadata_for("shot", "", SETUPS[1], cautions=[doubt])
+    tool.source.layer = viewer.add_image(
+        np.full(SHAPE, 300.0), metadata=metadata_for("source", "", **facts)
+    )
+    assert tool.request().origins["Warning"] == "'6.0 MeV': it may be film"
+    of_first, of_second = inputs_of(tool).provenance.images
+    assert (of_first.file, of_first.source.file) == ("a.h5", "a.h5")
+    assert (of_second.file, of_second.source.file) == ("", "")
 
 
 def lies_in_view(tool, part):
@@ -733,7 +527,7 @@ def lies_in_view(tool, part):
 
 
 def test_run_is_in_view_at_once_and_the_verdict_at_the_end(
-    window, open_widget, show, fitted, qtbot
+    window, open_widget, show, fitted, qtbot, wait
 ):
     window.window._qt_window.resize(1366, 768)
     for setup, image in zip(SETUPS, images(), strict=True):
@@ -741,14 +535,14 @@ def test_run_is_in_view_at_once_and_the_verdict_at_the_end(
         window.add_image(image, name=setup.probe, metadata=metadata)
     tool = open_widget("Fit several images")
     qtbot.wait(100)
-    qtbot.waitUntil(lambda: lies_in_view(tool, tool.panel.button), timeout=PATIENCE)
+    wait(lambda: lies_in_view(tool, tool.panel.button))
     assert not tool.setup_section.isExpanded()
     assert tool.setup_section.text() == "Setup: 14.7 MeV proton, came with pack.h5"
     window.window._qt_window.resize(1366, 560)
     qtbot.wait(100)
     tool.area.verticalScrollBar().setValue(0)
     show(tool, fitted)
-    qtbot.waitUntil(lambda: lies_in_view(tool, tool.view.verdict), timeout=PATIENCE)
+    wait(lambda: lies_in_view(tool, tool.view.verdict))
     # What is not known yet has to be seen, and must not fold away while it is typed.
     window.layers.select_all()
     window.layers.remove_selected()
@@ -761,7 +555,7 @@ def test_run_is_in_view_at_once_and_the_verdict_at_the_end(
     assert tool.setup_section.text() == "Setup: 14.7 MeV proton, typed for 'image'"
 
 
-def test_a_recipe_tells_noise_and_point_spread(window, tool, tmp_path, messages):
+def test_a_recipe_tells_noise_and_point_spread(tool, tmp_path, refused):
     path = tmp_path / "recipe.toml"
     choices = '[fit]\nfields = ["E", "B"]\nnoise = 3.5\nsource_size = 3e-6\nresolution = 4e-5\n'
     path.write_text(f"[[steps]]\nstep = 'bin'\nfactor = 2\n{choices}")
@@ -775,21 +569,5 @@ def test_a_recipe_tells_noise_and_point_spread(window, tool, tmp_path, messages)
     assert of_each(inputs_of(tool).shots, "psf") == pytest.approx(widths, rel=1e-12)
     assert 1 < widths[0] < 2
     tool.setup.set_kind("none")
-    tool.recipes.load(path)
-    assert messages[-1].endswith("select the setup first, or give the point spread in px")
-
-
-def test_a_recipe_that_cannot_be_shown_changes_nothing(tool, messages, tmp_path):
-    path, before = tmp_path / "recipe.toml", tool.state()
-    for text, sentence in (
-        ('[source]\nmethod = "polynomial"\n', "estimates the source"),
-        ('[[steps]]\nstep = "high-pass"\nwidth = 9\n', "changes what the forward model is fitted"),
-        ('[fit]\nfields = ["plasma"]\n', "fits the fields plasma: with this setup expected"),
-        ('[fit]\nbeam = "dark"\n', "beam"),
-    ):
-        messages.clear()
-        path.write_text(text)
-        tool.recipes.load(path)
-        assert sentence in messages[0]
-        assert tool.panel.status.text() == messages[0]
-        assert tool.state() == before
+    words = "select the setup first, or give the point spread in px"
+    refused(tool, words, lambda: tool.recipes.load(path))

@@ -1,10 +1,8 @@
 """Entries of napari's menus that open a widget, and its preferences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from qtpy.QtWidgets import QComboBox, QFileDialog
+from qtpy.QtWidgets import QComboBox
 
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, setup_origin_of
 from napari_shadowinv._napari.layers import add_layers, inversion_layers
@@ -14,8 +12,6 @@ from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets.analyse import Analyse
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv._system.machine import available_threads, set_default_threads
-
-PATIENCE = 60_000  # ms
 
 
 @pytest.fixture
@@ -42,7 +38,7 @@ def docked(window, kind):
 
 
 def test_analyse_opens_once_for_the_selected_image_or_result(
-    window, choose, solved, messages, qtbot
+    window, choose, solved, messages, wait
 ):
     choose("analyse")  # in the menu Plugins
     choose("plot_along_line")
@@ -55,7 +51,7 @@ def test_analyse_opens_once_for_the_selected_image_or_result(
     assert analyse.checked() == [image]
     assert analyse.lines.layer.name == "profile – shot"
     assert analyse.lines.layer.mode == "add_line"
-    qtbot.waitUntil(analyse.isVisible, timeout=PATIENCE)
+    wait(analyse.isVisible)
     analyse.parent().hide()
     field, arrows = add_some(window, solved, "field", "arrows")
     add_some(window, solved, "field")
@@ -82,14 +78,6 @@ def test_an_image_is_predicted_from_the_selected_potential(window, choose, solve
     choose("predict_image")
     assert "is selected: select the field or the potential of a result" in messages[-1]
     assert forward.field.layer is potential
-
-
-def test_a_folder_is_chosen_and_watched(opened, tmp_path, monkeypatch):
-    monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: str(tmp_path))
-    tool = opened(Invert)
-    tool.choose_folder()
-    assert tool.image.kind == "folder"
-    assert tool.image.shots() == tmp_path
 
 
 def test_a_setup_is_stored_with_its_image(window, choose, proton_setup, solved, messages):
@@ -140,14 +128,14 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(preferences, windo
     assert preference("units", "length") == "automatic"
 
 
-def test_runs_have_the_preferred_number_of_threads(preferences, qtbot):
+def test_runs_have_the_preferred_number_of_threads(preferences, qtbot, wait):
     cores, threads = available_threads(None), []
     panel = Run("Run", "")
     qtbot.addWidget(panel)
     try:
         for preferences.widgets.threads in (7, 0):  # 0: all of them
             panel.start(lambda on_progress, should_stop: threads.append(available_threads(None)))
-            qtbot.waitUntil(lambda: not panel.running, timeout=PATIENCE)
+            wait(lambda: not panel.running)
     finally:
         set_default_threads(None)
     assert threads == [7, cores]

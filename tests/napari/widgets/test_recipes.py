@@ -1,9 +1,5 @@
 """Recipes: the list of steps, the placement of results, and files for window and command."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 from napari.components import ViewerModel
@@ -12,16 +8,13 @@ from qtpy.QtWidgets import QApplication
 from helpers.command_line import undrawn
 from helpers.forms import enter
 from helpers.jobs import run_job
-from napari_shadowinv import InputError, Instrument, InversionOptions, read
+from helpers.layers import layer_of
+from napari_shadowinv import InputError, Instrument, InversionOptions, read, write
 from napari_shadowinv._napari.form import StepsSection
-from napari_shadowinv._napari.layer_metadata import (
-    frame_of,
-    metadata_for,
-    role_of,
-    setup_origin_of,
-)
+from napari_shadowinv._napari.layer_metadata import frame_of, metadata_for, role_of, setup_origin_of
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.widgets import _files
+from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io.store import read_stack
@@ -41,9 +34,7 @@ from napari_shadowinv.preprocessing import (
 )
 from napari_shadowinv.provenance import Provenance
 
-Array = np.ndarray[Any, Any]
 FEW = InversionOptions(n_sites=300)
-PATIENCE = 60_000  # ms
 
 
 @pytest.fixture
@@ -71,18 +62,17 @@ def image(viewer, shot_file):
     return layer
 
 
-def by_command(*arguments):
-    done = undrawn(*arguments)
+def by_command(*arguments, out):
+    """Run the command, and return the inversion that it writes."""
+    done = undrawn(*arguments, "--out", out)
     assert done.exit_code == 0, done.output
-
-
-# The list of steps
+    return Inversion.from_dataset(read(out))
 
 
 def test_steps_are_added_moved_and_removed(qtbot):
     section = StepsSection()
     qtbot.addWidget(section)
-    changes: list[None] = []
+    changes = []
     section.changed.connect(lambda: changes.append(None))
     assert section.folded.text() == "Steps: none"
     assert not section.folded.isExpanded()
@@ -109,6 +99,10 @@ def test_steps_are_added_moved_and_removed(qtbot):
     assert len(changes) >= 6
     section.restore([{"step": "sharpen"}, "nonsense", {"step": "bin", "factor": 2}])
     assert section.steps() == (Bin(factor=2),)
+    assert section._earlier.text().startswith("Kept from an earlier image: bin.")
+    for show in (lambda: section.show_steps([Bin(factor=3)]), lambda: section.restore([])):
+        show()  # a recipe that the user loads, or nothing
+        assert section._earlier.text() == ""
 
 
 def test_a_range_that_is_none_is_refused_where_it_is_typed(qtbot):
@@ -122,8 +116,6 @@ def test_a_range_that_is_none_is_refused_where_it_is_typed(qtbot):
     with pytest.raises(InputError, match="such as 10:200"):
         section.steps()
 
-
-# Where results lie
 
 PLACED = {
     "upright": {},
@@ -169,69 +161,53 @@ def test_a_result_of_larger_pixels_is_in_the_units_of_these(
     run(tool)
     recipe = Recipe(steps=(Bin(factor=2),), setup=proton_setup, options=FEW)
     alone = run_recipe(recipe, shot)
-    fresh = add_to_viewer(ViewerModel(), alone)
-    mine, expected = (
-        next(layer for layer in layers if role_of(layer) == "field")
-        for layers in (viewer.layers, fresh)
-    )
+    fresh = ViewerModel()
+    add_to_viewer(fresh, alone)
+    mine, expected = (layer_of(each, "field") for each in (viewer, fresh))
     assert mine.name.replace(" – shot", "") == expected.name
     np.testing.assert_allclose(mine.data, expected.data)
 
 
-# One file for window and command
-
-
-STEPS_FIRST = (Crop(y=(4, 44), x=(10, 58)), HotPixelFilter(threshold=9.0), Bin(factor=2))
-
-
-def test_the_command_does_what_the_window_saves(
-    viewer, opened, run, image, shot_file, tmp_path, proton_setup
-):
+@pytest.fixture
+def filled(opened, image, proton_setup):
+    """*Invert* with a crop, further steps, an estimated source and a setup."""
     tool = opened()
     tool._draw_crop()
     tool.crop.layer.add_rectangles(np.array([[4, 10], [4, 57], [43, 57], [43, 10]]))
-    tool.steps.show_steps(STEPS_FIRST[1:])
+    tool.steps.show_steps((HotPixelFilter(threshold=9.0), Bin(factor=2)))
     tool.source.show(PolynomialEstimate(degree=1))
-    tool.masks.paint()
-    tool.masks.layer.data[6:9, 12:15] = 1
-    tool.source_masks.paint()
-    tool.source_masks.layer.data[12:30, 22:45] = 1
     tool.setup.show_setup(proton_setup.model_dump())
-    run(tool)
-    field = next(layer for layer in viewer.layers if role_of(layer) == "field")
-    mine = field.metadata["napari-shadowinv"]["result"].content
-    tool.recipes.save(tmp_path / "how.toml")
-    assert {path.name for path in tmp_path.glob("how*")} == {
-        "how.toml",
-        "how_mask.png",
-        "how_source_mask.png",
-    }
-    by_command(
-        "invert", shot_file, "--recipe", tmp_path / "how.toml", "--out", tmp_path / "a.shadowinv"
-    )
-    reloaded = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
+    return tool
+
+
+def paint(masks, *pixels):
+    masks.paint()
+    masks.layer.data[pixels] = 1
+
+
+def test_the_command_does_what_the_window_saves(filled, run, shot_file, tmp_path):
+    paint(filled.masks, np.s_[6:9], np.s_[12:15])
+    paint(filled.source_masks, np.s_[12:30], np.s_[22:45])
+    mine = run(filled)
+    filled.recipes.save(tmp_path / "how.toml")
+    written = {path.name for path in tmp_path.glob("how*")}
+    assert written == {"how.toml", "how_mask.png", "how_source_mask.png"}
+    recipe, out = tmp_path / "how.toml", tmp_path / "a.shadowinv"
+    reloaded = by_command("invert", shot_file, "--recipe", recipe, out=out)
     np.testing.assert_array_equal(reloaded.displacement, mine.displacement)
-    assert reloaded.provenance is not None
-    assert reloaded.provenance.recipe == mine.provenance.recipe
-    assert reloaded.provenance.image.sha256 == mine.provenance.image.sha256
-    assert reloaded.provenance.setup == mine.provenance.setup
-    pixels = [[mask.mask() for mask in each.provenance.masks] for each in (reloaded, mine)]
+    one, other = reloaded.provenance, mine.provenance
+    assert one.recipe == other.recipe
+    assert one.image.sha256 == other.image.sha256
+    assert one.setup == other.setup
+    pixels = [[mask.mask() for mask in each.masks] for each in (one, other)]
     np.testing.assert_array_equal(*pixels)
 
 
-def test_copied_python_makes_the_same_result(viewer, opened, run, image, proton_setup):
+def test_copied_python_makes_the_same_result(filled, run):
     clipboard = QApplication.clipboard()
     clipboard.setText("")
-    tool = opened()
-    tool._draw_crop()
-    tool.crop.layer.add_rectangles(np.array([[4, 10], [4, 57], [43, 57], [43, 10]]))
-    tool.steps.show_steps(STEPS_FIRST[1:])
-    tool.source.show(PolynomialEstimate(degree=1))
-    tool.setup.show_setup(proton_setup.model_dump())
-    run(tool)
-    field = next(layer for layer in viewer.layers if role_of(layer) == "field")
-    mine = field.metadata["napari-shadowinv"]["result"].content
-    tool.recipes.copy()
+    mine = run(filled)
+    filled.recipes.copy()
     lines, names = clipboard.text(), {}
     assert len(lines.splitlines()) <= 8
     exec(lines, names)
@@ -239,26 +215,25 @@ def test_copied_python_makes_the_same_result(viewer, opened, run, image, proton_
     assert names["recipe"] == mine.provenance.recipe
     assert names["inversion"].setup == mine.provenance.setup
     clipboard.setText("")
-    tool.masks.paint()
-    tool.masks.layer.data[6:9, 12:15] = 1
-    tool.recipes.copy()  # a mask in no file
+    paint(filled.masks, np.s_[6:9], np.s_[12:15])
+    filled.recipes.copy()  # a mask in no file
     assert clipboard.text() == ""
 
 
 def test_the_selected_result_is_repeated_from_its_files(
-    viewer, opened, image, shot_file, run, qtbot, monkeypatch
+    viewer, opened, image, shot_file, run, wait, monkeypatch
 ):
-    said: list[str] = []
+    said = []
     monkeypatch.setattr(_files, "show_info", said.append)
     tool = opened(Invert)
     tool.options.restore({"n_sites": 200})
     tool.recipes.repeat()
     assert not tool.panel.running  # the image is no result
     run(tool)
-    (field,) = [layer for layer in viewer.layers if role_of(layer) == "field"]
+    field = layer_of(viewer, "field")
     viewer.layers.selection.active = field
     tool.recipes.repeat()
-    qtbot.waitUntil(lambda: bool(said), timeout=60_000)
+    wait(lambda: bool(said))
     assert said == ["Difference: none: the same result, bit for bit. Changed: nothing"]
     first, second = [layer for layer in viewer.layers if role_of(layer) == "field"]
     assert second.name == first.name.replace("shot", "shot repeated")
@@ -268,7 +243,7 @@ def test_the_selected_result_is_repeated_from_its_files(
     np.save(shot_file, 2 + np.load(shot_file))
     viewer.layers.selection.active = first
     tool.recipes.repeat()
-    qtbot.waitUntil(lambda: len(said) == 2, timeout=60_000)
+    wait(lambda: len(said) == 2)
     assert f"the image {shot_file.name} differs" in said[1]
 
 
@@ -280,13 +255,12 @@ def test_the_window_does_what_the_command_saves(
         'kind = "proton"\nenergy = 14.7\nsource_object_distance = 0.01\n'
         "object_image_distance = 1.0\npixel_size = 2e-6\n"
     )
-    by_command(
+    reloaded = by_command(
         "invert", shot_file, "--step=crop y=4:44 x=10:", "--bin", 2, "--step=low-pass 1.5",
         "--source", tmp_path / "beam.npy", "--setup", tmp_path / "setup.toml",
-        "--set=options.n_sites=300",
-        "--save-recipe", tmp_path / "how.toml", "--out", tmp_path / "a.shadowinv",
+        "--set=options.n_sites=300", "--save-recipe", tmp_path / "how.toml",
+        out=tmp_path / "a.shadowinv",
     )  # fmt: skip
-    reloaded = Inversion.from_dataset(read(tmp_path / "a.shadowinv"))
     tool = opened()
     tool.recipes.load(tmp_path / "how.toml")
     assert tool.crop.layer.name == "crop – shot"
@@ -331,19 +305,16 @@ def test_a_source_that_is_no_file_is_written_beside_the_recipe(
     tool.source.layer = viewer.add_image(beam, name="beam", metadata=metadata_for("source", ""))
     tool.recipes.save(tmp_path / "how.toml")
     np.testing.assert_array_equal(np.load(tmp_path / "how_source.npy"), beam)
-    out = tmp_path / "a.shadowinv"
-    by_command("invert", shot_file, "--recipe", tmp_path / "how.toml", "--out", out)
-    reloaded = Inversion.from_dataset(read(out))
+    recipe, out = tmp_path / "how.toml", tmp_path / "a.shadowinv"
+    reloaded = by_command("invert", shot_file, "--recipe", recipe, out=out)
     inversion = run_job(tool.request())
     np.testing.assert_array_equal(inversion.displacement, reloaded.displacement)
 
 
-def test_a_stack_is_inverted_by_a_saved_recipe(viewer, opened, shot, tmp_path, qtbot):
+def test_a_stack_is_inverted_by_a_saved_recipe(viewer, opened, shot, tmp_path, run):
     usable = np.ones(shot.shape, bool)
     usable[:4, :6] = False
     recipe = Recipe(steps=(Crop(y=(2, 46)), Bin(factor=2)), mask=tmp_path / "mask.png", options=FEW)
-    from napari_shadowinv.io import write
-
     write(tmp_path / "mask.png", usable.astype(float))
     write_recipe(tmp_path / "how.toml", recipe)
     stack = viewer.add_image(np.stack([shot, shot[::-1]]), name="shots", scale=(1, 2, 2))
@@ -351,16 +322,12 @@ def test_a_stack_is_inverted_by_a_saved_recipe(viewer, opened, shot, tmp_path, q
     tool.recipes.load(tmp_path / "how.toml")
     assert tool.steps.steps() == recipe.steps
     tool.store.folder.restore({"path": str(tmp_path / "a.shadowinv.zarr")})
-    tool.panel.button.click()
-    qtbot.waitUntil(
-        lambda: any(role_of(layer) == "field" for layer in viewer.layers), timeout=PATIENCE
-    )
-    qtbot.waitUntil(lambda: not tool.panel.running and not tool.results.busy, timeout=PATIENCE)
+    run(tool)
     alone = run_recipe(recipe, shot[::-1])
     dataset = read_stack(tmp_path / "a.shadowinv.zarr")
     displacement = dataset["displacement"].values[1]
     np.testing.assert_allclose(displacement, alone.displacement, atol=1e-5)
-    field = next(layer for layer in viewer.layers if role_of(layer) == "field")
+    field = layer_of(viewer, "field")
     assert field.data.shape == (2, 22, 30)
     np.testing.assert_allclose(field.data_to_world((1, 0, 0)), stack.data_to_world((1, 2.5, 0.5)))
     provenance = Provenance.of(dataset.attrs, dataset.variables)
@@ -368,40 +335,42 @@ def test_a_stack_is_inverted_by_a_saved_recipe(viewer, opened, shot, tmp_path, q
     np.testing.assert_array_equal(provenance.masks[0].mask(), usable)
 
 
-def test_what_cannot_be_loaded_or_saved_is_one_sentence_and_changes_nothing(
-    viewer, opened, image, tmp_path, messages
-):
-    tool = opened()
-    tool.steps.add("bin")
-    before, layers = tool.recipe(), list(viewer.layers)
-    from napari_shadowinv.io import write
+NOT_SHOWN = {
+    Invert: (
+        ("[[steps]]\nstep = 'binn'\n", "did you mean 'bin'"),
+        ("mask = 'small.png'\n", "mask has shape (9, 9), image (48, 60)"),
+        ("mask = 'gone.png'\n", "gone.png"),
+        ("[[steps]]\nstep = 'crop'\ny = '3:4'\n", "contains 60 × 1 pixels"),
+        ("[source]\nmethod = 'measured'\n", "the shot's file"),
+        ("steps = [\n", "toml"),
+    ),
+    FitImages: (
+        ("[source]\nmethod = 'polynomial'\n", "estimates the source"),
+        ("[[steps]]\nstep = 'high-pass'\nwidth = 9\n", "changes what the forward model is fitted"),
+        ("[fit]\nfields = ['plasma']\n", "fits the fields plasma: with this setup expected"),
+        ("[fit]\nbeam = 'dark'\n", "beam"),
+    ),
+}
 
+
+@pytest.mark.parametrize("kind", NOT_SHOWN)
+def test_a_recipe_that_cannot_be_shown_changes_nothing(opened, image, tmp_path, refused, kind):
+    tool = opened(kind)
+    tool.steps.add("bin")
+    before, state = tool.recipe(), tool.state()
     write(tmp_path / "small.png", np.eye(9))
-    wrong = {
-        "typo": ("[[steps]]\nstep = 'binn'\n", "did you mean 'bin'"),
-        "mask": ("mask = 'small.png'\n", "mask has shape (9, 9), image (48, 60)"),
-        "gone": ("mask = 'gone.png'\n", "gone.png"),
-        "crop": ("[[steps]]\nstep = 'crop'\ny = '3:4'\n", "contains 60 × 1 pixels"),
-        "own": ("[source]\nmethod = 'measured'\n", "the shot's file"),
-        "toml": ("steps = [\n", "toml"),
-    }
-    for name, (text, words) in wrong.items():
-        path = tmp_path / f"{name}.toml"
+    path = tmp_path / "how.toml"
+    for text, words in NOT_SHOWN[kind]:
         path.write_text(text)
-        messages.clear()
-        tool.recipes.load(path)
-        assert len(messages) == 1, (name, messages)
-        assert words in messages[0]
-        assert "\n" not in messages[0]
-        assert tool.panel.status.text() == messages[0]
-        assert tool.recipe() == before
-        assert list(viewer.layers) == layers
+        refused(tool, words, lambda: tool.recipes.load(path))
+        assert (tool.recipe(), tool.state()) == (before, state)
+
+
+def test_files_beside_a_saved_recipe_are_not_replaced(opened, image, tmp_path, refused):
+    tool = opened()
     (tmp_path / "new_mask.png").write_text("somebody's")
-    tool.masks.paint()
-    tool.masks.layer.data[2:4] = 1
-    messages.clear()
-    tool.recipes.save(tmp_path / "new.toml")
-    assert "new_mask.png exists" in messages[0]
+    paint(tool.masks, np.s_[2:4])
+    refused(tool, "new_mask.png exists", lambda: tool.recipes.save(tmp_path / "new.toml"))
     assert not (tmp_path / "new.toml").exists()
     assert (tmp_path / "new_mask.png").read_text() == "somebody's"
 

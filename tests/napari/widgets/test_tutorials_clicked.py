@@ -1,11 +1,8 @@
 """The tutorials by their clicks: menus, labels and buttons as the pages name them."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +10,7 @@ from qtpy import QtWidgets
 from qtpy.QtCore import Qt
 from typer.testing import CliRunner
 
+from helpers.windows import PATIENCE
 from napari_shadowinv import Instrument
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, unit_of
 from napari_shadowinv._napari.viewer_sync import _text_overlay
@@ -23,7 +21,6 @@ from napari_shadowinv.io.store import DONE
 
 PAGES = Path(__file__).parents[3] / "docs" / "tutorials"
 PLUGIN = "Shadowinv"
-PATIENCE_MS = 300_000
 
 
 def page(name):
@@ -36,11 +33,11 @@ def plain(text):
 
 
 @pytest.fixture
-def choose(window, qtbot):
+def menu(window, qtbot):
     """Choose an entry of napari's menus, written as on the pages."""
 
     def trigger(path):
-        owner: Any = window.window._qt_window.menuBar()
+        owner = window.window._qt_window.menuBar()
         *menus, entry = (plain(part) for part in path.split(">"))
         for name in menus:
             (owner,) = [
@@ -59,41 +56,55 @@ def choose(window, qtbot):
 
 
 @pytest.fixture
-def press(qtbot):
+def opened(window, menu):
+    """Open a window of the plugin by the menu, and return it."""
+
+    def by_menu(title):
+        menu(f"Plugins > {PLUGIN} > {title}")
+        docks = window.window._qt_window.findChildren(QtWidgets.QDockWidget)
+        (tool,) = [dock.widget() for dock in docks if title in dock.windowTitle()]
+        return tool
+
+    return by_menu
+
+
+def press(tool, text):
     """Press the visible button of a widget that has this text."""
-
-    def click(tool, text):
-        (button,) = [
-            button
-            for button in tool.findChildren(QtWidgets.QAbstractButton)
-            if (plain(button.text()) or button.text()) == (plain(text) or text)
-            and button.isVisibleTo(tool)
-        ]
-        assert button.isEnabled()
-        button.click()
-
-    return click
+    (button,) = [
+        button
+        for button in tool.findChildren(QtWidgets.QAbstractButton)
+        if (plain(button.text()) or button.text()) == (plain(text) or text)
+        and button.isVisibleTo(tool)
+    ]
+    assert button.isEnabled()
+    button.click()
 
 
 @pytest.fixture
-def answer_dialogs(monkeypatch):
-    """Answer all dialogs that ask for a file with this path."""
+def run(rest, qtbot):
+    """Press Run, and wait until the layers are there and the button is as before."""
 
-    def answer(path):
-        for name in ("getSaveFileName", "getOpenFileName"):
-            monkeypatch.setattr(QtWidgets.QFileDialog, name, lambda *_, **__: (str(path), ""))
+    def pressed(tool):
+        press(tool, "Run")
+        rest(tool)
+        assert tool.panel.button.text() == "Run"
+        qtbot.wait(50)
 
-    return answer
+    return pressed
 
 
-def tool_of(window, title):
-    """The widget that a menu has opened."""
-    (tool,) = [
-        dock.widget()
-        for dock in window.window._qt_window.findChildren(QtWidgets.QDockWidget)
-        if title in dock.windowTitle()
-    ]
-    return tool
+@pytest.fixture
+def save_reload(window, choose):
+    """Save the result, close everything and open the file."""
+
+    def saved(tool, path, button="Save result…"):
+        choose(path)
+        press(tool, button)
+        assert path.exists()
+        window.layers.clear()
+        window.open(path, plugin="napari-shadowinv")
+
+    return saved
 
 
 def select(tool, text, label=""):
@@ -146,11 +157,11 @@ def check(tool, text):
     assert box.isChecked()
 
 
-def wait_for_layers(tool, qtbot):
-    """Wait until a run has ended and its layers are there; the Run button stands there again."""
-    qtbot.waitUntil(lambda: tool.panel.button.text() == "Run", timeout=PATIENCE_MS)
-    qtbot.waitUntil(lambda: not tool.results.busy, timeout=PATIENCE_MS)
-    qtbot.wait(50)
+def enter_setup(tool, text):
+    """Type the setup of a page's table."""
+    select(tool, "particles (protons, …)")
+    for title, value in re.findall(r"^\| ([\w ]+) \| `(.*?)` \|", text, re.M):
+        enter(tool, title, value)
 
 
 def layer_of(window, role):
@@ -158,36 +169,20 @@ def layer_of(window, role):
     return [layer for layer in window.layers if role_of(layer) == role][-1]
 
 
-def overlay_text(window):
-    """The text in the corner of the canvas."""
-    return str(_text_overlay(window).text)
-
-
 def report_of(tool):
     reports = tool.findChildren(ReportView)
     return "\n".join(f"{title} {text}" for report in reports for title, text in report.rows)
 
 
-def save_reload(window, tool, path, press, answer_dialogs, button="Save result…"):
-    """Save the result, close everything and open the file."""
-    answer_dialogs(path)
-    press(tool, button)
-    assert path.exists()
-    window.layers.clear()
-    window.open(path, plugin="napari-shadowinv")
-
-
 def test_first_shadowgram_is_clicked_to_its_end(
-    window, choose, press, answer_dialogs, qtbot, tmp_path
+    window, tmp_path, menu, opened, run, save_reload, choose, wait
 ):
     text = page("first-shadowgram.md")
-    choose(f"File > Open Sample > {PLUGIN} > Toroidal field below caustics")
+    menu(f"File > Open Sample > {PLUGIN} > Toroidal field below caustics")
     assert [layer.name for layer in window.layers if layer.visible] == ["toroid"]
-    choose(f"Plugins > {PLUGIN} > Invert")
-    tool = tool_of(window, "Invert")
+    tool = opened("Invert")
     assert tool.image.layer is window.layers["toroid"]
-    press(tool, "Run")
-    wait_for_layers(tool, qtbot)
+    run(tool)
     field = layer_of(window, "field")
     assert field.visible
     assert "9.7 mT·m" in text
@@ -200,8 +195,7 @@ def test_first_shadowgram_is_clicked_to_its_end(
     assert residual.replace(" ", "") in report_of(tool).replace(" ", "")
     assert "Warning" not in report_of(tool)
 
-    choose(f"Plugins > {PLUGIN} > Analyse")
-    profile = tool_of(window, "Analyse")
+    profile = opened("Analyse")
     press(profile, "✎")
     middle = field.extent.world.mean(axis=0)
     ends = np.array([field.extent.world[0], field.extent.world[1]])
@@ -212,19 +206,17 @@ def test_first_shadowgram_is_clicked_to_its_end(
         on = profile.layers.item(row).text() == field.name
         state = Qt.CheckState.Checked if on else Qt.CheckState.Unchecked
         profile.layers.item(row).setCheckState(state)
-    qtbot.waitUntil(
-        lambda: [one.name for one in profile.profiles] == [field.name], timeout=PATIENCE_MS
-    )
+    wait(lambda: [one.name for one in profile.profiles] == [field.name])
     flanks = np.array_split(profile.profiles[0].values, 2)
     for flank in flanks:
         assert np.nanmax(flank) == pytest.approx(9.7, rel=0.04)
 
-    answer_dialogs(tmp_path / "recipe.toml")
+    choose(tmp_path / "recipe.toml")
     (save,) = [one for one in tool.recipes.menu().actions() if one.text() == "Save…"]
     save.trigger()
     assert (tmp_path / "recipe_source.npy").exists()
     values = np.asarray(field.data)
-    save_reload(window, tool, tmp_path / "toroid.shadowinv", press, answer_dialogs)
+    save_reload(tool, tmp_path / "toroid.shadowinv")
     again = layer_of(window, "field")
     np.testing.assert_array_equal(np.asarray(again.data), values)
     assert unit_of(again) == "mT·m"
@@ -232,23 +224,19 @@ def test_first_shadowgram_is_clicked_to_its_end(
 
 
 def test_proton_radiograph_is_clicked_to_its_end(
-    window, choose, press, answer_dialogs, qtbot, tmp_path, monkeypatch
+    window, tmp_path, monkeypatch, opened, run, save_reload, choose
 ):
     text = page("proton-radiograph.md")
     monkeypatch.chdir(tmp_path)
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(compile(block, "proton-radiograph.md", "exec"), {})
     window.open(["shot.tif", "reference.tif"], plugin="napari")
-    choose(f"Plugins > {PLUGIN} > Invert")
-    tool = tool_of(window, "Invert")
+    tool = opened("Invert")
     assert (tool.image.layer.name, tool.source.layer.name) == ("shot", "reference")
-    select(tool, "particles (protons, …)")
-    for title, value in re.findall(r"^\| ([\w ]+) \| `(.*?)` \|", text, re.M):
-        enter(tool, title, value)
-    answer_dialogs(tmp_path / "setup.toml")
+    enter_setup(tool, text)
+    choose(tmp_path / "setup.toml")
     press(tool.setup, "Save…")
-    press(tool, "Run")
-    wait_for_layers(tool, qtbot)
+    run(tool)
     report = report_of(tool)
     (residual,) = re.findall(r"\*\*Image residual\*\* ([\d.]+ %)", text)
     assert f"{residual} of the mean" in report
@@ -261,8 +249,7 @@ def test_proton_radiograph_is_clicked_to_its_end(
 
     check(tool, "Keep earlier results")
     select(tool, "uniform")
-    press(tool, "Run")
-    wait_for_layers(tool, qtbot)
+    run(tool)
     wrong = layer_of(window, "field")
     assert wrong is not field
     assert field in window.layers
@@ -275,25 +262,24 @@ def test_proton_radiograph_is_clicked_to_its_end(
     line = tool.verdict.text()
     assert "Reaches the edge" in line
     assert "assumed uniform" in report_of(tool)
-    save_reload(window, tool, tmp_path / "shot.shadowinv", press, answer_dialogs)
+    save_reload(tool, tmp_path / "shot.shadowinv")
     assert float(layer_of(window, "field").data.max()) == pytest.approx(peak, abs=0.06)
 
 
-def test_no_reference_is_clicked_to_its_end(window, choose, press, answer_dialogs, qtbot, tmp_path):
+def test_no_reference_is_clicked_to_its_end(window, tmp_path, menu, opened, run, save_reload, wait):
     rows = re.findall(
         r"^\| ([a-z].*?) \| ([\d.]+) \| \d+ \| [\d.]+ \|", page("no-reference.md"), re.M
     )
     peaks = {title: float(peak) for title, peak in rows}
-    choose(f"File > Open Sample > {PLUGIN} > Four toroidal fields, uneven beam")
+    menu(f"File > Open Sample > {PLUGIN} > Four toroidal fields, uneven beam")
     beam = window.layers["four toroids source"]
     assert not beam.visible
-    choose(f"Plugins > {PLUGIN} > Invert")
-    tool = tool_of(window, "Invert")
+    tool = opened("Invert")
     assert tool.image.layer is window.layers["four toroids"]
     select(tool, "estimate: fitted polynomial")
     press(tool, "Show source")
-    qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE_MS)
-    qtbot.waitUntil(lambda: len(window.layers) == 3, timeout=PATIENCE_MS)
+    wait(lambda: not tool.panel.running)
+    wait(lambda: len(window.layers) == 3)
     guess = window.layers.selection.active
     assert role_of(guess) == "source"
     assert guess.contrast_limits == window.layers["four toroids"].contrast_limits
@@ -309,26 +295,24 @@ def test_no_reference_is_clicked_to_its_end(window, choose, press, answer_dialog
     }
     for title, verdict in verdicts.items():
         select(tool, title)
-        press(tool, "Run")
-        wait_for_layers(tool, qtbot)
+        run(tool)
         fields.append(layer_of(window, "field"))
         assert float(fields[-1].data.max()) == pytest.approx(peaks[title], abs=0.06)
         assert verdict in tool.verdict.text()
         assert ("227 %" in report_of(tool)) == title.startswith("estimate")
     assert len({layer.name for layer in fields}) == 3
-    save_reload(window, tool, tmp_path / "four.shadowinv", press, answer_dialogs)
+    save_reload(tool, tmp_path / "four.shadowinv")
     again = float(layer_of(window, "field").data.max())
     assert again == pytest.approx(peaks["uniform"], abs=0.06)
 
 
 def test_two_energies_are_clicked_to_their_end(
-    window, choose, press, answer_dialogs, qtbot, tmp_path, monkeypatch
+    window, tmp_path, monkeypatch, menu, opened, run, save_reload, choose
 ):
     text = page("two-energies.md")
-    monkeypatch.setattr(_panels, "_REDRAW_MS", PATIENCE_MS)  # the curve once, at the end
-    choose(f"File > Open Sample > {PLUGIN} > Two energies, beam not recorded")
-    choose(f"Plugins > {PLUGIN} > Fit several images")
-    tool = tool_of(window, "Fit several images")
+    monkeypatch.setattr(_panels, "_REDRAW_MS", PATIENCE)  # the curve once, at the end
+    menu(f"File > Open Sample > {PLUGIN} > Two energies, beam not recorded")
+    tool = opened("Fit several images")
     table = tool.images
     rows = [[table.item(row, column).text() for column in (0, 1)] for row in range(2)]
     assert rows == [["14.7 MeV", "14.7"], ["3 MeV", "3"]]
@@ -339,8 +323,7 @@ def test_two_energies_are_clicked_to_their_end(
     )[0]
     select(tool, source, label="Source")
     enter(tool, "Noise", noise)
-    press(tool, "Run")
-    wait_for_layers(tool, qtbot)
+    run(tool)
     assert "Determined" in tool.view.verdict.text()
     field, beam = layer_of(window, "field"), layer_of(window, "source")
     assert "peak 30.3 MG µm" in text
@@ -349,41 +332,33 @@ def test_two_energies_are_clicked_to_their_end(
     assert layer_of(window, "uncertainty").data.shape == field.data.shape
     assert beam.data.std() / beam.data.mean() == pytest.approx(0.103, rel=0.05)
 
-    answer_dialogs(tmp_path / "recipe.toml")
+    choose(tmp_path / "recipe.toml")
     (save,) = [entry for entry in tool.recipes.menu().actions() if entry.text() == "Save…"]
     save.trigger()
     assert 'noise = "poisson"' in (tmp_path / "recipe.toml").read_text(encoding="utf-8")
     values = np.asarray(field.data)
-    save_reload(window, tool, tmp_path / "two.shadowinv", press, answer_dialogs)
+    save_reload(tool, tmp_path / "two.shadowinv")
     np.testing.assert_array_equal(np.asarray(layer_of(window, "field").data), values)
 
 
 def test_film_pack_is_clicked_to_its_end(
-    window, choose, press, answer_dialogs, qtbot, tmp_path, film_pack
+    window, tmp_path, film_pack, opened, run, save_reload, choose, rest, wait
 ):
     """With three simulated films instead of the real ones."""
 
-    def wait():
-        qtbot.waitUntil(lambda: not tool.panel.running, timeout=PATIENCE_MS)
-        busy = (tool.results, tool.fit_images)
-        qtbot.waitUntil(lambda: not any(layers.busy for layers in busy), timeout=PATIENCE_MS)
-        qtbot.wait(50)
-
-    choose(f"Plugins > {PLUGIN} > Film pack")
-    tool = tool_of(window, "Film pack")
-    answer_dialogs(film_pack.pack)
+    tool = opened("Film pack")
+    choose(film_pack.pack)
     press(tool, "…")
-    press(tool, "Run")
-    wait()
+    run(tool)
     fluence = layer_of(window, "fluence")
     assert fluence.data.shape[0] == len(tool.spectrum.energies) == 3
     window.dims.set_current_step(0, 1)
     energy = f"{tool.spectrum.energies[1]:.3g} MeV"
-    qtbot.waitUntil(lambda: energy in overlay_text(window), timeout=PATIENCE_MS)
+    wait(lambda: energy in str(_text_overlay(window).text))
     whole = np.array(tool.spectrum.fluence)
     press(tool, "✎")
     tool.regions.layer.add_rectangles([[20, 30], [49, 59]])
-    qtbot.waitUntil(lambda: (tool.spectrum.fluence != whole).all(), timeout=PATIENCE_MS)
+    wait(lambda: (tool.spectrum.fluence != whole).all())
 
     press(tool, "Show corners")
     corners = np.array(tool.corners.polygon.data[0])
@@ -393,35 +368,31 @@ def test_film_pack_is_clicked_to_its_end(
     marks = window.layers.selection.active
     assert marks.mode == "paint"
     marks.paint((1, 40, 50), marks.selected_label)
-    press(tool, "Run")
-    wait()
+    run(tool)
     assert "Warning" not in tool.panel.status.text()
     fluence = layer_of(window, "fluence")
     assert (layer_of(window, "unusable").data[1] == marks.selected_label).any()
 
     press(tool, "Layers for a fit")
-    wait()
+    rest(tool)
     films = [layer for layer in window.layers if role_of(layer) == "shot"]
     assert len(films) == 3
-    choose(f"Plugins > {PLUGIN} > Fit several images")
-    table = tool_of(window, "Fit several images").images
+    table = opened("Fit several images").images
     assert [table.item(row, 0).text() for row in range(3)] == [layer.name for layer in films]
 
     values = np.asarray(fluence.data)
-    save_reload(window, tool, tmp_path / "pack.shadowinv", press, answer_dialogs, "Save…")
+    save_reload(tool, tmp_path / "pack.shadowinv", "Save…")
     np.testing.assert_array_equal(np.asarray(layer_of(window, "fluence").data), values)
 
 
-def test_stack_is_clicked_to_its_end(window, choose, press, qtbot, tmp_path, monkeypatch):
+def test_stack_is_clicked_to_its_end(window, tmp_path, monkeypatch, menu, opened, run, wait, qtbot):
     text = page("stack.md")
     monkeypatch.chdir(tmp_path)
-    choose(f"File > Open Sample > {PLUGIN} > Plasma wave, 20 optical shots")
-    choose(f"Plugins > {PLUGIN} > Invert")
-    tool = tool_of(window, "Invert")
+    menu(f"File > Open Sample > {PLUGIN} > Plasma wave, 20 optical shots")
+    tool = opened("Invert")
     select(tool, "high-pass")
     tool.store.folder.restore({"path": str(tmp_path / "night.shadowinv.zarr")})
-    press(tool, "Run")
-    wait_for_layers(tool, qtbot)
+    run(tool)
     field = layer_of(window, "field")
     assert field.data.shape[0] == 20
     window.dims.set_current_step(0, 12)
@@ -430,7 +401,7 @@ def test_stack_is_clicked_to_its_end(window, choose, press, qtbot, tmp_path, mon
     (command,) = re.findall(r"^    shadowinv (info .*)$", text, re.M)
     result = CliRunner().invoke(app, shlex.split(command))
     assert result.exit_code == 0, result.output
-    names: dict[str, Any] = {}
+    names = {}
     (lines,) = re.findall(r"^    import xarray\n(?:    .*\n)+", text, re.M)
     exec(re.sub("^    ", "", lines, flags=re.M), names)
     night = names["night"]
@@ -441,23 +412,19 @@ def test_stack_is_clicked_to_its_end(window, choose, press, qtbot, tmp_path, mon
 
 
 def test_film_without_reference_is_clicked_to_its_verdict(
-    window, choose, press, qtbot, tmp_path, monkeypatch
+    window, tmp_path, monkeypatch, opened, run
 ):
     text = page("film-without-reference.md")
     monkeypatch.chdir(tmp_path)
     block = re.findall(r"```python\n(.*?)```", text, re.DOTALL)[0]
     exec(compile(block, "film-without-reference.md", "exec"), {})
     window.open("8MeV.tif", plugin="napari")
-    choose(f"Plugins > {PLUGIN} > Invert")
-    tool = tool_of(window, "Invert")
-    select(tool, "particles (protons, …)")
-    for title, value in re.findall(r"^\| ([\w ]+) \| `(.*?)` \|", text, re.M):
-        enter(tool, title, value)
+    tool = opened("Invert")
+    enter_setup(tool, text)
     press(tool, "Instrument")
     for entry, title in re.findall(r"\*([\w ]+)\* under \*\*([\w ]+)\*\*", text):
         select(tool, entry, title)
-    press(tool, "Run")
-    wait_for_layers(tool, qtbot)
+    run(tool)
     assert tool.instrument.model() == Instrument(detector="film", beam_source="TNSA")
     report = report_of(tool)
     assert tool.verdict.text().startswith("<b>Too uncertain</b>")

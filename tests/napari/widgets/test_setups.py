@@ -1,0 +1,278 @@
+"""The setup of an image: its form, whose it is, and where it came from."""
+
+import pickle
+
+import numpy as np
+import pytest
+from napari.layers import Image
+
+from helpers.forms import enter
+from helpers.reports import texts_of
+from napari_shadowinv import InputError, ProtonSetup
+from napari_shadowinv._napari.layer_metadata import (
+    metadata_for,
+    role_of,
+    setup_of,
+    setup_origin_of,
+    source_of,
+)
+from napari_shadowinv._napari.layers import add_to_viewer
+from napari_shadowinv._napari.simulate import Simulate
+from napari_shadowinv._napari.viewer_sync import error_text
+from napari_shadowinv._napari.widgets._image_table import ImageTable, beam_column
+from napari_shadowinv._napari.widgets._inputs import SetupPicker, fields_of
+from napari_shadowinv._napari.widgets.invert import Invert
+from napari_shadowinv.io import read_shot
+from napari_shadowinv.physics.setup import setup_from_dict
+
+
+@pytest.fixture
+def plain(viewer, shot):
+    """A shot that napari itself has opened."""
+    return viewer.add_image(shot, name="plain")
+
+
+@pytest.fixture
+def picker(qtbot):
+    made = SetupPicker()
+    qtbot.addWidget(made)
+    return made
+
+
+def typed(tool, energy):
+    """Type a whole setup, field by field."""
+    tool.setup.set_kind("proton")
+    values = {
+        "energy": energy,
+        "source_object_distance": 0.01,
+        "object_image_distance": 1.0,
+        "pixel_size": 2e-6,
+    }
+    for name, value in values.items():
+        enter(tool.setup.form.entries[name], value)
+
+
+def test_a_setup_stays_with_the_image_that_it_came_with(viewer, opened, plain, shot, proton_setup):
+    origin = {"setup_origin": "came with experiment.h5"}
+    metadata = metadata_for("shot", "", proton_setup, **origin)
+    of_a_file = viewer.add_image(shot, name="measured", metadata=metadata)
+    tool = opened(Invert)
+    for _ in range(2):
+        tool.image.layer = of_a_file
+        assert tool.setup.setup() == proton_setup
+        assert tool.setup.note.text() == "Came with experiment.h5."
+        tool.image.layer = plain
+        assert tool.setup.setup() is None
+        assert tool.setup.note.text() == ""
+    # Nor is it at hand in the form, now or in the next session.
+    tool.setup.set_kind("proton")
+    assert tool.setup.form.is_empty
+    tool.image.layer = of_a_file
+    enter(tool.setup.form.entries["energy"], "3 MeV")
+    assert setup_origin_of(of_a_file) == "came with experiment.h5, changed by hand"
+    tool.write_state()
+    viewer.layers.clear()
+    viewer.add_image(shot, name="another")
+    later = opened(Invert)
+    assert later.setup.setup() is None
+    later.setup.set_kind("proton")
+    assert later.setup.form.is_empty
+
+
+def test_what_the_user_typed_is_at_hand_and_says_for_what(viewer, opened, plain, shot):
+    tool = opened(Invert)
+    typed(tool, 5.0)
+    entered = tool.setup.setup()
+    assert entered.pixel_size == pytest.approx(2e-6)
+    assert setup_of(plain) == entered
+    image = viewer.add_image(shot, name="other")
+    tool.image.layer = image
+    assert tool.setup.setup() is None
+    assert setup_of(image) is None
+    tool.setup.set_kind("proton")
+    assert tool.setup.setup() == entered
+    assert tool.setup.note.text() == "Typed for 'plain'."
+    assert setup_origin_of(image) == "typed for 'plain'"
+    # An image keeps what was chosen for it, none too.
+    tool.image.layer = plain
+    tool.setup.set_kind("none")
+    tool.image.layer = image
+    assert tool.setup.setup() == entered
+    tool.image.layer = plain
+    assert tool.setup.setup() is None
+
+    tool.write_state()
+    viewer.layers.clear()
+    new = viewer.add_image(shot, name="new")
+    later = opened(Invert)
+    assert later.setup.setup() is None
+    later.setup.set_kind("proton")
+    assert later.setup.setup() == entered
+    assert setup_origin_of(new) == "typed for 'plain', in an earlier session"
+    typed(later, 6.0)
+    assert setup_origin_of(new) == "typed for 'new'"
+
+
+def test_the_last_setup_is_selected_where_that_is_preferred(
+    viewer, opened, plain, shot, preferences
+):
+    preferences.widgets.last_setup = True
+    tool = opened(Invert)
+    assert tool.setup.setup() is None  # there is no last one
+    typed(tool, 5.0)
+    entered = tool.setup.setup()
+    tool.write_state()
+    viewer.layers.clear()
+    new = viewer.add_image(shot, name="new")
+    later = opened(Invert)
+    assert later.setup.setup() == entered
+    assert later.setup.note.text() == "Typed for 'plain', in an earlier session."
+    # The image has no setup of its own before it is edited.
+    assert setup_of(new) is None
+    # None is a choice, too.
+    later.setup.set_kind("none")
+    later.write_state()
+    assert opened(Invert).setup.setup() is None
+    later.setup.set_kind("proton")
+    later.write_state()
+    preferences.widgets.last_setup = False
+    viewer.layers.clear()
+    viewer.add_image(shot, name="newest")
+    assert opened(Invert).setup.setup() is None
+
+
+def test_a_loaded_setup_goes_with_the_image_until_run(viewer, opened, plain, proton_setup):
+    tool = opened(Invert)
+    tool.setup.load(proton_setup.model_dump(exclude_none=True), "folder/tcc.toml")
+    assert tool.setup.setup() == proton_setup
+    assert tool.setup.note.text() == "Loaded from tcc.toml."
+    enter(tool.setup.form.entries["energy"], 5.0)
+    other = viewer.add_image(np.ones((20, 30)), name="other")
+    tool.image.layer = other
+    assert tool.setup.setup().energy == 5.0
+    tool.request()
+    assert setup_of(plain) is None
+    assert setup_of(other).energy == 5.0
+    assert setup_origin_of(other) == "loaded from tcc.toml, changed by hand for 'other'"
+    assert tool.setup.note.text() == "Loaded from tcc.toml, changed by hand for 'other'."
+    # From then on it is the setup of this image only.
+    tool.image.layer = plain
+    assert tool.setup.setup() is None
+
+
+def test_other_files_do_not_inherit_a_setup(viewer, opened):
+    tool = opened(Invert)
+    tool.image.set_kind("files")
+    typed(tool, 5.0)
+
+    def choose(pattern):
+        tool.image.form.restore({"path": pattern})
+
+    choose("monday/*.tif")
+    assert tool.setup.setup() is not None
+    choose("tuesday/*.tif")
+    assert tool.setup.setup() is None
+    tool.setup.set_kind("proton")
+    assert tool.setup.setup() is not None
+    assert tool.setup.origin == "typed"
+
+
+def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
+    viewer, opened, solved, proton_setup, run
+):
+    tool = opened(Simulate)
+    assert tool.setup.setup() == ProtonSetup.example()
+    assert tool.setup.note.text() == "Example from the paper."
+    typed(tool, 7.0)
+    entered = tool.setup.setup()
+    add_to_viewer(viewer, solved, proton_setup, name="solved")
+    tool.object.set_kind("layer")
+    assert tool.setup.setup() == proton_setup
+    tool.object.set_kind("toroid")
+    assert tool.setup.setup() == entered
+    tool.write_state()
+    later = opened(Simulate)
+    assert later.setup.setup() == entered
+    tool.side.setText("20 x 20")
+    run(tool)
+    (prediction,) = tool.results.layers
+    assert role_of(prediction) == "shot"
+    assert setup_of(prediction) == entered
+    assert setup_origin_of(prediction).startswith("came with the forward model")
+    assert source_of(prediction) is None
+    # Opened in Invert, it is a file's setup like any other.
+    assert opened(Invert).setup.setup() == entered
+
+
+def test_the_form_shows_geometry_and_doubts_which_the_report_need_not_repeat(
+    viewer, opened, plain, run, picker
+):
+    tool, paper = opened(Invert), ProtonSetup.example()
+    tool.options.restore({"n_sites": 200})
+    for setup, view in ((picker, "pixel 1.5 µm"), (tool.setup, "90 × 72 µm")):
+        setup.show_setup(paper.model_dump())
+        assert setup.geometry_label.text().startswith(f"{view} at the object, M = 16.4")
+    doubt = tool.setup.warning_label
+    assert doubt.text() == ""
+    tool.setup.show_setup({**paper.model_dump(), "energy": 147.0})
+    assert "147 MeV" in doubt.text()
+    swapped = {"source_object_distance": 1.0, "object_image_distance": 0.01}
+    tool.setup.show_setup({**paper.model_dump(), **swapped})
+    assert "the magnification is 1.01" in doubt.text()
+    run(tool)
+    assert tool.verdict.text()
+    assert doubt.text() not in texts_of(tool.report).values()
+
+
+def test_an_error_calls_the_fields_of_a_setup_by_their_labels():
+    with pytest.raises(InputError) as caught:
+        setup_from_dict({"kind": "proton", "object_image_distance": 0}, "the setup")
+    assert "'object_image_distance' is 0" in str(caught.value)
+    text = error_text(caught.value)
+    assert "'Object to image (m)' is 0" in text
+    assert "_" not in text
+    sent = pickle.loads(pickle.dumps(caught.value))
+    assert (type(sent), str(sent)) == (InputError, str(caught.value))
+
+
+@pytest.mark.parametrize("is_by_us", [True, False])
+def test_sizes_in_the_file_begin_a_setup(tmp_path, picker, is_by_us):
+    """`dr` of a text image is its pixel at the detector; napari itself knows nothing of it."""
+    path = tmp_path / "shot.txt"
+    np.savetxt(path, np.ones((8, 9)), header="pixel_width: 2.5e-05\nobject_image_dist: 0.1")
+    geometry = read_shot(path).metadata["geometry"]
+    assert geometry["detector_pixel_size"] == 2.5e-5
+    layer = Image(np.ones((8, 9)), name="shot")
+    if is_by_us:
+        layer.metadata["napari-shadowinv"] = {"file": {"geometry": geometry}}
+    else:
+        layer._source = layer.source.model_copy(update={"path": str(path)})
+    picker.follow(layer)
+    picker.set_kind("proton")
+    values = picker.form.state()
+    assert values["detector_pixel_size"] == 2.5e-5
+    assert values["object_image_distance"] == 0.1
+    assert "energy" not in values
+    assert picker.note.text() == "Begun with the file of 'shot'."
+    # A setup file needs not repeat it, and is not overruled.
+    entries = {"kind": "proton", "energy": 14.7, "source_object_distance": 0.01}
+    picker.load(entries, "setup.toml")
+    assert picker.setup().detector_pixel_size == 2.5e-5
+    picker.load({**entries, "pixel_size": 3e-6}, "setup.toml")
+    assert picker.setup().detector_pixel_size is None
+    assert picker.setup().pixel_size == 3e-6
+
+
+def test_a_further_kind_has_its_form_fields_and_column(xray_setup, viewer, picker, qtbot):
+    """That of CONTRIBUTING.md."""
+    picker.show_setup(xray_setup.example().model_dump())
+    assert picker.kind == "x-ray"
+    assert picker.setup() == xray_setup.example()
+    assert fields_of("x-ray") == {"electrons": ("electron density (phase ∝ λ²)", None)}
+    assert beam_column("x-ray").heading == "Energy (keV)"
+    viewer.add_image(np.ones((8, 8)), name="soft")
+    table = ImageTable(viewer, lambda layer: True)
+    qtbot.addWidget(table)
+    table.show_beams("x-ray", 8.0, is_brightness_known=True)
+    assert table.horizontalHeaderItem(1).text() == "Energy (keV)"
+    assert table.beam_value(table.used[0]) == 8.0
