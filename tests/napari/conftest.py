@@ -2,6 +2,7 @@
 
 import copy
 import functools
+import subprocess
 import sys
 from pathlib import Path
 
@@ -137,20 +138,17 @@ def in_loop(qtbot):
     return call
 
 
-def run_alone(code, tmp_path):
-    """Run Python code in a process of its own and return what it printed."""
-    import subprocess
-
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=300
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 @pytest.fixture
 def alone(tmp_path):
-    return lambda code: run_alone(code, tmp_path)
+    """Run Python code in a process of its own, and return what it printed."""
+
+    def run(code):
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return run
 
 
 @pytest.fixture

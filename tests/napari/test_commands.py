@@ -228,26 +228,12 @@ def test_from_the_menu_the_selected_layer_is_worked_on_beside_the_window(
     assert overlays.scale_bar.visible
 
 
-def test_the_cross_of_the_progress_bar_ends_an_inversion(
-    make_napari_viewer, in_loop, qtbot, messages
+@pytest.mark.parametrize("by", ["its cross", "closing"])
+def test_a_command_is_ended_by_its_cross_or_with_its_window(
+    make_napari_viewer, shot, in_loop, qtbot, messages, monkeypatch, by
 ):
     from napari.utils.progress import cancelable_progress, progress
 
-    window = make_napari_viewer()
-    image = synthetic_image(ellipse_pair((200, 200)).displacement)
-    add_shot(window, image)
-    in_loop(registered("invert_uniform"))
-    (bar,) = [bar for bar in progress._all_instances if isinstance(bar, cancelable_progress)]
-    assert bar.desc.startswith("Inverting shot")
-    bar.cancel()
-    qtbot.waitUntil(lambda: bar not in progress._all_instances, timeout=30_000)
-    assert len(window.layers) == 1
-    assert messages == []
-
-
-def test_closing_the_window_ends_a_command(
-    make_napari_viewer, shot, in_loop, qtbot, messages, monkeypatch
-):
     stopped = threading.Event()
 
     def wait_for_stop(*_, should_stop, **__):
@@ -260,6 +246,13 @@ def test_closing_the_window_ends_a_command(
     window = make_napari_viewer(show=True)  # a command belongs to the window in sight
     add_shot(window, shot)
     in_loop(registered("invert_uniform"))
-    window.close()
+    (bar,) = [bar for bar in progress._all_instances if isinstance(bar, cancelable_progress)]
+    assert bar.desc.startswith("Inverting shot")
+    if by == "closing":
+        window.close()
+    else:
+        bar.cancel()
     qtbot.waitUntil(stopped.is_set, timeout=30_000)
+    qtbot.waitUntil(lambda: bar not in progress._all_instances, timeout=30_000)
     assert messages == []
+    assert by == "closing" or len(window.layers) == 1

@@ -74,21 +74,6 @@ def test_warnings_are_told_when_a_pack_is_opened(viewer, pack_doses, tmp_path, m
     assert messages == ["dark.shadowinv: film 2 is too dark"]
 
 
-def test_a_spectrum_is_the_mean_of_usable_pixels(pack_doses):
-    region = np.zeros((80, 100), bool)
-    region[30:50, 10:40] = True
-    region = region[: pack_doses.dose.shape[1], : pack_doses.dose.shape[2]]
-    for inside in (None, region):
-        spectrum = pack_doses.spectrum(inside)
-        for k in range(3):
-            used = pack_doses.usable[k] & (True if inside is None else inside)
-            fluence = pack_doses.fluence[k][used].astype(float)
-            assert spectrum.fluence[k] == pytest.approx(fluence.mean(), rel=1e-12)
-            assert spectrum.error[k] == np.median(pack_doses.fluence_error[k][used])
-    nothing = pack_doses.spectrum(np.zeros_like(region))
-    assert np.isnan(nothing.fluence).all()
-
-
 def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_doses):
     lost = deepcopy(pack_doses)
     lost.usable[1] = False

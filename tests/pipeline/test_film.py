@@ -166,6 +166,19 @@ def test_the_setups_know_energy_depth_and_pixel(truth: Truth, doses, tmp_path: P
     assert last < first
 
 
+def test_a_spectrum_is_the_mean_of_usable_pixels(doses) -> None:
+    region = np.zeros(doses.dose.shape[1:], bool)
+    region[30:50, 10:40] = True
+    for inside in (None, region):
+        spectrum = doses.spectrum(inside)
+        for k in range(COUNT):
+            used = doses.usable[k] & (True if inside is None else inside)
+            fluence = doses.fluence[k][used].astype(float)
+            assert spectrum.fluence[k] == pytest.approx(fluence.mean(), rel=1e-12)
+            assert spectrum.error[k] == np.median(doses.fluence_error[k][used])
+    assert np.isnan(doses.spectrum(np.zeros_like(region)).fluence).all()
+
+
 def test_it_is_written_and_read(doses, tmp_path: Path) -> None:
     path = write(tmp_path / "pack.shadowinv", doses)
     labelled, again = doses.to_dataset(), read(path)

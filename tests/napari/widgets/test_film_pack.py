@@ -31,8 +31,11 @@ def tool(opened):
 
 @pytest.fixture
 def evaluated(viewer, tool, pack_doses, tmp_path):
-    """The widget with a result that was opened from a file."""
+    """The widget with a result that was opened from a file; that of another is not kept."""
+    tool.file.restore({"file": str(tmp_path / "another.toml")})
     viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
+    assert tool.file.state() == {}
+    assert tool.request().pack == pack_doses.pack
     return tool
 
 
@@ -130,13 +133,6 @@ def test_a_polygon_that_is_no_film_is_refused(evaluated, refused):
     ):
         polygon.data = shapes
         refused(evaluated, words)
-
-
-def test_an_opened_result_does_not_keep_the_file_of_another_one(viewer, tool, pack_doses, tmp_path):
-    tool.file.restore({"file": str(tmp_path / "another.toml")})
-    viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
-    assert tool.file.state() == {}
-    assert tool.request().pack == pack_doses.pack
 
 
 def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, run, tmp_path, choose):

@@ -366,6 +366,7 @@ def test_without_its_beam_an_image_has_the_source_from_before(viewer, opened):
     assert estimate in tool.source.offered
 
 
+@pytest.mark.usefixtures("no_causes")
 @pytest.mark.parametrize(("images", "kind"), [(1, Invert), (2, FitImages)])
 def test_a_fit_from_a_file_has_its_beam(viewer, opened, tmp_path, images, kind):
     options = FitOptions(max_iterations=2, samples=0)

@@ -298,17 +298,16 @@ def test_a_recipe_comes_back_from_its_file(viewer, opened, image, shot, tmp_path
 
 
 def test_a_source_that_is_no_file_is_written_beside_the_recipe(
-    viewer, opened, image, shot, shot_file, tmp_path
+    viewer, opened, image, shot_file, tmp_path
 ):
-    beam = 300 + np.random.default_rng(0).random(shot.shape)
+    beam = 300 + np.random.default_rng(0).random(image.data.shape)
     tool = opened()
     tool.source.layer = viewer.add_image(beam, name="beam", metadata=metadata_for("source", ""))
-    tool.recipes.save(tmp_path / "how.toml")
+    recipe = tmp_path / "how.toml"
+    tool.recipes.save(recipe)
     np.testing.assert_array_equal(np.load(tmp_path / "how_source.npy"), beam)
-    recipe, out = tmp_path / "how.toml", tmp_path / "a.shadowinv"
-    reloaded = by_command("invert", shot_file, "--recipe", recipe, out=out)
-    inversion = run_job(tool.request())
-    np.testing.assert_array_equal(inversion.displacement, reloaded.displacement)
+    reloaded = by_command("invert", shot_file, "--recipe", recipe, out=tmp_path / "a.shadowinv")
+    np.testing.assert_array_equal(run_job(tool.request()).displacement, reloaded.displacement)
 
 
 def test_a_stack_is_inverted_by_a_saved_recipe(viewer, opened, shot, tmp_path, run):
@@ -366,21 +365,20 @@ def test_a_recipe_that_cannot_be_shown_changes_nothing(opened, image, tmp_path, 
         assert (tool.recipe(), tool.state()) == (before, state)
 
 
-def test_files_beside_a_saved_recipe_are_not_replaced(opened, image, tmp_path, refused):
-    tool = opened()
-    (tmp_path / "new_mask.png").write_text("somebody's")
-    paint(tool.masks, np.s_[2:4])
-    refused(tool, "new_mask.png exists", lambda: tool.recipes.save(tmp_path / "new.toml"))
-    assert not (tmp_path / "new.toml").exists()
-    assert (tmp_path / "new_mask.png").read_text() == "somebody's"
-
-
-def test_the_menu_asks_for_a_file(opened, image, tmp_path, choose):
+def test_the_menu_asks_for_a_file_and_replaces_none_beside_it(
+    opened, image, tmp_path, choose, refused
+):
     choose(tmp_path / "how.toml")
     tool = opened()
     load, save, *_ = tool.recipes.menu().actions()
     assert (load.text(), save.text()) == ("Load recipe…", "Save…")
     tool.steps.add("bin")
+    paint(tool.masks, np.s_[2:4])
+    (tmp_path / "how_mask.png").write_text("somebody's")
+    refused(tool, "how_mask.png exists", save.trigger)
+    assert not (tmp_path / "how.toml").exists()
+    assert (tmp_path / "how_mask.png").read_text() == "somebody's"
+    tool.masks.layer = None
     save.trigger()
     tool.steps.show_steps(())
     load.trigger()

@@ -345,7 +345,6 @@ def test_film_pack_is_clicked_to_its_end(
     window, tmp_path, film_pack, opened, run, save_reload, choose, rest, wait
 ):
     """With three simulated films instead of the real ones."""
-
     tool = opened("Film pack")
     choose(film_pack.pack)
     press(tool, "…")
