@@ -63,21 +63,16 @@ def test_only_the_image_that_is_seen_has_a_colour_bar(viewer, solved):
     assert bars(viewer) == ["✓ residual (% of mean) – b"]
 
 
-def test_a_colour_bar_that_was_switched_off_stays_off(viewer, solved):
-    add_to_viewer(viewer, solved, name="a")
-    viewer.layers["✓ |d| (px) – a"].colorbar.visible = False
-    viewer.layers["✓ |d| (px) – a"].visible = False
-    viewer.layers["✓ residual (% of mean) – a"].visible = True
-    assert not any(layer.colorbar.visible for layer in viewer.layers if hasattr(layer, "colorbar"))
-
-
-def test_a_long_name_is_smaller_beside_the_colour_bar(viewer, solved):
+def test_a_colour_bar_that_was_switched_off_stays_off_and_has_room_for_a_long_name(viewer, solved):
     add_to_viewer(viewer, solved, name="a")
     add_to_viewer(viewer, solved, name=80 * "b")
     short, long = (viewer.layers[f"✓ |d| (px) – {name}"] for name in ("a", 80 * "b"))
     long.visible = False
     sizes = [layer.name_overlay.font_size for layer in (short, long)]
     assert sizes[1] * len(long.name) < 1.01 * sizes[0] * 46
+    short.colorbar.visible = short.visible = False
+    viewer.layers["✓ residual (% of mean) – a"].visible = True
+    assert not any(layer.colorbar.visible for layer in viewer.layers if hasattr(layer, "colorbar"))
 
 
 def test_an_image_of_the_same_size_lies_on_the_result(

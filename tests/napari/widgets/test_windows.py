@@ -337,62 +337,57 @@ def test_what_went_wrong_stays_until_the_next_run(panel, qtbot, wait, messages):
     assert status.isHidden()
 
 
-def choose_inversion(tool):
+def remembered_inversion(tool):
+    """Choose something in *Invert*; yield, and check what a later window shows."""
     tool.options.restore({"seed": 5})
     tool.source.set_kind("interpolated")
     for name in STEPS:
         tool.steps.add(name)
     tool.store.run.restore({"workers": 3, "overwrite": True})
-
-
-def of_inversion(tool):
+    tool = yield
     assert tool.steps.steps() == tuple(step() for step in STEPS.values())
     assert tool.options.model() == InversionOptions(seed=5)
     assert tool.source.kind == "interpolated"
     assert tool.store.run.model() == RunOptions(workers=3)  # what counts once is not kept
+    yield
 
 
-def choose_fit(tool):
+def remembered_fit(tool):
     for number in range(2):
         tool.viewer.add_image(np.eye(8) + number, metadata=metadata_for("shot", "", EXAMPLE))
     tool.fields.set_kind("B and E")
     tool.choices.restore({"brightness": "free", "noise": "poisson"})
     tool.options.restore(QUICK)
-
-
-def of_fit(tool):
+    tool = yield
     choices = tool.recipe().fit
     assert (choices.brightness, choices.noise) == ("free", "poisson")
     assert (choices.fields, choices.options) == (("B", "E"), FitOptions(**QUICK))
+    yield
 
 
-FIELD = {"file": "cube.nc", "beam": "x", "right": "y", "centre": True}
-
-
-def choose_object(tool):
+def remembered_object(tool):
+    field = {"file": "cube.nc", "beam": "x", "right": "y", "centre": True}
     tool.object.set_kind("grid")
-    tool.object.form.restore(FIELD)
+    tool.object.form.restore(field)
     tool.side.setText("20 x 30")
-
-
-def of_object(tool):
-    assert tool._object() == GridFile(**FIELD)
+    tool = yield
+    assert tool._object() == GridFile(**field)
     assert tool.side.text() == "20 x 30"
+    yield
 
 
 REMEMBERED = [
-    (Invert, choose_inversion, of_inversion),
-    (FitImages, choose_fit, of_fit),
-    (Simulate, choose_object, of_object),
-]
+    (Invert, remembered_inversion), (FitImages, remembered_fit), (Simulate, remembered_object)
+]  # fmt: skip
 
 
-@pytest.mark.parametrize(("kind", "choose", "check"), REMEMBERED)
-def test_choices_are_kept_between_sessions(opened, kind, choose, check, monkeypatch):
+@pytest.mark.parametrize(("kind", "remembered"), REMEMBERED)
+def test_choices_are_kept_between_sessions(opened, kind, remembered, monkeypatch):
     tool = opened(kind)
-    choose(tool)
+    chosen = remembered(tool)
+    next(chosen)
     tool.write_state()
-    check(opened(kind))
+    chosen.send(opened(kind))
     # A state that another version saved in another form keeps no window from opening.
     parts = json.loads(json.dumps(tool.state()))
     for value in (7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}):
