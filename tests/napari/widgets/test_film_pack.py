@@ -10,7 +10,6 @@ from qtpy.QtCore import Qt
 from qtpy.QtWidgets import QFileDialog
 
 from helpers.layers import layer_of
-from helpers.reports import texts_of
 from napari_shadowinv import read, write
 from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.layer_metadata import Frame, role_of, setup_of, usable_of
@@ -48,28 +47,6 @@ def mean_fluences(doses, rows=np.s_[:], columns=np.s_[:]):
     films = doses.fluence[:, rows, columns].astype(float)
     used = np.where(doses.usable[:, rows, columns], films, np.nan)
     return np.nanmean(used, axis=(1, 2))
-
-
-def test_a_run_shows_the_fluences_of_the_films(window, open_widget, film_pack, pack_doses, run):
-    tool = open_widget("Film pack")
-    tool.file.restore({"file": str(film_pack.pack)})
-    run(tool)
-    names = [f"{title} – trio" for title in ("dose (Gy)", "fluence (1/(m² MeV))", "unusable")]
-    assert [layer.name for layer in window.layers] == names
-    fluence = layer_of(window, "fluence")
-    np.testing.assert_array_equal(fluence.data, pack_doses.fluence)
-    assert window.layers.selection.active is fluence
-    assert tool.packs.layer is fluence
-    first, _, last = (f"{energy:.3g}" for energy in pack_doses.energies)
-    assert texts_of(tool.report)["Films"] == f"3, {first} to {last} MeV"
-    np.testing.assert_allclose(tool.spectrum.fluence, mean_fluences(pack_doses))
-    hatched = [patch for patch in tool.plot.figure.axes[0].patches if patch.get_hatch()]
-    assert len(hatched) == 1
-    low, high = hatched[0].get_x(), hatched[0].get_x() + hatched[0].get_width()
-    assert low <= tool.spectrum.energies[-1] <= high
-    # The same pack again takes the place of its result.
-    run(tool)
-    assert len(window.layers) == 3
 
 
 def test_the_spectrum_follows_the_region(evaluated, pack_doses, wait):

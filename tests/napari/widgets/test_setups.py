@@ -42,13 +42,8 @@ def picker(qtbot):
 def typed(tool, energy):
     """Type a whole setup, field by field."""
     tool.setup.set_kind("proton")
-    values = {
-        "energy": energy,
-        "source_object_distance": 0.01,
-        "object_image_distance": 1.0,
-        "pixel_size": 2e-6,
-    }
-    for name, value in values.items():
+    lengths = {"source_object_distance": 0.01, "object_image_distance": 1.0, "pixel_size": 2e-6}
+    for name, value in {"energy": energy, **lengths}.items():
         enter(tool.setup.form.entries[name], value)
 
 
@@ -164,13 +159,9 @@ def test_other_files_do_not_inherit_a_setup(viewer, opened):
     tool = opened(Invert)
     tool.image.set_kind("files")
     typed(tool, 5.0)
-
-    def choose(pattern):
-        tool.image.form.restore({"path": pattern})
-
-    choose("monday/*.tif")
+    tool.image.form.restore({"path": "monday/*.tif"})
     assert tool.setup.setup() is not None
-    choose("tuesday/*.tif")
+    tool.image.form.restore({"path": "tuesday/*.tif"})
     assert tool.setup.setup() is None
     tool.setup.set_kind("proton")
     assert tool.setup.setup() is not None

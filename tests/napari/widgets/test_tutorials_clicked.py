@@ -95,10 +95,10 @@ def run(rest, qtbot):
 
 @pytest.fixture
 def save_reload(window, choose):
-    """Save the result, close everything and open the file."""
+    """Save the result under a name without ending, close everything and open the file."""
 
     def saved(tool, path, button="Save result…"):
-        choose(path)
+        choose(path.with_suffix(""))
         press(tool, button)
         assert path.exists()
         window.layers.clear()
@@ -175,7 +175,7 @@ def report_of(tool):
 
 
 def test_first_shadowgram_is_clicked_to_its_end(
-    window, tmp_path, menu, opened, run, save_reload, choose, wait
+    window, tmp_path, menu, opened, run, save_reload, choose, wait, messages
 ):
     text = page("first-shadowgram.md")
     menu(f"File > Open Sample > {PLUGIN} > Toroidal field below caustics")
@@ -215,12 +215,25 @@ def test_first_shadowgram_is_clicked_to_its_end(
     (save,) = [one for one in tool.recipes.menu().actions() if one.text() == "Save…"]
     save.trigger()
     assert (tmp_path / "recipe_source.npy").exists()
-    values = np.asarray(field.data)
+    verdict, values, setup = tool.verdict.text(), np.asarray(field.data), tool.setup.setup()
+    names = [layer.name for layer in window.layers if result_of(layer) is not None]
     save_reload(tool, tmp_path / "toroid.shadowinv")
-    again = layer_of(window, "field")
+    assert "toroid.shadowinv" in messages[-1]
+    wait(lambda: role_of(window.layers.selection.active) == "field")
+    again = window.layers.selection.active
     np.testing.assert_array_equal(np.asarray(again.data), values)
     assert unit_of(again) == "mT·m"
     assert result_of(again) is not None
+    assert again.colorbar.visible
+    assert tool.verdict.text() == verdict
+    assert [layer.name for layer in window.layers if layer.name in names] == names
+    assert {role_of(layer) for layer in window.layers if layer.visible} == {"field", "arrows"}
+    # The image has its setup and source, and is a shot again.
+    assert role_of(tool.image.layer) == "image"
+    assert tool.setup.setup() == setup
+    run(tool)
+    strongest = window.layers.selection.active.data.max()
+    assert strongest == pytest.approx(values.max(), rel=1e-6)
 
 
 def test_proton_radiograph_is_clicked_to_its_end(
@@ -342,15 +355,28 @@ def test_two_energies_are_clicked_to_their_end(
 
 
 def test_film_pack_is_clicked_to_its_end(
-    window, tmp_path, film_pack, opened, run, save_reload, choose, rest, wait
+    window, tmp_path, film_pack, pack_doses, opened, run, save_reload, choose, rest, wait
 ):
     """With three simulated films instead of the real ones."""
     tool = opened("Film pack")
     choose(film_pack.pack)
     press(tool, "…")
     run(tool)
+    names = [f"{title} – trio" for title in ("dose (Gy)", "fluence (1/(m² MeV))", "unusable")]
+    assert [layer.name for layer in window.layers] == names
     fluence = layer_of(window, "fluence")
-    assert fluence.data.shape[0] == len(tool.spectrum.energies) == 3
+    np.testing.assert_array_equal(fluence.data, pack_doses.fluence)
+    assert window.layers.selection.active is tool.packs.layer is fluence
+    first, _, last = (f"{energy:.3g}" for energy in pack_doses.energies)
+    assert f"Films 3, {first} to {last} MeV" in report_of(tool)
+    films = zip(pack_doses.fluence.astype(float), pack_doses.usable, strict=True)
+    np.testing.assert_allclose(tool.spectrum.fluence, [film[used].mean() for film, used in films])
+    (hatched,) = [patch for patch in tool.plot.figure.axes[0].patches if patch.get_hatch()]
+    low = hatched.get_x()
+    assert low <= tool.spectrum.energies[-1] <= low + hatched.get_width()
+    # The same pack again takes the place of its result.
+    run(tool)
+    assert len(window.layers) == 3
     window.dims.set_current_step(0, 1)
     energy = f"{tool.spectrum.energies[1]:.3g} MeV"
     wait(lambda: energy in str(_text_overlay(window).text))
