@@ -115,15 +115,15 @@ def test_a_rectangle_on_a_turned_image_crops_its_pixels():
 def test_a_source_is_moved_by_whole_pixels_only():
     beam = np.random.default_rng(1).uniform(1, 2, (40, 50))
     image = Image(np.ones((20, 30)), scale=(2, 2), translate=(6, 8), name="shot")
-    whole = Image(beam, scale=(2, 2), name="ref")
-    np.testing.assert_array_equal(source_on(whole, beam, image), beam[3:23, 4:34])
+    reference = Image(beam, scale=(2, 2), name="ref")
+    np.testing.assert_array_equal(source_on(reference, beam, image), beam[3:23, 4:34])
     for translate, words in (
         ((1, 0), r"50 × 40 px \(scale 2\), the image 'shot' 30 × 20 px"),  # half a pixel
         ((8, 0), "only a part"),
     ):
-        whole.translate = translate
+        reference.translate = translate
         with pytest.raises(InputError, match=words):
-            source_on(whole, beam, image)
+            source_on(reference, beam, image)
     # A setup has placed the shot; the reference was opened later, in pixels.
     square, beam = Image(np.ones((20, 20)), scale=(1.5, 1.5), units="um"), np.eye(20)
     assert source_on(Image(beam), beam, square) is beam
@@ -154,6 +154,6 @@ def test_a_cut_source_is_no_longer_its_file(tmp_path):
 
 def test_matrices_there_and_back_are_inverse():
     image = Image(np.ones((20, 30)), scale=(2, 3), rotate=20.0, units="um")
-    other = Image(np.ones((20, 30)), shear=[0.2], translate=(4, 5), units="mm")
-    there, back = matrix_between(image, other), matrix_between(other, image)
+    turned = Image(np.ones((20, 30)), shear=[0.2], translate=(4, 5), units="mm")
+    there, back = matrix_between(image, turned), matrix_between(turned, image)
     np.testing.assert_allclose(there @ back, np.eye(3), atol=1e-9)

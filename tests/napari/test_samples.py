@@ -28,10 +28,10 @@ def test_each_opens_with_its_setup_and_a_beam_that_has_its_light(viewer, name):
 
 
 def test_caustics_are_where_the_name_promises_them_in_flat_beams():
-    (beam, (below, _, _)), (other, (image, _, _)) = (
+    (beam, (below, _, _)), (second_beam, (image, _, _)) = (
         (make()[0][0], make()[-1]) for make in (samples.toroid, samples.toroid_with_caustics)
     )
-    assert np.ptp(beam) == np.ptp(other) == 0
+    assert np.ptp(beam) == np.ptp(second_beam) == 0
     assert image.max() > 8 * image.mean()
     assert below.max() < 8 * below.mean()
 

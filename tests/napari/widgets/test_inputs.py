@@ -89,12 +89,12 @@ def test_no_image_is_its_own_source(viewer, opened, plain, shot):
     tool = opened(Invert)
     assert tool.source.offered == []
     # Which of two unknown images is the beam, nobody but the user can tell.
-    other = viewer.add_image(shot, name="other")
+    second = viewer.add_image(shot, name="other")
     assert tool.image.layer is plain
-    assert tool.source.offered == [other]
+    assert tool.source.offered == [second]
     assert tool.source.layer is None
-    tool.source.layer = other
-    tool.image.layer = other
+    tool.source.layer = second
+    tool.image.layer = second
     assert tool.source.layer is None
     assert tool.source.offered == [plain]
 
@@ -373,15 +373,15 @@ def test_a_fit_from_a_file_has_its_beam(viewer, opened, tmp_path, images, kind):
     strength = [1.0, 0.5][:images]
     recorded = [OBJECT * BEAM * noise for noise in NOISE[:images]]
     shots = shots_of(recorded, source=BEAM, noise=0.01, strength=strength)
-    found = run_fit(Recipe(fit=FitChoices(options=options)), shots)
-    path = write(tmp_path / "fit.shadowinv", found.to_dataset())
+    result = run_fit(Recipe(fit=FitChoices(options=options)), shots)
+    path = write(tmp_path / "fit.shadowinv", result.to_dataset())
     add_layers(viewer, layers_of_dataset(read(path), "fit"))
     tool = opened(kind)
     source = tool.source
     if images == 1:
         assert source.is_supplied
         beam = source.measured(layer_of(viewer, "image")).image
-        np.testing.assert_array_equal(beam, found.source[0])
+        np.testing.assert_array_equal(beam, result.source[0])
     else:
         assert len(tool.images.used) == images
         assert role_of(source.layer) == "source"

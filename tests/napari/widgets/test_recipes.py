@@ -195,11 +195,11 @@ def test_the_command_does_what_the_window_saves(filled, run, shot_file, tmp_path
     recipe, out = tmp_path / "how.toml", tmp_path / "a.shadowinv"
     reloaded = by_command("invert", shot_file, "--recipe", recipe, out=out)
     np.testing.assert_array_equal(reloaded.displacement, mine.displacement)
-    one, other = reloaded.provenance, mine.provenance
-    assert one.recipe == other.recipe
-    assert one.image.sha256 == other.image.sha256
-    assert one.setup == other.setup
-    pixels = [[mask.mask() for mask in each.masks] for each in (one, other)]
+    of_command, of_window = reloaded.provenance, mine.provenance
+    assert of_command.recipe == of_window.recipe
+    assert of_command.image.sha256 == of_window.image.sha256
+    assert of_command.setup == of_window.setup
+    pixels = [[mask.mask() for mask in each.masks] for each in (of_command, of_window)]
     np.testing.assert_array_equal(*pixels)
 
 

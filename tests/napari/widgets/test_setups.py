@@ -34,9 +34,9 @@ def plain(viewer, shot):
 
 @pytest.fixture
 def picker(qtbot):
-    made = SetupPicker()
-    qtbot.addWidget(made)
-    return made
+    widget = SetupPicker()
+    qtbot.addWidget(widget)
+    return widget
 
 
 def typed(tool, energy):
@@ -142,13 +142,13 @@ def test_a_loaded_setup_goes_with_the_image_until_run(viewer, opened, plain, pro
     assert tool.setup.setup() == proton_setup
     assert tool.setup.note.text() == "Loaded from tcc.toml."
     enter(tool.setup.form.entries["energy"], 5.0)
-    other = viewer.add_image(np.ones((20, 30)), name="other")
-    tool.image.layer = other
+    second = viewer.add_image(np.ones((20, 30)), name="other")
+    tool.image.layer = second
     assert tool.setup.setup().energy == 5.0
     tool.request()
     assert setup_of(plain) is None
-    assert setup_of(other).energy == 5.0
-    assert setup_origin_of(other) == "loaded from tcc.toml, changed by hand for 'other'"
+    assert setup_of(second).energy == 5.0
+    assert setup_origin_of(second) == "loaded from tcc.toml, changed by hand for 'other'"
     assert tool.setup.note.text() == "Loaded from tcc.toml, changed by hand for 'other'."
     # From then on it is the setup of this image only.
     tool.image.layer = plain
