@@ -12,6 +12,7 @@ from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
     is_estimate,
+    result_of,
     role_of,
     setup_of,
     source_of,
@@ -37,6 +38,7 @@ def add_shot(viewer, image, setup=None):
 def test_invert_makes_the_layers_of_the_default_inversion(viewer, shot, proton_setup):
     layer = add_shot(viewer, shot, proton_setup)
     layer.translate = (30.0, 60.0)
+    layer.metadata[KEY]["setup_origin"] = "came with experiment.h5"
     by_role = {role_of(keywords): (data, keywords)
                  for data, keywords, _ in commands.invert_uniform(layer)}  # fmt: skip
     field = proton_setup.path_integrated_b(invert(shot).displacement)
@@ -45,6 +47,13 @@ def test_invert_makes_the_layers_of_the_default_inversion(viewer, shot, proton_s
     assert keywords["name"] == "± |∫B×dz| (µT·m) – shot"
     assert keywords["translate"] == (30.0, 60.0)
     assert keywords["scale"] == (1.5, 1.5)
+    # They have the setup of the layer, and say so; without one, none.
+    for _, keywords, _ in commands.invert_uniform(layer):
+        assert setup_of(keywords) == proton_setup
+        assert result_of(keywords).origins["Setup"] == "came with experiment.h5"
+    ((_, keywords, _), *_) = commands.invert_uniform(add_shot(viewer, shot))
+    assert setup_of(keywords) is None
+    assert "Setup" not in result_of(keywords).origins
 
 
 def test_the_shot_that_is_shown_is_taken_of_a_stack(viewer, shot):

@@ -16,7 +16,6 @@ from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
     result_of,
     role_of,
-    setup_of,
     setup_origin_of,
 )
 from napari_shadowinv._napari.layers import add_layers, add_to_viewer
@@ -110,16 +109,6 @@ def test_results_are_not_offered_as_shots(viewer, opened, plain, solved):
     for command in (commands.invert_uniform, commands.high_pass):
         with pytest.raises(InputError, match="is part of a result: select the shot"):
             command(field)
-
-
-def test_one_click_takes_the_setup_of_the_layer_and_says_so(of_a_file, plain, proton_setup):
-    for layer, setup, origin in (
-        (of_a_file, proton_setup, "came with experiment.h5"),
-        (plain, None, None),
-    ):
-        for _, keywords, _ in commands.invert_uniform(layer):
-            assert setup_of(keywords) == setup
-            assert result_of(keywords).origins.get("Setup") == origin
 
 
 def test_a_source_can_be_filtered_and_stays_one(viewer, opened):

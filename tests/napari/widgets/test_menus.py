@@ -115,13 +115,8 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(preferences, windo
     qtbot.addWidget(dialog)
     pages = {dialog._list.item(row).text(): row for row in range(dialog._list.count())}
     dialog._list.setCurrentRow(pages["Shadowinv"])
-    page = dialog._stack.currentWidget()
-    choices = [
-        box
-        for box in page.findChildren(QComboBox)
-        if box.findText("cm") >= 0 and box.findText("mm") >= 0
-    ]
-    (lengths,) = choices
+    boxes = dialog._stack.currentWidget().findChildren(QComboBox)
+    (lengths,) = [box for box in boxes if box.findText("cm") >= 0 and box.findText("mm") >= 0]
     lengths.setCurrentIndex(lengths.findText("mm"))
     assert preference("units", "length") == "mm"
     dialog.reject()

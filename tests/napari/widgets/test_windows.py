@@ -165,7 +165,7 @@ def a_stack(viewer, opened, shot, tmp_path, **_):
 def a_fit(viewer, opened, shot, **_):
     for name, energy in (("fast", 14.7), ("slow", 6.0)):
         setup = EXAMPLE.model_copy(update={"energy": energy})
-        viewer.add_image(shot**energy, name=name, metadata=metadata_for("shot", "", setup))
+        viewer.add_image(shot + energy, name=name, metadata=metadata_for("shot", "", setup))
     tool = opened(FitImages)
     tool.options.restore(QUICK)
     return tool
