@@ -11,6 +11,7 @@ import pytest
 from helpers.windows import PATIENCE, at_rest, running_threads
 from napari_shadowinv._napari.form import PROBLEM_STYLE
 from napari_shadowinv._napari.run import _Mailbox
+from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -150,14 +151,20 @@ def refused(wait, qtbot, messages):
 
 @pytest.fixture
 def held(monkeypatch):
-    """Hold all work, as a large image would, until it is asked to stop or let go."""
+    """Hold all work, as a large image would, until it is let go, or asked to stop: see `stops`."""
     let_go, fill = threading.Event(), _Mailbox.fill
+    let_go.stops = []  # whether each work then ended by itself
 
     def hold(box, work):
         def later(on_progress, should_stop):
             while not (let_go.is_set() or should_stop()):
                 time.sleep(0.01)
-            return work(on_progress, should_stop)
+            let_go.stops.append(False)
+            try:
+                return work(on_progress, should_stop)
+            except InversionCancelled:
+                let_go.stops[-1] = True
+                raise
 
         fill(box, later)
 

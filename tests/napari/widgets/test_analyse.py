@@ -121,6 +121,11 @@ def test_drawn_circle_measures_the_same_current_as_python(form, measure, inversi
     assert measured["current"].value == expected["current"].value
     np.testing.assert_array_equal(measured["current"].samples, expected["current"].samples)
     assert expected.facts[0].text in texts_of(form.report).values()
+    # The centre of an object along the beam is that of a circle, too.
+    draw(form, "azimuthal", "ellipse", [[23.5, 23.5], [15.0, 15.0]])
+    axis = measure(form).product
+    assert axis.center == pytest.approx((23.5, 23.5))
+    assert axis.radius == pytest.approx(15.0)
 
 
 def test_profile_is_drawn_with_its_bands(form, measure):
@@ -147,13 +152,6 @@ def test_entries_of_a_product_are_those_of_its_model(form):
         offered |= form._picker.form.entries.keys()
     assert {"width", "find_tilt", "component", "path_length", "smoothing"} <= offered
     assert offered.isdisjoint({"path", "center", "rectangle", "label", "noise_power"})
-
-
-def test_centre_of_an_object_along_the_beam_is_that_of_a_circle(form, measure):
-    draw(form, "azimuthal", "ellipse", [[23.5, 23.5], [15.0, 15.0]])
-    measured = measure(form).product
-    assert measured.center == pytest.approx((23.5, 23.5))
-    assert measured.radius == pytest.approx(15.0)
 
 
 def test_map_becomes_a_layer_on_its_result(form, viewer, measure):

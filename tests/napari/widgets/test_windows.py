@@ -204,6 +204,7 @@ def ready(viewer, opened, shot, tmp_path, film_pack, solved):
 @pytest.mark.parametrize("make", [a_shot, a_stack, a_fit, a_pack, an_image, a_plan, a_product])
 def test_cancelled_work_leaves_nothing(ready, cancelled, held, make):
     cancelled(ready(make))
+    assert held.stops == [True]
 
 
 @pytest.mark.parametrize("make", [a_shot, a_fit])
