@@ -25,7 +25,6 @@ from napari_shadowinv._napari.layer_metadata import (
     unit_of,
 )
 from napari_shadowinv._napari.layers import fit_layers
-from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.cautions import Caution
@@ -41,7 +40,6 @@ from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.shot import Shot, shots_of
 
-REDRAW_MS = _panels._REDRAW_MS  # ms
 SHAPE = (48, 64)
 LENGTHS = {"source_object_distance": 1.3e-3, "object_image_distance": 2e-2, "pixel_size": 1.5e-6}
 ENERGIES = (14.7, 6.0)
@@ -57,12 +55,6 @@ def images(noise=0.01):
     rng = np.random.default_rng(5)
     planes = [predict_image(TRUTH, SETUPS[0], setup) for setup in SETUPS]
     return [300 * plane * rng.normal(1, noise, plane.shape) for plane in planes]
-
-
-@pytest.fixture(autouse=True)
-def _curve_at_the_end(monkeypatch):
-    """Draw the curve once: repeated drawing would take as long as these fits."""
-    monkeypatch.setattr(_panels, "_REDRAW_MS", 120_000)
 
 
 @pytest.fixture
@@ -259,14 +251,11 @@ def test_a_fit_that_is_far_on_ends_soon_after_cancel(viewer, tool, cancelled, mo
     for layer, plane in zip(viewer.layers, images(noise=0), strict=True):
         large = zoom(plane, 4, order=1)
         layer.data = large * rng.normal(1, 0.01, large.shape)
-    tool.view._redraw_timer.setInterval(REDRAW_MS)
     tool.options.restore({**QUICK, "samples": 1000, "max_iterations": 1})
 
     def draws_samples():
         traced.clear()
-        is_told = tool.panel.status.text().startswith("Fitting: stage 3 of 3")
-        is_last = any(stage == "samples" for stage, _ in tool.panel.tag.history)
-        return is_last and is_told and not tool.view.curve.isHidden()
+        return tool.panel.status.text().startswith("Fitting: stage 3 of 3, samples")
 
     cancelled(tool, draws_samples)
     assert len(traced) <= 8 * len(ENERGIES)  # a line search of the step under way

@@ -10,11 +10,9 @@ from qtpy import QtWidgets
 from qtpy.QtCore import Qt
 from typer.testing import CliRunner
 
-from helpers.windows import PATIENCE
 from napari_shadowinv import Instrument
 from napari_shadowinv._napari.layer_metadata import result_of, role_of, unit_of
 from napari_shadowinv._napari.viewer_sync import _text_overlay
-from napari_shadowinv._napari.widgets import _panels
 from napari_shadowinv._napari.widgets._panels import ReportView
 from napari_shadowinv.cli import app
 from napari_shadowinv.io.store import DONE
@@ -320,10 +318,9 @@ def test_no_reference_is_clicked_to_its_end(window, tmp_path, menu, opened, run,
 
 
 def test_two_energies_are_clicked_to_their_end(
-    window, tmp_path, monkeypatch, menu, opened, run, save_reload, choose
+    window, tmp_path, menu, opened, run, save_reload, choose
 ):
     text = page("two-energies.md")
-    monkeypatch.setattr(_panels, "_REDRAW_MS", PATIENCE)  # the curve once, at the end
     menu(f"File > Open Sample > {PLUGIN} > Two energies, beam not recorded")
     tool = opened("Fit several images")
     table = tool.images
