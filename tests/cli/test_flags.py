@@ -1,6 +1,5 @@
 """Flags of the commands, the keys that --set takes, and the sentences about their values."""
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -74,46 +73,8 @@ def test_bad_values_are_named_by_their_keys(command: str, section: str) -> None:
         assert f"{section}.{key} is " in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("setting", "sentence"),
-    [
-        ("options.tolernce=1", "options.tolernce: did you mean options.tolerance?"),
-        ("tolerance=1", "tolerance: did you mean options.tolerance?"),
-        ("option.beam_rms=1", "option.beam_rms: did you mean instrument.beam_rms?"),
-        ("zzz=1", "zzz: expected a key that begins with options., instrument."),
-        ("options.tolerance", "expected KEY=VALUE"),
-    ],
-)
-def test_a_wrong_key_is_refused_with_the_nearest(
-    refused: Callable[..., None], setting: str, sentence: str
-) -> None:
-    refused("invert", "shot.npy", "--set", setting, names=sentence)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (
-            "invert shot.npy --set options.solver=lbfgs --boundary free",
-            "options.solver is 'lbfgs' and --boundary is 'free', expected",
-        ),
-        (
-            "invert shot.npy --set options.noise_level=2 --set options.units_per_quantum=3",
-            "options.noise_level is 2 and options.units_per_quantum is 3, expected one",
-        ),
-        ("invert shot.npy --accuracy 3", "--accuracy is 3"),
-        ("invert shot.npy --instrument film,filn", "--instrument is 'film,filn': did you mean"),
-        ("invert shot.npy --instrument film,camera", "expected one detector and one beam"),
-        ("batch shot.npy --out a.shadowinv.zarr --workers 0", "--workers is 0"),
-    ],
-)
-def test_contradictions_name_flags_and_keys(
-    refused: Callable[..., None], arguments: str, sentence: str
-) -> None:
-    refused(*arguments.split(), names=sentence)
-
-
-def test_keys_steps_and_sources_are_completed() -> None:
+def test_commands_keys_steps_and_sources_are_completed() -> None:
+    assert completed("shadowinv inv") == ["invert"]
     keys = {f"{key}=" for key in keys_of(INVERSION_SECTIONS)}
     assert keys <= set(completed("shadowinv invert shot.npy --set o")) | set(
         completed("shadowinv invert shot.npy --set i")

@@ -31,6 +31,24 @@ def shadowinv(*arguments: object) -> Result:
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
+def done(*arguments: object, code: int = 0) -> str:
+    """Run the command, which must end with a code, and return its output in one line."""
+    result = shadowinv(*arguments)
+    assert result.exit_code == code, result.output
+    return flat(result.output)
+
+
+def refused(*arguments: object, names: str | tuple[str, ...]) -> None:
+    """Run a command that must fail with one sentence and write nothing in the current folder."""
+    before = content(Path()), {*Path().rglob("*")}
+    result = shadowinv(*arguments)
+    assert result.exit_code == 2, result.output
+    (line,) = result.stderr.splitlines()
+    for name in (names,) if isinstance(names, str) else names:
+        assert name in flat(line)
+    assert (content(Path()), {*Path().rglob("*")}) == before
+
+
 def run_line(line: str, *more: str, columns: int = 300) -> Result:
     """Run the command as a page shows it; it must succeed."""
     result = CliRunner().invoke(app, [*shlex.split(line), *more], env={"COLUMNS": str(columns)})
