@@ -81,25 +81,17 @@ def test_waiting_file_that_changes_or_goes_no_longer_waits(watch, tmp_path):
     assert watching.names_after(1.1) == ["shot_1.npy"]
 
 
-def test_file_has_its_final_name_when_it_is_named(watch, tmp_path):
+def test_files_have_their_final_names_and_are_in_counting_order(watch, tmp_path):
     watching = watch()
-    (tmp_path / "shot_1.npy.part").write_bytes(bytes(10))
-    (tmp_path / ".shot_2.npy").write_bytes(bytes(10))
+    for name in ("shot_10.npy.part", ".shot_9.npy", "shot_2.npy.part"):
+        (tmp_path / name).write_bytes(bytes(10))
     assert watching.names_after(1.0) == []
     assert watching.names_after(2.0) == []
-    for name in ("shot_1.npy.part", ".shot_2.npy"):
+    for name in ("shot_10.npy.part", ".shot_9.npy", "shot_2.npy.part"):
         (tmp_path / name).rename(tmp_path / name.strip(".").removesuffix(".part"))
     assert watching.names_after(1.0) == []
-    assert watching.names_after(1.1) == ["shot_1.npy", "shot_2.npy"]
-    assert not watching.arrivals.left_out
-
-
-def test_files_complete_at_once_are_in_counting_order(watch, tmp_path):
-    for number in (10, 9, 2):
-        (tmp_path / f"shot_{number}.npy").write_bytes(bytes(10))
-    watching = watch()
-    watching.names_after(0.0)
     assert watching.names_after(1.1) == ["shot_2.npy", "shot_9.npy", "shot_10.npy"]
+    assert not watching.arrivals.left_out
 
 
 def test_existing_files_are_ignored_until_they_change(watch, tmp_path):

@@ -7,7 +7,7 @@ import csv
 import numpy as np
 import pytest
 
-from helpers.command_line import flat, shadowinv
+from helpers.command_line import done
 from napari_shadowinv._napari.stores import shot_rows
 from napari_shadowinv.io import store_columns
 from napari_shadowinv.io.store import StackStore
@@ -47,12 +47,12 @@ def test_added_column_is_read_and_listed_everywhere(
     assert written.site_count.attrs["long_name"] == "Number of sites"
     assert StackStore(out).columns[-1] is site_column
 
-    listed = flat(shadowinv("info", out, "--all").output)
+    listed = done("info", out, "--all")
     assert "places" in listed
     assert "0100" in listed
 
     table = tmp_path / "t.csv"
-    shadowinv("export", out, "--format", "csv", "--out", table)
+    done("export", out, "--format", "csv", "--out", table)
     with table.open(newline="", encoding="utf-8") as f:
         assert [row["site_count"] for row in csv.DictReader(f)] == ["100", ""]
 

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import re
-import shlex
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
-from typer.testing import CliRunner
 
+from helpers.command_line import run_line
+from helpers.pages import blocks, commands, run_python, text_of
 from napari_shadowinv import Shot, invert, run_stack
-from napari_shadowinv.cli import app
 from napari_shadowinv.pipeline.shot_table import ShotRow
 
-PAGE = (Path(__file__).parents[2] / "docs" / "batch.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"^    (shadowinv [^#\n]*)", PAGE, re.MULTILINE)
+PAGE = text_of("docs/batch.md")
+COMMANDS = [line.partition("#")[0] for line in commands(PAGE)]
 
 
 @pytest.fixture
@@ -38,24 +36,19 @@ def folder(night, tmp_path, monkeypatch) -> Path:
 
 def run_job_array() -> None:
     """Run the script of the page for the shots that there are."""
-    (script,) = re.findall(r"```bash\n(#!/bin/bash\n#SBATCH --array=0-9\n.*?)```", PAGE, re.DOTALL)
+    script = next(block for block in blocks(PAGE, "bash") if "--array=0-9" in block)
     (command,) = re.findall(r"^shadowinv (.*)$", script.replace("\\\n", " "), re.MULTILINE)
     for task in "3021":
-        arguments = shlex.split(command.replace("$SLURM_ARRAY_TASK_ID", task))
-        result = CliRunner().invoke(app, arguments)
-        assert result.exit_code == 0, result.output
+        run_line(command.replace("$SLURM_ARRAY_TASK_ID", task))
 
 
 def test_python_blocks_of_the_page_keep_their_promise(folder, night):
-    names: dict[str, Any] = {}
     run_job_array()
     run_stack(Shot("shots/*.tif", source="reference.tif"), "live.shadowinv.zarr")
     lines = [f"{number}, {number}.5\n" for number in (3, 0, 1, 2)]
     Path("day.csv").write_text("".join(["shot, delay (ns)\n", *lines]))
-    blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    for block in blocks:
-        if "cluster" not in block:
-            exec(compile(block, "batch.md", "exec"), names)
+    local = [block for block in blocks(PAGE, "python") if "cluster" not in block]
+    names = run_python("".join(f"```python\n{block}```\n" for block in local))
     alone = invert(tifffile.imread("shots/shot_3.tif"), source=tifffile.imread("reference.tif"))
     assert float(names["one"].max()) == pytest.approx(alone.potential.max())
     assert list(names["later"].status) == [1] * 4
@@ -76,41 +69,28 @@ def test_page_lists_the_columns_of_the_model():
 
 def test_the_commands_work_as_shown(folder, night):
     pytest.importorskip("imageio_ffmpeg")
-    batch = ["batch", "shots/*.tif", "--source", "reference.tif", "--out", "night.shadowinv.zarr"]
-    assert batch == shlex.split(COMMANDS[0])[1:]
-    runner = CliRunner()
     Path("setup.toml").write_text(
         'kind = "proton"\nenergy = 14.7\nsource_object_distance = 0.01\n'
         "object_image_distance = 0.3\npixel_size = 1e-5\n"
     )
-    fast = ["--scheduler", "threads", "--set=options.n_sites=100", "--setup", "setup.toml"]
-    assert runner.invoke(app, [*batch, *fast]).exit_code == 0
     bare = np.ones(night.source.shape, np.uint8)
     bare[4:17, 6:22] = 0
     iio.imwrite("bare.png", bare)
+    fast = ["--scheduler", "threads", "--set=options.n_sites=100", "--setup", "setup.toml"]
     (guessing,) = [command for command in COMMANDS if "--source-from" in command]
-    command = [*shlex.split(guessing)[1:], *fast]
-    assert runner.invoke(app, command).exit_code == 0
+    for command in (COMMANDS[0], guessing):
+        run_line(command, *fast)
     # The field reaches the edge: a warning.
     cautious = ["--set=options.n_sites=100", "--set=instrument.beam_rms=0"]
-    watches = [command for command in COMMANDS if command.startswith("shadowinv watch")]
-    for watching in watches:
-        if "status_file" in watching:
+    for watch in (command for command in COMMANDS if command.startswith("watch")):
+        if "status_file" in watch:
             tifffile.imwrite("shots/shot_3.tif", night.images[0].astype("float32"))
-        result = runner.invoke(app, [*watching.split()[1:], "--idle", "0.2", *cautious])
-        assert result.exit_code == 0, result.output
-        assert result.stdout.splitlines()[0].startswith("Watching shots for images; ")
+        printed = run_line(watch, "--idle", "0.2", *cautious).stdout
+        assert printed.splitlines()[0].startswith("Watching shots for images; ")
     keys = re.findall(r'"(\w+)":', re.findall(r"```text\n(\{.*?)```", PAGE, re.DOTALL)[0])
     status = Path("status.json").read_text()
     assert [key for key in keys if f'"{key}"' not in status] == []
-    commands = [command for command in COMMANDS if not re.search("batch|watch", command)]
-    assert len(commands) == 7
-    for command in commands:
-        result = runner.invoke(app, command.split()[1:])
-        assert result.exit_code == 0, result.output
-
-
-def test_every_link_of_the_page_leads_somewhere():
-    for target in re.findall(r"\]\(([^)#]+)\)", PAGE):
-        if not target.startswith("http"):
-            assert (Path(__file__).parents[2] / "docs" / target).exists(), target
+    remaining = [command for command in COMMANDS if not re.match("batch|watch", command)]
+    assert len(remaining) == 7
+    for command in remaining:
+        run_line(command)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import dask.array as da
@@ -11,7 +10,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from helpers.command_line import flat, shadowinv
+from helpers.command_line import done, shadowinv
+from helpers.results import provenance_in
 from napari_shadowinv import InputError, invert_stack, read
 from napari_shadowinv.io.store import DONE, FAILED
 
@@ -99,21 +99,28 @@ def test_frame_that_is_missing_fails_alone(any_night, run_file, out):
     assert "does not hold frame 6" in str(stored.report.values[6])
 
 
-def test_batch_and_info_take_arrays_of_hdf5(any_night, run_file, out, tmp_path):
+def test_batch_and_info_take_arrays_of_hdf5(any_night, run_file, out, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    usable = np.ones(any_night.source.shape, np.uint8)
+    usable[:3] = 0
+    data = "run.h5::/entry/data/data"
     with h5py.File(run_file, "r+") as file:
-        file["entry/reference"] = any_night.source
-    more = ("--source", f"{run_file}::/entry/reference", "--set=options.n_sites=100")
-    result = shadowinv("batch", f"{run_file}::/entry/data/data", "--out", out, *more)
-    assert result.exit_code == 0, result.output
-    expected = any_night.run(out.with_name("expected.shadowinv.zarr"))
-    stored = read(out)
-    np.testing.assert_array_equal(stored.potential, expected.potential)
-    source = json.loads(stored.provenance)["images"][0]["source"]
-    assert (source["file"], source["variable"]) == ("run.h5", "/entry/reference")
+        file["entry/beam"], file["entry/usable"] = any_night.source, usable
+    (tmp_path / "table.csv").write_text(f"file, mask\n{data}[1], run.h5::/entry/usable\n")
+    common = ("--source", "run.h5::/entry/beam", "--set=options.n_sites=100", "--out")
+    shadowinv("batch", data, "--mask", "run.h5::/entry/usable", *common, out)
+    shadowinv("batch", "table.csv", *common, "table.shadowinv.zarr")
+    many, row = read(out), read("table.shadowinv.zarr")
+    assert (many.status == DONE).all()
+    expected = any_night.run(out.with_name("expected.shadowinv.zarr"), mask=usable > 0)
+    np.testing.assert_array_equal(many.displacement, expected.displacement)
+    np.testing.assert_array_equal(many.mask, 6 * [usable != 0])
+    np.testing.assert_array_equal(row.displacement[0], many.displacement[1])
+    assert list(row.name.values) == [f"{data}[1]"]
+    source = provenance_in(many).image.source
+    assert (source.file, source.variable) == ("run.h5", "/entry/beam")
 
-    listed = flat(shadowinv("info", f"{run_file}::/entry/data/data").output)
+    listed = done("info", data)
     assert "6 frames, run.h5[0] to run.h5[5]" in listed
     assert "(6, 24, 28), [shot, y, x]" in listed
-    result = shadowinv("invert", f"{run_file}::entry/data/data")
-    assert result.exit_code == 2
-    assert "such as 'entry/data/data[0]'" in flat(result.output)
+    assert "such as 'entry/data/data[0]'" in done("invert", "run.h5::entry/data/data", code=2)

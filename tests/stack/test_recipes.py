@@ -19,10 +19,11 @@ import numpy as np
 import pytest
 import tifffile
 
+from helpers.pages import blocks, text_of
 from napari_shadowinv import read
 from napari_shadowinv.io.store import DONE
 
-PAGE = (Path(__file__).parents[2] / "docs" / "batch.md").read_text(encoding="utf-8")
+PAGE = text_of("docs/batch.md")
 SOURCES = Path(sys.modules["napari_shadowinv"].__file__ or "").parents[1]
 PATIENCE = 120
 
@@ -48,13 +49,6 @@ exec {sys.executable} -m dask "$@"
 SHADOWINV = f"""#!/bin/sh
 exec {sys.executable} -c "from napari_shadowinv.cli import app; app()" "$@"
 """
-
-
-def block(word: str) -> str:
-    """Return the block of the page in which a word is."""
-    blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    (code,) = [text for text in blocks if word in text]
-    return code
 
 
 @pytest.fixture
@@ -104,7 +98,7 @@ def end_group(leader: int) -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="the loopback's name is lo")
 def test_the_recipe_for_slurm_inverts_a_stack(project, slurm, tmp_path):
     pytest.importorskip("dask_jobqueue")
-    recipe = block("SLURMCluster")
+    (recipe,) = (block for block in blocks(PAGE, "python") if "SLURMCluster" in block)
     for theirs, ours in (("/project", str(project)), ("32,", "2,"), ("64GB", "2GB")):
         assert theirs in recipe
         recipe = recipe.replace(theirs, ours)

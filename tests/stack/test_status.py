@@ -10,13 +10,6 @@ from napari_shadowinv.io.store import StackStore
 from napari_shadowinv.stack import RunStatus
 
 
-def test_rate_and_forecast_follow_from_the_numbers():
-    status = RunStatus(total=12, done=8, failed=1, waiting=3, ended=6, seconds=12.0)
-    assert status.rate == 0.5
-    assert status.remaining == 6.0
-    assert RunStatus(total=3, waiting=3).remaining is None
-
-
 @pytest.mark.parametrize(
     ("status", "text"),
     [
@@ -26,8 +19,11 @@ def test_rate_and_forecast_follow_from_the_numbers():
         (RunStatus(done=2, waiting=5, scheduler="watching"), "2 done, 5 waiting"),
     ],
 )
-def test_text_names_the_numbers_above_zero(status, text):
+def test_text_names_numbers_above_zero_and_the_rest_follows_from_them(status, text):
     assert status.text == text
+    status = RunStatus(total=12, done=8, failed=1, waiting=3, ended=6, seconds=12.0)
+    assert (status.rate, status.remaining) == (0.5, 6.0)
+    assert RunStatus(total=3, waiting=3).remaining is None
 
 
 def test_status_counts_shots_of_earlier_runs(make_night, out):

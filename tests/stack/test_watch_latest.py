@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.command_line import shadowinv
+from helpers.command_line import done
 from helpers.night import OPTIONS
 from helpers.watched import SETTLE, SOURCE, Watched, put, watched_once
-from napari_shadowinv import InputError, Instrument, Shot, read, run_stack
+from napari_shadowinv import InputError, Instrument, Recipe, Shot, read, run_stack
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
 from napari_shadowinv.pipeline import WatchOptions
 from napari_shadowinv.stack import watch_stack
@@ -79,14 +79,9 @@ def test_existing_files_are_passed_over_but_the_newest_and_done_ones(folder, out
     (folder / "shot_4.npy").unlink()
     put(folder, 4)
     files = [folder / f"shot_{number}.npy" for number in range(5)]
-    later = run_stack(Shot(files, source=SOURCE), out, recipe_of_watch(), run={"redo_failed": True})
+    recipe = Recipe(options=OPTIONS)
+    later = run_stack(Shot(files, source=SOURCE), out, recipe, run={"redo_failed": True})
     assert numbers_of(later) == [(name, DONE) for name in "14023"]
-
-
-def recipe_of_watch():
-    from napari_shadowinv import Recipe
-
-    return Recipe(options=OPTIONS)
 
 
 def test_shot_in_work_is_pending_when_the_watch_ends(folder, out):
@@ -108,12 +103,10 @@ def test_shot_in_work_is_pending_when_the_watch_ends(folder, out):
 
 def test_command_counts_what_it_passes_over_and_ends_well(folder, out):
     put(folder, 0, 1, 2)
-    result = shadowinv(
-        "watch", folder, "--pattern", "*.npy", "--out", out, "--set=options.n_sites=100",
-        "--latest", "--set=run.max_shots=1", f"--set=run.settle={SETTLE}",
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
-    assert "Stopped: 1 done, 2 skipped; repeat" in result.stdout
+    keys = [f"--set={key}" for key in ("options.n_sites=100", "run.max_shots=1")]
+    settle = f"--set=run.settle={SETTLE}"
+    printed = done("watch", folder, "--pattern", "*.npy", "--out", out, "--latest", settle, *keys)
+    assert "Stopped: 1 done, 2 skipped; repeat" in printed
     assert numbers_of(read(out)) == [("2", DONE)]
 
 
