@@ -25,7 +25,7 @@ def file(tmp_path: Path) -> Iterator[Any]:
 
 def shot_in(file: Any, name: str = "data") -> Any:
     """Return what is read from a file that is still open for writing."""
-    path = Path(file.filename)
+    path = file.filename
     file.close()
     return read_shot(f"{path}::{name}")
 
@@ -58,16 +58,13 @@ def test_offset_of_nexus_is_added_before_its_factor(file: Any, prefix: str) -> N
     np.testing.assert_array_equal(shot_in(file, "entry/data").image, (COUNTS + 5) * 2)
 
 
-def test_factor_of_each_frame_is_its_own(file: Any) -> None:
-    file["data"] = np.stack([COUNTS, COUNTS])
-    file["data_scaling_factor"] = np.array([2.0, 3.0])
+def test_factor_of_each_frame_is_its_own_and_of_another_number_none(file: Any) -> None:
+    path = file.filename
+    file["data"], file["one"] = np.stack([COUNTS, COUNTS]), COUNTS
+    file["data_scaling_factor"], file["one_scaling_factor"] = np.array([2.0, 3.0]), np.ones(7)
     np.testing.assert_array_equal(shot_in(file, "data[1]").image, 3 * COUNTS)
-
-
-def test_factors_of_another_number_are_refused(file: Any) -> None:
-    file["data"], file["data_scaling_factor"] = COUNTS, np.ones(7)
-    with pytest.raises(FileFormatError, match="7 numbers in 'data_scaling_factor'"):
-        shot_in(file)
+    with pytest.raises(FileFormatError, match="7 numbers in 'one_scaling_factor'"):
+        read_shot(f"{path}::one")
 
 
 def nexus(file: Any, frames: Any) -> Any:
@@ -97,8 +94,7 @@ def test_pixel_mask_of_each_frame_is_its_own(file: Any) -> None:
     flags[1, 2, 0] = 1
     nexus(file, np.stack([COUNTS, COUNTS]))["pixel_mask"] = flags
     path = file.filename
-    file.close()
-    assert read_shot(f"{path}::entry/data/data[0]").mask is None
+    assert shot_in(file, "entry/data/data[0]").mask is None
     assert not read_shot(f"{path}::entry/data/data[1]").mask[2, 0]
 
 

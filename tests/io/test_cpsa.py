@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.command_line import flat, shadowinv
+from helpers.command_line import done
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read, read_shot, read_tracks
 from napari_shadowinv.pipeline.rerun import rerun
@@ -115,11 +115,14 @@ def test_ranges_choose_tracks_and_are_kept(scan: Path) -> None:
         assert again.metadata == shot.metadata
 
 
-def test_a_usual_bin_holds_fifty_tracks_on_average(scan: Path) -> None:
+def test_a_usual_bin_holds_fifty_tracks_and_gaps_are_reported(scan: Path, tmp_path: Path) -> None:
     shot = read_shot(scan)
     assert shot.image.shape == (2, 4)
     assert shot.image.sum() == 432  # 54 in each
     assert shot.metadata["geometry"]["detector_pixel_size"] == pytest.approx(600e-6)
+    frames = snake(4, 4, lambda c, r: [ROUND])
+    path = save(tmp_path / "a.cpsa", (4, 4), frames, pitch=1.2)
+    assert "overlap or leave gaps" in str(read_shot(path).cautions)
 
 
 @pytest.mark.parametrize(
@@ -134,12 +137,6 @@ def test_impossible_ranges_are_refused(scan: Path, text: str) -> None:
     with pytest.raises(InputError, match="expected") as error:
         read(scan, variable=text)
     assert "\n" not in str(error.value)
-
-
-def test_gaps_between_frames_are_reported(tmp_path: Path) -> None:
-    frames = snake(4, 4, lambda c, r: [ROUND])
-    path = save(tmp_path / "a.cpsa", (4, 4), frames, pitch=1.2)
-    assert "overlap or leave gaps" in str(read_shot(path).cautions)
 
 
 WRONG_HEADERS: list[dict[str, float]] = [
@@ -183,15 +180,9 @@ def test_frames_twice_or_with_too_many_tracks_are_refused(tmp_path: Path) -> Non
             read_tracks(path)
 
 
-def test_a_scan_larger_than_the_memory_is_refused(
-    scan: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_is_too_large_empty_or_no_scan_is_refused(
+    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("SHADOWINV_MAX_GB", "1e-6")
-    with pytest.raises(FileFormatError, match="expands to"):
-        read_tracks(scan)
-
-
-def test_other_files_are_no_scans(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     np.save(path, np.ones((4, 4)))
     with pytest.raises(InputError, match="nor a CR-39 scan"):
@@ -199,19 +190,19 @@ def test_other_files_are_no_scans(tmp_path: Path) -> None:
     empty = save(tmp_path / "none.cpsa", (2, 2), snake(2, 2, lambda c, r: []))
     with pytest.raises(InputError, match="no track lies within the ranges"):
         read(empty)
+    monkeypatch.setenv("SHADOWINV_MAX_GB", "1e-6")
+    with pytest.raises(FileFormatError, match="expands to"):
+        read_tracks(scan)
 
 
 def test_the_command_inverts_a_scan(scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(scan.parent)
-    chosen = "diameter=:12 contrast=:40 bin=100"
-    done = shadowinv("invert", f"{scan}::{chosen}", "--out", "a.shadowinv")
-    assert done.exit_code == 0, done.output
-    image = read_shot(scan, variable=chosen).image
-    assert image.shape == (12, 24)
-    np.testing.assert_allclose(read(Path("a.shadowinv"))["residual"].shape, image.shape)
+    chosen = f"{scan}::diameter=:12 contrast=:40 bin=100"
+    done("invert", chosen, "--out", "a.shadowinv")
+    assert read("a.shadowinv")["residual"].shape == read_shot(chosen).image.shape == (12, 24)
     assert rerun("a.shadowinv").is_identical
-    report = flat(shadowinv("info", f"{scan}::{chosen}").output)
-    assert "CR-39 tracks" in report
-    assert "288 of 432 tracks counted in bins of 100 µm" in report
-    assert "detector pixel size (m)" in report
-    assert "all 432 tracks are counted" in flat(shadowinv("info", scan).output)
+    report = done("info", chosen)
+    counted = "288 of 432 tracks counted in bins of 100 µm"
+    for words in ("CR-39 tracks", counted, "detector pixel size (m)"):
+        assert words in report
+    assert "all 432 tracks are counted" in done("info", scan)

@@ -74,15 +74,6 @@ def test_staggered_components_are_brought_to_common_nodes(tmp_path):
     check_grid(grid)
 
 
-def test_constant_component_is_read_from_its_attributes(tmp_path):
-    path = write_openpmd(tmp_path / "b.h5")
-    with h5py.File(path, "a") as file:
-        del file["data/7/fields/B/z"]
-        item = file.create_group("data/7/fields/B/z")
-        item.attrs.update(value=0.5, shape=[6, 5, 4], unitSI=10.0, position=[0.0, 0.0, 0.0])
-    np.testing.assert_allclose(read_field_grid(path).magnetic[0], 5.0)
-
-
 def test_iteration_is_chosen_by_its_number(tmp_path):
     path = write_openpmd(tmp_path / "b.h5", iterations=(7, 100))
     with pytest.raises(InputError, match="iterations 7, 100: choose"):
@@ -90,11 +81,15 @@ def test_iteration_is_chosen_by_its_number(tmp_path):
     with pytest.raises(InputError, match="no iteration 8"):
         read_field_grid(path, iteration=8)
     check_grid(read_field_grid(path, iteration=100))
-
-
-def test_a_group_that_is_no_number_is_no_iteration(tmp_path):
-    path = write_openpmd(tmp_path / "b.h5", iterations=(7, "²"))
+    # A group that is no number is no iteration.
+    path = write_openpmd(tmp_path / "c.h5", iterations=(7, "²"))
     check_grid(read_field_grid(path))
+    # A constant component is in attributes.
+    with h5py.File(path, "a") as file:
+        del file["data/7/fields/B/z"]
+        item = file.create_group("data/7/fields/B/z")
+        item.attrs.update(value=0.5, shape=[6, 5, 4], unitSI=10.0, position=[0.0, 0.0, 0.0])
+    np.testing.assert_allclose(read_field_grid(path).magnetic[0], 5.0)
 
 
 def test_netcdf_dataset_is_read(tmp_path):

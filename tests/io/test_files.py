@@ -11,17 +11,13 @@ from napari_shadowinv.io.files import check_output, replacing, sha256
 from napari_shadowinv.io.formats import kind_of
 
 
-def test_checksum_is_sha256_of_content(tmp_path: Path) -> None:
+def test_checksum_is_sha256_of_content_and_a_folder_or_no_file_is_named(tmp_path: Path) -> None:
     path = tmp_path / "abc"
     path.write_bytes(b"abc")
     assert sha256(path) == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-
-
-def test_folder_and_missing_file_are_named(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match="is a folder"):
-        kind_of(tmp_path)
-    with pytest.raises(FileFormatError, match=r"nowhere\.tif does not exist"):
-        kind_of(tmp_path / "nowhere.tif")
+    for place, words in ((tmp_path, "is a folder"), (tmp_path / "b.tif", "b.tif does not exist")):
+        with pytest.raises(FileFormatError, match=words):
+            kind_of(place)
 
 
 def test_outputs_that_cannot_be_written_are_refused(tmp_path: Path) -> None:
@@ -57,8 +53,14 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_file_that_appears_during_the_work_is_not_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "result.bin"
+def test_file_has_its_name_when_it_is_whole_unless_another_has_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    with replacing(path) as temporary:
+        assert (temporary.parent, temporary.suffix) == (path.parent, ".npy")
+        assert not path.exists()
+        np.save(temporary, np.arange(3))
+    assert np.load(path).tolist() == [0, 1, 2]
+    path.unlink()
 
     def write_late() -> None:
         with replacing(path) as temporary:
@@ -69,16 +71,6 @@ def test_file_that_appears_during_the_work_is_not_replaced(tmp_path: Path) -> No
         write_late()
     assert path.read_text() == "theirs"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_temporary_file_lies_beside_with_the_same_ending(tmp_path: Path) -> None:
-    path = tmp_path / "a.npy"
-    with replacing(path) as temporary:
-        assert temporary.parent == path.parent
-        assert temporary.suffix == ".npy"
-        assert not path.exists()
-        np.save(temporary, np.arange(3))
-    assert np.load(path).tolist() == [0, 1, 2]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals to oneself")

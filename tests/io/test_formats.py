@@ -39,12 +39,14 @@ def test_an_ending_is_written_in_the_registry_alone() -> None:
     assert places == {suffix: {"io/formats.py"} for suffix in SUFFIXES}
 
 
-def test_a_name_or_an_ending_means_one_format() -> None:
+def test_a_name_or_an_ending_means_one_format_and_its_marks_are_in_the_head() -> None:
     names = [each.name for each in FORMATS]
     assert len(set(names)) == len(names)
     for role in ("reader", "image_writer", "result_writer"):
         endings = [end for each in FORMATS if getattr(each, role) for end in each.suffixes]
         assert len(set(endings)) == len(endings), role
+    ends = [at + len(mark) for each in FORMATS for at, mark in each.marks]
+    assert max(ends) <= signature(format_of).parameters["head_bytes"].default
 
 
 @pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)
@@ -54,11 +56,6 @@ def test_its_functions_exist(each: Format) -> None:
     assert all(callable(function(name)) for name in roles if name)
     assert bool(each.reader or each.named_reader) == bool(each.title)  # what can be read is listed
     assert all(suffix == suffix.lower() and suffix[0] == "." for suffix in each.suffixes)
-
-
-def test_marks_are_in_the_head_of_a_file() -> None:
-    ends = [at + len(mark) for each in FORMATS for at, mark in each.marks]
-    assert max(ends) <= signature(format_of).parameters["head_bytes"].default
 
 
 def test_messages_and_help_list_every_format(tmp_path: Path) -> None:
@@ -72,13 +69,10 @@ def test_messages_and_help_list_every_format(tmp_path: Path) -> None:
     assert all(each.title in words for each in listed if "image" in each.holds)
 
 
-def test_zarr_store_of_another_program_is_named(tmp_path: Path) -> None:
+def test_content_decides_before_the_ending(tmp_path: Path) -> None:
     (tmp_path / "zarr.json").write_text("{}")
     with pytest.raises(FileFormatError, match="is a Zarr store of another program"):
         read(tmp_path)
-
-
-def test_tiff_with_the_ending_of_raw_pixels_is_read(tmp_path: Path) -> None:
     for suffix in (".raw", ".img"):
         tifffile.imwrite(tmp_path / f"shot{suffix}", np.ones((4, 5), np.uint8))
         assert read_shot(tmp_path / f"shot{suffix}").image.shape == (4, 5)

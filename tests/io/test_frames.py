@@ -55,48 +55,34 @@ def test_address_names_an_array_or_a_default_of_nexus(nexus, name):
     assert list(frames.name.values) == [f"run_12.nxs[{i},{j}]" for i in (0, 1) for j in (0, 1, 2)]
 
 
-def test_lazy_frames_load_only_computed_frames(nexus, loaded):
+def test_only_computed_and_chosen_frames_are_loaded(nexus, loaded):
     frames = read(f"{nexus}::/entry/data/data")
     assert loaded == [35]
     frames.image[2:4].compute()
     assert loaded == [35] * 3
-
-
-def test_index_selects_one_frame(nexus, loaded):
     shot = read(f"{nexus}::/entry/data/data[1,2]")
-    np.testing.assert_array_equal(shot.image, CUBE[1, 2])
+    assert loaded == [35] * 4
     assert shot.metadata["variable"] == "/entry/data/data[1,2]"
-    assert loaded == [35]
-    again = read_shot(nexus, variable="/entry/data/data[1,2]")
-    np.testing.assert_array_equal(again.image, CUBE[1, 2])
-
-
-def test_leading_axes_of_length_one_are_one_image(nexus):
+    for frame in (shot, read_shot(nexus, variable="/entry/data/data[1,2]")):
+        np.testing.assert_array_equal(frame.image, CUBE[1, 2])
+    # Leading axes of length one are one image.
     assert read(f"{nexus}::/entry/single").image.shape == (5, 7)
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
+def test_wrong_names_and_indices_are_refused(nexus):
+    listed = r"\? it holds 'entry/single'"
+    for name, words in (
         ("entry/data/data[1]", r"frames from \[0,0\] to \[1,2\]"),
         ("entry/data/data[1,3]", r"frames from \[0,0\] to \[1,2\]"),
-        (
-            "entry/datum",
-            r"has no array 'entry/datum': did you mean 'entry/data/data'\? it holds 'entry/single'",
-        ),
+        ("entry/datum", rf"has no array 'entry/datum': did you mean 'entry/data/data'{listed}"),
         ("entry/times", r"with shape \(6,\): expected an image"),
-    ],
-)
-def test_wrong_name_or_index_is_refused(nexus, name, words):
-    with pytest.raises((InputError, FileFormatError), match=words):
-        read(f"{nexus}::{name}")
-
-
-def test_many_images_and_a_default_in_a_circle_are_refused(nexus):
+    ):
+        with pytest.raises((InputError, FileFormatError), match=words):
+            read(f"{nexus}::{name}")
     with pytest.raises(FileFormatError, match=r"6 frames: .* such as 'entry/data/data\[0,0\]'"):
         read_shot(nexus, variable="entry/data/data")
     with h5py.File(nexus, "r+") as file:
-        file["entry"].attrs["default"] = "/entry"
+        file["entry"].attrs["default"] = "/entry"  # a default in a circle
     with pytest.raises(InputError, match=r"has no array '/': it holds .*'entry/data/data'"):
         read(f"{nexus}::/")
 

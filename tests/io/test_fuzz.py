@@ -2,38 +2,23 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
+import fuzz
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import write
 from napari_shadowinv.physics.setup import ProtonSetup
 
-FUZZ = Path(__file__).parents[2] / "benchmarks" / "fuzz.py"
 # Those need an inversion, whose kernels would have to be compiled for these alone.
 RESULTS = ("inversion.h5", "result.shadowinv")
 STORE = "run.shadowinv.zarr"
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux reports memory")
-
-
-def load() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fuzz", FUZZ)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fuzz"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-fuzz = load()
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,7 @@ import struct
 import tracemalloc
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,36 +22,35 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read
 
 Array = np.ndarray[Any, Any]
+Write = Callable[[Path], object]
 NOISE = np.random.default_rng(0).integers(1, 255, (64, 80)).astype(np.uint16)
 NAN = np.full((64, 80), np.nan)
 CUBE = np.ones((4, 5, 6), np.uint16)
 HUGE = 100_000
 
 
-def mat5(array: Array) -> Callable[[Path], object]:
-    return lambda path: savemat(path, {"shot": array})
+def mat5(array: Array) -> Write:
+    return partial(savemat, mdict={"shot": array})
 
 
-def mat7(array: Array) -> Callable[[Path], object]:
-    return lambda path: savemat(path, {"shot": array}, do_compression=True)
+def mat7(array: Array) -> Write:
+    return partial(savemat, mdict={"shot": array}, do_compression=True)
 
 
-def mat73(array: Array) -> Callable[[Path], object]:
-    return lambda path: save_mat73(path, {"shot": array})
+def mat73(array: Array) -> Write:
+    return partial(save_mat73, arrays={"shot": array})
 
 
-def b16(array: Array, **header: int) -> Callable[[Path], object]:
-    return lambda path: save_b16(path, array, **header)
+def b16(array: Array, **header: int) -> Write:
+    return partial(save_b16, pixels=array, **header)
 
 
-def spe(
-    array: Array, code: int = 3, footer: bytes = b"", **header: int
-) -> Callable[[Path], object]:
+def spe(array: Array, code: int = 3, footer: bytes = b"", **header: int) -> Write:
     footer = footer or (b"<SpeFormat/>" if "offset" in header else b"")
-    return lambda path: save_spe(path, array, code, footer, marked=False, **header)
+    return partial(save_spe, pixels=array, code=code, footer=footer, marked=False, **header)
 
 
-def prad(array: Array | None, **attributes: object) -> Callable[[Path], object]:
+def prad(array: Array | None, **attributes: object) -> Write:
     def write(path: Path) -> None:
         with h5py.File(path, "w") as file:
             file.attrs.update(object_type="radiograph", **attributes)
@@ -60,20 +60,20 @@ def prad(array: Array | None, **attributes: object) -> Callable[[Path], object]:
     return write
 
 
-def npy(array: Array) -> Callable[[Path], object]:
-    return lambda path: np.save(path, array)
+def npy(array: Array) -> Write:
+    return partial(np.save, arr=array)
 
 
-def tiff(array: Array, **options: Any) -> Callable[[Path], object]:
-    return lambda path: tifffile.imwrite(path, array, **{"photometric": "minisblack", **options})
+def tiff(array: Array, **options: Any) -> Write:
+    return partial(tifffile.imwrite, data=array, **{"photometric": "minisblack", **options})
 
 
-def imagej(function: int) -> Callable[[Path], object]:
+def imagej(function: int) -> Write:
     text = f"ImageJ=1.54f\ncf={function}\nc0=1\nc1=2\nvunit=OD\n"
     return tiff(NOISE, description=text, metadata=None)
 
 
-def retagged(**tags: int) -> Callable[[Path], object]:
+def retagged(**tags: int) -> Write:
     def write(path: Path) -> None:
         tiff(NOISE)(path)
         with tifffile.TiffFile(path, mode="r+") as file:
@@ -101,16 +101,16 @@ def picture(path: Path) -> None:
     iio.imwrite(path, NOISE.astype(np.uint8))
 
 
-def text(content: str | bytes) -> Callable[[Path], object]:
+def text(content: str | bytes) -> Write:
     raw = content if isinstance(content, bytes) else content.encode()
     return lambda path: path.write_bytes(raw)
 
 
-def table(array: Array) -> Callable[[Path], object]:
-    return lambda path: np.savetxt(path, array)
+def table(array: Array) -> Write:
+    return partial(np.savetxt, X=array)
 
 
-def cut(write: Callable[[Path], object], share: float) -> Callable[[Path], object]:
+def cut(write: Write, share: float) -> Write:
     def write_part(path: Path) -> None:
         write(path)
         content = path.read_bytes()
@@ -119,7 +119,7 @@ def cut(write: Callable[[Path], object], share: float) -> Callable[[Path], objec
     return write_part
 
 
-def patched(write: Callable[[Path], object], *changes: tuple[int, bytes]) -> Callable[[Path], Any]:
+def patched(write: Write, *changes: tuple[int, bytes]) -> Write:
     def write_patched(path: Path) -> None:
         write(path)
         content = bytearray(path.read_bytes())
@@ -147,7 +147,7 @@ def unwritten(path: Path, name: str, **root: str) -> None:
         file.attrs.update(root)
 
 
-def png(side: int, bits: int, colour: int, pixels: bytes) -> Callable[[Path], object]:
+def png(side: int, bits: int, colour: int, pixels: bytes) -> Write:
     def chunk(name: bytes, data: bytes) -> bytes:
         return (
             struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
@@ -162,7 +162,7 @@ def ink(path: Path) -> None:
     Image.fromarray(np.stack([NOISE.astype(np.uint8)] * 4, axis=-1), "CMYK").save(path)
 
 
-GOOD: dict[str, Callable[[Path], object]] = {
+GOOD: dict[str, Write] = {
     "five.mat": mat5(NOISE),
     "seven.mat": mat7(NOISE),
     "hdf.mat": mat73(NOISE),
@@ -193,7 +193,7 @@ STACKS: tuple[dict[str, Any], ...] = (
     {"imagej": True, "truncate": True},
 )
 # The name of a file, what writes it, and words of the sentence that refuses it.
-BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
+BAD: dict[str, tuple[str, Write, str]] = {
     **{f"empty {name}": (name, text(b""), "empty") for name in GOOD},
     **{
         f"{share} of {name}": (name, cut(GOOD[name], share), "")

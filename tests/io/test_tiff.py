@@ -9,11 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import tifffile
-from PIL import Image, TiffImagePlugin
 
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import read, read_shot
-from napari_shadowinv.io.images import read_scan
+from napari_shadowinv.io import read
 
 SHOT = np.random.default_rng(0).integers(1, 4000, (24, 32)).astype(np.uint16)
 STACK = np.stack([SHOT, SHOT + 1, SHOT + 2])
@@ -108,75 +106,26 @@ def test_thumbnails_pyramids_and_labels_are_no_shots(path: Path) -> None:
     np.testing.assert_array_equal(frames_of(path), STACK)
 
 
-def test_small_page_without_a_mark_is_left_out_with_a_caution(path: Path) -> None:
-    with tifffile.TiffWriter(path) as tiff:
-        tiff.write(SHOT, metadata=None)
-        tiff.write(SMALL, metadata=None)
-    shot = read(path)
+def test_pages_of_one_size_are_shots_and_a_mask_or_a_small_one_is_not(path: Path) -> None:
+    def write(*pages: Any, **last: int) -> Any:
+        with tifffile.TiffWriter(path) as tiff:
+            for page in pages:
+                tiff.write(page, metadata=None, **(last if page is pages[-1] else {}))
+        return read(path)
+
+    shot = write(SHOT, SMALL)
     np.testing.assert_array_equal(shot.image, SHOT)
     assert [caution.code for caution in shot.cautions] == ["file"]
     assert "6×8" in shot.cautions[0].text
-
-
-def test_pages_of_one_size_and_different_depth_are_all_shots(path: Path) -> None:
-    with tifffile.TiffWriter(path) as tiff:
-        tiff.write(SHOT, metadata=None)
-        tiff.write((SHOT // 16).astype(np.uint8), metadata=None)
+    write(SHOT, (SHOT // 16).astype(np.uint8))
     np.testing.assert_array_equal(frames_of(path), [SHOT, SHOT // 16])
-
-
-def test_page_with_a_mask_is_no_shot(path: Path) -> None:
-    with tifffile.TiffWriter(path) as tiff:
-        tiff.write(SHOT, metadata=None)
-        tiff.write(SHOT > 2000, subfiletype=2, metadata=None)
+    write(SHOT, SHOT > 2000, subfiletype=2)
     with tifffile.TiffFile(path, mode="r+") as tiff:
         tiff.pages[1].tags[254].overwrite(4)
     np.testing.assert_array_equal(read(path).image, SHOT)
 
 
-# Orientation
-
-SEEN = {
-    1: SHOT, 2: SHOT[:, ::-1], 3: SHOT[::-1, ::-1], 4: SHOT[::-1],
-    5: SHOT.T, 6: np.rot90(SHOT, -1), 7: SHOT[::-1, ::-1].T, 8: np.rot90(SHOT),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("orientation", SEEN)
-def test_orientation_is_applied_whatever_the_compression(path: Path, orientation: int) -> None:
-    tag = (274, "H", 1, orientation, True)
-    for compression in (None, "zlib"):
-        tifffile.imwrite(path, SHOT, extratags=[tag], compression=compression)
-        np.testing.assert_array_equal(read(path).image, SEEN[orientation])
-    tags = TiffImagePlugin.ImageFileDirectory_v2()
-    tags[274] = orientation
-    Image.fromarray(SHOT).save(path, compression="tiff_lzw", tiffinfo=tags)
-    shot = read(path)
-    np.testing.assert_array_equal(shot.image, SEEN[orientation])
-    assert any("turned" in note for note in shot.notes) == (orientation != 1)
-
-
-def test_orientation_of_frames_and_scans(path: Path) -> None:
-    tag = [(274, "H", 1, 8, True)]
-    tifffile.imwrite(path, STACK, photometric="minisblack", extratags=tag, metadata=None)
-    np.testing.assert_array_equal(frames_of(path), [np.rot90(frame) for frame in STACK])
-    colours = np.stack([SHOT, SHOT + 1, SHOT + 2], axis=-1)
-    tifffile.imwrite(path, colours, photometric="rgb", extratags=tag, resolution=(300, 300))
-    scan = read_scan(path)
-    np.testing.assert_array_equal(scan.pixels, np.rot90(colours))
-    assert scan.pixel_size == pytest.approx(25.4e-3 / 300)
-
-
 # Values
-
-
-def test_pixels_without_data_are_left_out(path: Path) -> None:
-    stored = SHOT.copy()
-    stored[2:5, 7] = 65535
-    tifffile.imwrite(path, stored, extratags=[(42113, "s", 0, "65535", True)], metadata=None)
-    shot = read(path)
-    np.testing.assert_array_equal(shot.mask, stored != 65535)
-    assert any("3 pixels" in note for note in shot.notes)
 
 
 def imagej(lines: str) -> dict[str, Any]:
@@ -227,85 +176,3 @@ def test_values_are_those_that_the_file_means(path: Path, name: str) -> None:
     shot = read(path)
     np.testing.assert_allclose(shot.image, meant)
     assert any("calibrated by ImageJ" in note for note in shot.notes) == ("c0" in str(options))
-
-
-def test_one_bit_is_read(path: Path) -> None:
-    Image.fromarray(SHOT % 2 == 1).save(path)
-    np.testing.assert_array_equal(read(path).image, SHOT % 2)
-
-
-def test_transparent_pixels_are_not_light(path: Path) -> None:
-    alpha = np.where(SHOT > 2000, 65535, 0).astype(np.uint16)
-    pixels, kinds = np.stack([SHOT, alpha], axis=-1), ["unassalpha"]
-    tifffile.imwrite(path, pixels, photometric="minisblack", extrasamples=kinds)
-    shot = read(path)
-    np.testing.assert_array_equal(shot.mask, alpha > 0)
-    np.testing.assert_array_equal(shot.image[alpha > 0], SHOT[alpha > 0])
-
-
-def test_colour_profile_is_a_caution_unless_it_is_linear(path: Path) -> None:
-    for name, codes in ((b"sRGB IEC61966-2.1", ["gamma"]), (b"Linear grey", [])):
-        profile = (34675, "B", len(name), name, True)
-        tifffile.imwrite(path, SHOT, extratags=[profile])
-        assert [caution.code for caution in read(path).cautions] == codes
-
-
-def test_grey_jpeg_in_a_tiff_is_not_linear(path: Path) -> None:
-    image = np.full((16, 16), 80, np.uint8)
-    tifffile.imwrite(path, image, compression="jpeg", photometric="minisblack")
-    assert [caution.code for caution in read(path).cautions] == ["gamma"]
-    tifffile.imwrite(path, image, compression="jpeg2000", photometric="minisblack")
-    assert read(path).cautions == ()
-
-
-# Size of the pixels
-
-
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"resolution": (1000, 2000), "resolutionunit": "CENTIMETER"}, "10 µm wide and 5 µm high"),
-        (
-            {
-                "ome": True,
-                "metadata": {"PhysicalSizeX": 5.0, "PhysicalSizeY": 5.0, "PhysicalSizeYUnit": "nm"},
-            },
-            "5 µm wide and 0.005 µm high",
-        ),
-    ],
-)
-def test_pixels_that_are_not_square_are_a_caution(
-    path: Path, options: dict[str, Any], words: str
-) -> None:
-    tifffile.imwrite(path, SHOT, **options)
-    (caution,) = read(path).cautions
-    assert words in caution.text
-    assert size_in(path) is None
-
-
-def size_in(path: Path) -> float | None:
-    return read_shot(path).metadata.get("geometry", {}).get("detector_pixel_size")
-
-
-MILLIMETRES = {"PhysicalSizeXUnit": "mm", "PhysicalSizeYUnit": "mm"}
-SIZES: list[tuple[dict[str, Any], float | None]] = [
-    *(({"resolution": (dots, dots), "resolutionunit": unit}, size) for dots, unit, size in (
-        (72, "INCH", None), (96, "INCH", None), (300, "INCH", None), (28.35, "CENTIMETER", None),
-        (1, "NONE", None), (0.2, "NONE", None), (1e4 / 6.5, "CENTIMETER", 6.5e-6),
-        (25400 / 6.5, "INCH", 6.5e-6),
-    )),
-    *(({"resolution": (n, n), "imagej": True, "metadata": {"unit": unit}}, size)
-      for n, unit, size in ((1 / 6.5, "um", 6.5e-6), (5, "mm", 2e-4), (1, "um", None),
-                            (72, "inch", None), (5, "pixel", None))),
-    *(({"ome": True, "metadata": {"PhysicalSizeX": x, "PhysicalSizeY": y, **units}}, size)
-      for x, y, units, size in ((6.5, 6.5, {}, 6.5e-6), (0.02, 0.02, MILLIMETRES, 2e-5),
-                                (6.5, 0.0065, {"PhysicalSizeYUnit": "mm"}, 6.5e-6))),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("options", "size"), SIZES)
-def test_size_of_a_pixel_is_offered_unless_it_may_be_a_default(
-    path: Path, options: dict[str, Any], size: float | None
-) -> None:
-    tifffile.imwrite(path, SHOT, **options)
-    assert size_in(path) == (None if size is None else pytest.approx(size, rel=1e-4))
