@@ -20,12 +20,9 @@ def test_a_forecast_grows_with_what_is_asked_for() -> None:
     assert seconds(200, 2, fields=("B", "E")) > 1.3 * seconds(200, 2)
     assert seconds(200, 2, beam="unknown") > 1.2 * seconds(200, 2)
     assert seconds(200, 2, options=FitOptions(samples=0)) < seconds(200, 2)
-
-
-def test_a_forecast_knows_that_samples_of_beams_between_energies_are_fitted() -> None:
     instrument, choices = Instrument(beam_between=0.05), FitChoices()
     costs = [fit_cost((200, 200), 2, choices, each).seconds for each in (Instrument(), instrument)]
-    assert 2 < costs[1] / costs[0] < 3
+    assert 2 < costs[1] / costs[0] < 3  # samples of beams between energies are fitted
     assert fit_cost((200, 200), 1, choices, instrument) == fit_cost((200, 200), 1, choices)
     quick = FitChoices(options=FitOptions(samples=0))
     assert fit_cost((200, 200), 2, quick, instrument) == fit_cost((200, 200), 2, quick)

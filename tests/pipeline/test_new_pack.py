@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers.command_line import flat, shadowinv
+from helpers.command_line import done
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.pipeline import read_pack
 from napari_shadowinv.pipeline.film_files import draft_pack, write_new_pack
@@ -26,12 +26,9 @@ def scans(tmp_path: Path) -> Path:
 
 def test_draft_has_the_scans_in_order(scans: Path) -> None:
     entries = draft_pack(scans)
-    assert [layer["file"] for layer in entries["layers"]] == [
-        "EBT3_film_11.tif",
-        "film_2.tif",
-        "film_10.tif",
+    assert [(layer["film"], layer["file"]) for layer in entries["layers"]] == [
+        *(("EBT3", "EBT3_film_11.tif"), ("HDV2", "film_2.tif"), ("HDV2", "film_10.tif"))
     ]
-    assert [layer["film"] for layer in entries["layers"]] == ["EBT3", "HDV2", "HDV2"]
     assert entries["films"] == {"HDV2": {"calibration": "HDV2_table.csv", "unexposed": "HDV2.tif"}}
 
 
@@ -53,14 +50,8 @@ def test_other_folders_are_refused(tmp_path: Path) -> None:
 
 
 def test_film_command_writes_a_new_pack(scans: Path) -> None:
-    ended = shadowinv("film", "--new", scans)
-    assert ended.exit_code == 0, ended.output
+    printed = done("film", "--new", scans)
     for words in ("calibration of EBT3", "filters: those in front", "seen from", "pack.toml"):
-        assert words in flat(ended.output)
+        assert words in printed
     assert len(read_pack(scans / "pack.toml").layers) == 3
-    again = shadowinv("film", "--new", scans)
-    assert again.exit_code == 2
-    assert "exists" in flat(again.output)
-    nothing = shadowinv("film")
-    assert nothing.exit_code == 2
-    assert "received no pack file" in flat(nothing.output)
+    assert "exists" in done("film", "--new", scans, code=2)

@@ -54,21 +54,16 @@ def toml(path: Path, **entries: Any) -> Path:
     return path
 
 
-def test_setup_is_completed_by_the_file_unless_it_states_a_size(path: Path, tmp_path: Path) -> None:
+def test_setup_is_completed_by_the_file_but_for_its_kind_and_size(path: Path) -> None:
     geometry = read_shot(path).metadata["geometry"]
-    setup = setup_from(toml(tmp_path / "a.toml", kind="proton", **LENGTHS), geometry)
+    file = path.with_name("a.toml")
+    setup = setup_from(toml(file, kind="proton", **LENGTHS), geometry)
     assert setup.object_pixel_size == pytest.approx(2e-6)
-    own = toml(tmp_path / "b.toml", kind="proton", pixel_size=7e-6, **LENGTHS)
-    assert setup_from(own, geometry).object_pixel_size == 7e-6
-
-
-def test_size_of_a_pixel_does_not_name_the_beam(path: Path, tmp_path: Path) -> None:
-    geometry = read_shot(path).metadata["geometry"]
+    toml(file, kind="proton", pixel_size=7e-6, **LENGTHS)
+    assert setup_from(file, geometry).object_pixel_size == 7e-6
     with pytest.raises(InputError, match="'kind' is missing"):
-        setup_from(toml(tmp_path / "a.toml", object_image_distance=0.09), geometry)
-
-
-def test_own_images_state_the_pixels_at_the_object(path: Path) -> None:
+        setup_from(toml(file, object_image_distance=0.09), geometry)
+    # Images of its own state the pixels at the object.
     setup = ProtonSetup(**LENGTHS, detector_pixel_size=20e-6)
     write(path, SHOT.astype(float), setup=setup, overwrite=True)
     stated = read_shot(path).metadata["geometry"]

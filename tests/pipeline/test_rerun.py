@@ -193,6 +193,23 @@ def test_a_file_elsewhere_is_asked_for(example: Example) -> None:
         rerun(harmful, other_folders=True)
 
 
+@pytest.mark.parametrize(
+    "part", [{"mask": "FILE"}, {"source": {"method": "measured", "file": "FILE"}}]
+)
+def test_a_file_of_a_recipe_elsewhere_is_asked_for(tmp_path: Path, part: Any) -> None:
+    foreign = str(tmp_path / "private.npy")
+    for name in ("private", "shot"):
+        np.save(tmp_path / f"{name}.npy", np.random.default_rng(0).poisson(100, (16, 16)))
+    (tmp_path / "mine").mkdir()
+    with chdir(tmp_path / "mine"):
+        Path("shot.npy").hardlink_to(tmp_path / "shot.npy")
+        dataset = run(Recipe(), "shot.npy").to_dataset()
+        provenance = json.loads(dataset.attrs["provenance"])
+        provenance["recipe"] |= json.loads(json.dumps(part).replace("FILE", foreign))
+        with pytest.raises(InputError, match=f"{foreign}, which is in another folder"):
+            rerun(dataset.assign_attrs(provenance=json.dumps(provenance)))
+
+
 @every_kind
 def test_a_result_is_repeated_bit_for_bit(example: Example, tmp_path: Path) -> None:
     before, provenance = example.dataset, provenance_of(example.dataset)
@@ -276,19 +293,6 @@ def test_a_mask_in_a_file_that_was_not_used_is_not_used_again(tmp_path: Path) ->
     assert first.mask.all()
     again = rerun(write(tmp_path / "a.shadowinv", first))
     assert again.is_identical
-
-
-def test_a_shot_of_a_stack_has_its_own_mask_and_that_of_all_again(tmp_path: Path) -> None:
-    hidden = np.zeros((2, *SHAPE))
-    hidden[1, :2] = 1
-    for index, path in enumerate(record(tmp_path)[:2]):
-        pradreader(tmp_path / f"shot_{index}.txt", np.load(path), hidden[index])
-    recipe = Recipe(mask=tmp_path / "mask.tif", options=InversionOptions(n_sites=150))
-    run_stack(str(tmp_path / "shot_*.txt"), tmp_path / "a.shadowinv.zarr", recipe)
-    shot = read_stack(tmp_path / "a.shadowinv.zarr").isel(shot=1).load()
-    again = rerun(shot, tmp_path / "shot_1.txt")
-    usable = (tifffile.imread(tmp_path / "mask.tif") > 0) & (hidden[1] == 0)
-    np.testing.assert_array_equal(again.content.mask, usable)
 
 
 def test_what_was_no_file_is_asked_for(tmp_path: Path) -> None:

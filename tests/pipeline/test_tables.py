@@ -122,7 +122,7 @@ def test_empty_lines_and_comments_count_as_lines(name: str, kind: Kind, path: Pa
 
 
 @pytest.mark.parametrize("separator", [";", "\t", " , ", '","'])
-def test_separators_and_byte_order_mark_change_nothing(
+def test_separators_capitals_and_byte_order_mark_change_nothing(
     kind: Kind, path: Path, separator: str
 ) -> None:
     write(path, kind.lines())
@@ -132,39 +132,25 @@ def test_separators_and_byte_order_mark_change_nothing(
         lines = [f'"{line}"' for line in lines]
     path.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(lines).encode())
     assert kind.read(path) == plain
-
-
-def test_column_names_are_read_in_capitals(kind: Kind, path: Path) -> None:
-    write(path, kind.lines())
-    plain = kind.read(path)
-    header, *rows = kind.lines()
-    write(path, [header.upper(), *rows])
+    write(path, [lines[0].upper(), *lines[1:]])
     assert kind.read(path) == plain
 
 
-def test_missing_column_is_named(name: str, kind: Kind, path: Path) -> None:
-    missing = kind.columns[0]
-    write(path, [",".join(cells[1:]) for cells in (kind.columns, *kind.rows)])
-    refuses(kind, path, f"has no column '{missing}'")
-
-
-def test_column_given_twice_is_named(kind: Kind, path: Path) -> None:
-    write(path, [f"{line},{line.split(',')[0]}" for line in kind.lines()])
-    refuses(kind, path, f"has the column '{kind.columns[0]}' twice")
-
-
-def test_empty_table_and_table_without_rows_are_refused(kind: Kind, path: Path) -> None:
-    write(path, ["", "# nothing"])
-    refuses(kind, path, f"has no column '{kind.columns[0]}'")
-    write(path, kind.lines()[:1])
-    refuses(kind, path, "has no rows below its column names")
-
-
-def test_row_with_more_values_than_columns_is_refused(kind: Kind, path: Path) -> None:
-    header, first, last = kind.lines()
-    count = len(kind.columns)
-    write(path, [header, first, "", f"{last},,7"])
-    refuses(kind, path, f"line 4 has {count + 2} values, expected {count}: {kind.columns[0]}, ")
+def test_columns_that_do_not_fit_are_named(kind: Kind, path: Path) -> None:
+    first, count, (header, *rows) = kind.columns[0], len(kind.columns), kind.lines()
+    without_first = [",".join(cells[1:]) for cells in (kind.columns, *kind.rows)]
+    for lines, words in (
+        (without_first, f"has no column '{first}'"),
+        (["", "# nothing"], f"has no column '{first}'"),
+        ([f"{line},{line.split(',')[0]}" for line in (header, *rows)], f"column '{first}' twice"),
+        ([header], "has no rows below its column names"),
+        (
+            [header, rows[0], "", f"{rows[1]},,7"],
+            f"line 4 has {count + 2} values, expected {count}: {first}, ",
+        ),
+    ):
+        write(path, lines)
+        refuses(kind, path, words)
     write(path, [f"{line},," for line in kind.lines()])
     kind.read(path)
 
@@ -184,12 +170,9 @@ def test_cell_that_cannot_be_read_is_refused(
     refuses(kind, path, reason)
 
 
-def test_line_of_a_later_check_is_that_of_the_file(path: Path) -> None:
+def test_lines_of_later_checks_and_a_column_of_film_numbers(path: Path) -> None:
     write(path, ["file,shot", "", "a.tif,1", "# tilted", "b.tif,"])
     with pytest.raises(InputError, match="line 5 does not say which shot"):
         rows_by_shot(path)
-
-
-def test_hash_names_a_column_of_film_numbers(path: Path) -> None:
     write(path, ["#,Dose,Red,Green,Blue", ",Gy,,,", "1,1,5,5,5", "2,3,4,4,4"])
     np.testing.assert_array_equal(Calibration.from_csv(path).doses, [1, 3])
