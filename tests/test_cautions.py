@@ -34,17 +34,11 @@ def test_a_code_that_is_not_listed_is_refused():
         Caution("typo", "a sentence")
 
 
-def test_json_restores_code_and_text():
+def test_json_restores_a_caution_also_of_a_later_version():
     caution = Caution("flux", "the flux differs")
     written = json.loads(json.dumps(dataclasses.asdict(caution)))
     assert Caution.from_json(written) == caution
     assert Caution.from_json(caution) is caution
-
-
-def test_codes_of_later_versions_are_read():
     later = {"code": "of-a-later-version", "text": "a sentence"}
     assert Caution.from_json(later) == Caution("other", "a sentence")
-
-
-def test_about_names_the_image_and_keeps_the_code():
-    assert Caution("flux", "it differs").about("a.tif") == Caution("flux", "a.tif: it differs")
+    assert caution.about("a.tif") == Caution("flux", "a.tif: the flux differs")

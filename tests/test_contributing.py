@@ -153,16 +153,15 @@ def command():
     return lambda *arguments: runner.invoke(app, [str(argument) for argument in arguments])
 
 
-def test_the_command_prints_each_result(command, result_files, inversion, make_fit):
+def test_the_command_prints_results_refuses_mistakes_and_has_help(
+    command, result_files, inversion, make_fit, tmp_path
+):
     answer = command(*result_files)
     assert answer.exit_code == 0, answer.output
     text = flat(answer.output)
     assert "Headlines" in text
     for path, result in zip(result_files, (inversion, make_fit()), strict=True):
         assert f"{path.name} {result.headline.text}" in text
-
-
-def test_the_command_refuses_a_mistake_in_a_sentence_and_has_help(command, tmp_path):
     answer = command(tmp_path / "absent.shadowinv")
     assert answer.exit_code == EXIT_MISTAKE
     assert "absent.shadowinv" in answer.output

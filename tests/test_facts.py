@@ -171,7 +171,7 @@ def texts_by_key(facts):
     return {fact.key: fact.text for fact in facts}
 
 
-def test_facts_give_the_numbers_of_the_report(inversion):
+def test_facts_give_the_numbers_of_the_report_and_the_field_in_its_unit(inversion):
     texts = texts_by_key(inversion.facts)
     report = inversion.report
     assert texts["image_residual"].startswith(percent(report.image_residual))
@@ -180,14 +180,11 @@ def test_facts_give_the_numbers_of_the_report(inversion):
     assert texts["caustics"] == "0 % of the pixels"
     assert texts["time"].startswith(f"{sum(report.seconds.values()):.2f} s")
     assert "field" not in texts
-
-
-def test_facts_with_a_setup_add_the_field_in_its_unit(inversion):
     setup = ProtonSetup.example()
-    texts = texts_by_key(inversion.in_units(setup).facts)
+    field = texts_by_key(inversion.in_units(setup).facts)["field"]
     strength = setup.field_in_si("path_integrated_b", inversion.displacement)
-    assert f"{1e3 * np.hypot(*strength).max():.3g}" in texts["field"]
-    assert "mT·m" in texts["field"]
+    assert f"{1e3 * np.hypot(*strength).max():.3g}" in field
+    assert "mT·m" in field
 
 
 def test_a_caution_is_a_doubtful_fact_and_lack_of_convergence_a_failed_one(image, inversion):
@@ -220,7 +217,7 @@ def test_facts_of_a_fit_name_images_fields_and_the_verdict(fitted):
     assert {fact.level for fact in facts if fact.key == "verdict"} == {Level.DOUBTFUL}
 
 
-def test_the_title_of_a_headline_is_one_word_for_trust():
+def test_the_title_of_a_headline_is_one_word_for_trust(hasty):
     titles = {
         (Verdict.DETERMINED, Level.SOUND): "determined",
         (Verdict.DETERMINED, Level.DOUBTFUL): "determined, with warnings",
@@ -233,9 +230,7 @@ def test_the_title_of_a_headline_is_one_word_for_trust():
         assert Headline(level, "9 T", verdict).title == title
     doubted = Headline(Level.DOUBTFUL, "9 T", Verdict.DETERMINED)
     assert str(doubted) == "Determined, with warnings: 9 T"
-
-
-def test_the_headline_of_a_fit_begins_with_its_peaks(hasty):
+    # That of a fit begins with its peaks.
     (shown,) = shown_fields([hasty.fields[0].displacement], None, mask=hasty.used)
     assert hasty.headline.text.startswith(f"peak |d| {shown.largest:.3g} px; ")
     assert hasty.assessment.short in hasty.headline.text

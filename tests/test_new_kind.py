@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.command_line import flat, shadowinv
+from helpers.command_line import done, flat, shadowinv
 from napari_shadowinv import InputError, ProtonSetup, fit, invert, predict_image, run_stack
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.io import read, read_shot, write
@@ -79,11 +79,7 @@ def test_inversion_of_a_new_kind_has_its_fields(setups, images, tmp_path):
     density = setups[0].areal_electron_density(inversion.potential)
     np.testing.assert_allclose(dataset["areal_electron_density"], density, rtol=1e-6)
     assert dataset["areal_electron_density"].attrs["units"] == "m⁻²"
-    output = flat(shadowinv("info", path).output)
-    assert "X-rays of 8 keV" in output
-
-
-def test_pradformat_refuses_a_new_kind(setups):
+    assert "X-rays of 8 keV" in done("info", path)
     with pytest.raises(InputError, match="received kind 'x-ray'"):
         check_pradformat_setup(setups[0])
 
@@ -122,9 +118,8 @@ def test_table_gives_each_shot_the_quantity_of_a_new_kind(table, setups):
     assert store["photon_energy"].values.tolist() == [8.0, 12.0]
     assert store["photon_energy"].attrs == {"units": "keV", "long_name": "Energy of the X-rays"}
     assert "energy" not in store
-    output = flat(shadowinv("info", "out.shadowinv.zarr", "--all").output)
-    assert "energies 8, 12 keV" in output
-    shadowinv("export", "out.shadowinv.zarr", "--format", "csv", "--out", "shots_out.csv")
+    assert "energies 8, 12 keV" in done("info", "out.shadowinv.zarr", "--all")
+    done("export", "out.shadowinv.zarr", "--format", "csv", "--out", "shots_out.csv")
     with Path("shots_out.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["photon_energy (keV)"] for row in rows] == ["8.0", "12.0"]
@@ -134,14 +129,9 @@ def test_table_gives_each_shot_the_quantity_of_a_new_kind(table, setups):
 
 
 def test_command_fits_a_table_of_a_new_kind(table):
-    result = shadowinv(
-        *("fit", table, "--setup", "xray.toml", "--out", "fit.shadowinv"),
-        *(
-            "--set=fit.options.samples=0",
-            "--set=fit.options.max_iterations=3",
-            "--set=fit.options.spacing=0.25",
-        ),
-    )
+    keys = ("samples=0", "max_iterations=3", "spacing=0.25")
+    quick = [f"--set=fit.options.{key}" for key in keys]
+    result = shadowinv("fit", table, "--setup", "xray.toml", "--out", "fit.shadowinv", *quick)
     assert "8 keV" in flat(result.output), result.output
 
 
@@ -152,15 +142,12 @@ def test_text_image_states_a_new_kind(table, setups, images):
     Path("harder.toml").write_text("photon_energy = 12")
     shot = read_shot(Path("shot.txt"))
     assert setup_from(Path("harder.toml"), shot.metadata["geometry"]) == setups[1]
-    assert "photon energy (keV) 8" in flat(shadowinv("info", "shot.txt").output)
+    assert "photon energy (keV) 8" in done("info", "shot.txt")
 
 
-def test_comparison_has_the_causes_of_a_new_kind(setups):
+def test_comparison_and_rows_know_a_new_kind(setups, table):
     assert compared_fields(setups) == (("electrons",),)
     assert compared_fields([ProtonSetup.example()]) == (("B",), ("E",), ("B", "E"))
-
-
-def test_rows_keep_the_quantity_of_a_new_kind(table):
     rows = table_rows(table)
     assert [row.beam for row in rows] == [{"photon_energy": 8.0}, {"photon_energy": 12.0}]
     assert rows[1].beam_text == "12 keV"

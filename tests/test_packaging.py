@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -91,14 +92,24 @@ def test_the_version_has_one_place(metadata: Message) -> None:
     assert re.fullmatch(r"\d+\.\d+\.\d+((a|b|rc|\.dev)\d+)?", __version__)
 
 
-def test_the_version_is_told_without_heavy_imports() -> None:
-    script = """
-import sys
-import napari_shadowinv
-print(napari_shadowinv.__version__, sorted({"numpy", "numba", "scipy", "dask"} & set(sys.modules)))
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert done.stdout.strip() == f"{__version__} []", done.stderr
+HEAVY = "numba xarray matplotlib skimage h5py tifffile imageio dask distributed scipy.optimize"
+WINDOWS = "napari qtpy PyQt6 PySide6"
+LIGHT = {
+    "import napari_shadowinv; napari_shadowinv.__version__": f"numpy scipy {HEAVY} {WINDOWS}",
+    "from napari_shadowinv.io import read, write": f"scipy {HEAVY} {WINDOWS}",
+    "from napari_shadowinv.cli import app": f"scipy.fft zarr {HEAVY} {WINDOWS}",
+    "from helpers.command_line import done; done('info', '--system')": WINDOWS,
+}
+
+
+@pytest.mark.parametrize("code", LIGHT)
+def test_what_is_often_imported_is_light(code: str) -> None:
+    script = f"{code}\nimport sys; print({{*{LIGHT[code].split()}}} & {{*sys.modules}})"
+    path = os.pathsep.join([*filter(None, sys.path), str(ROOT / "tests")])
+    environment = {**os.environ, "PYTHONPATH": path}
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    assert done.stdout.strip() == "set()", done.stderr
 
 
 def test_the_wheel_describes_itself(about: dict[str, str], metadata: Message) -> None:
@@ -113,22 +124,12 @@ def test_the_wheel_describes_itself(about: dict[str, str], metadata: Message) ->
     assert "Framework :: napari" in classifiers
     assert "Typing :: Typed" in classifiers
     assert not [name for name in classifiers if name.startswith("License ::")]
-
-
-def test_the_classifiers_exist(metadata: Message) -> None:
     trove_classifiers = pytest.importorskip("trove_classifiers")
-    assert set(metadata.get_all("Classifier", [])) <= trove_classifiers.classifiers
+    assert set(classifiers) <= trove_classifiers.classifiers
 
 
 def names_in(needs: list[str]) -> set[str]:
     return {re.split(r"[^\w-]", need)[0].lower().replace("_", "-") for need in needs}
-
-
-def test_napari_is_no_requirement_of_the_core(metadata: Message) -> None:
-    needs = metadata.get_all("Requires-Dist", [])
-    required = names_in([need for need in needs if "extra ==" not in need])
-    assert "numpy" in required
-    assert not {"napari", "qtpy", "pyqt6", "pyside6", "pytest"} & required
 
 
 MODULES = {"PIL": "pillow", "skimage": "scikit-image"}  # whose names differ from their packages'
@@ -141,7 +142,11 @@ def test_the_page_of_dependencies_has_all_that_is_declared_and_imported(metadata
     )
     brought_by = {name: names_in(text.split(", ")) - {""} for name, text in rows}
     needs = metadata.get_all("Requires-Dist", [])
-    assert brought_by.keys() == names_in([need for need in needs if "extra ==" not in need])
+    required = names_in([need for need in needs if "extra ==" not in need])
+    assert brought_by.keys() == required
+    # napari is no requirement of the core.
+    assert "numpy" in required
+    assert not {"napari", "qtpy", "pyqt6", "pyside6", "pytest"} & required
     for name, brought in brought_by.items():
         assert brought <= names_in(requires(name) or []), name
     imported = {
@@ -161,16 +166,13 @@ def test_the_page_of_dependencies_has_all_that_is_declared_and_imported(metadata
 # The citation
 
 
-def test_the_citation_is_of_this_version() -> None:
+def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
     """`make lint` checks its format."""
     citation = loaded(ROOT / "CITATION.cff")
     assert (citation["title"], citation["version"]) == ("napari-shadowinv", __version__)
     assert citation["license"] == "BSD-3-Clause"
     assert citation["authors"] == [{"name": "napari-shadowinv contributors"}]
-
-
-def test_the_citation_names_the_paper_and_its_authors() -> None:
-    (paper,) = loaded(ROOT / "CITATION.cff")["references"]
+    (paper,) = citation["references"]
     assert {"type", "title", "authors"} <= set(paper)
     for author in paper["authors"]:
         assert set(author) == {"family-names", "given-names"}

@@ -111,8 +111,15 @@ def test_docstrings_begin_with_a_verb_or_a_noun(docstrings):
 
 
 @pytest.mark.parametrize("idiom", IDIOMS)
-def test_docstrings_use_no_idiom(docstrings, idiom):
+def test_docstrings_messages_and_pages_use_no_idiom(docstrings, messages, idiom):
     wrong = [place for place, text in docstrings.items() if re.search(idiom, text)]
+    wrong += [f"{path.name}:{line}" for path, line, text in messages if re.search(idiom, text)]
+    wrong += [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in PAGES
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if re.search(idiom, line)
+    ]
     assert not wrong, f"write {IDIOMS[idiom]}"
 
 
@@ -122,12 +129,6 @@ def test_docstrings_name_things_by_nouns(docstrings, words):
     counts = Counter({place: len(re.findall(words, text)) for place, text in texts.items()})
     total = sum(len(re.findall(r"[a-z]+", text)) for text in texts.values())
     assert 1000 * counts.total() / total < MAX_RATES[words], counts.most_common(8)
-
-
-@pytest.mark.parametrize("idiom", IDIOMS)
-def test_messages_help_and_windows_use_no_idiom(messages, idiom):
-    wrong = [f"{path.name}:{line}" for path, line, text in messages if re.search(idiom, text)]
-    assert not wrong, f"write {IDIOMS[idiom]}"
 
 
 def model_keys() -> set[str]:
@@ -150,17 +151,6 @@ def test_messages_below_the_faces_suit_each_of_them(messages):
         if of_one_face.search(re.sub(r"\{\w+\}", "", text))
         and not re.fullmatch(r"[\s\w]+", text)  # nor a list of keys
     ]
-
-
-@pytest.mark.parametrize("idiom", IDIOMS)
-def test_pages_use_no_idiom(idiom):
-    wrong = [
-        f"{path.relative_to(ROOT)}:{number}"
-        for path in PAGES
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
-        if re.search(idiom, line)
-    ]
-    assert not wrong, f"write {IDIOMS[idiom]}"
 
 
 def prose_lines(text: str) -> Iterator[str]:

@@ -54,6 +54,22 @@ def test_a_workflow_ends_in_time_reads_alone_and_finds_its_files(name: str) -> N
     scripts = re.findall(r"\.ci/[\w-]+", (FOLDER / f"{name}.yml").read_text("utf-8"))
     assert [path for path in scripts if not (ROOT / path).is_file()] == []
 
+    def artifacts(job: Any, action: str) -> set[str]:
+        steps = job.get("steps", ())
+        if "uses" in job:
+            called = loaded(ROOT / job["uses"])["jobs"].values()
+            steps = [step for inner in called for step in inner["steps"]]
+        uses = f"actions/{action}-artifact@"
+        used = (step for step in steps if step.get("uses", "").startswith(uses))
+        return {step["with"]["name"] for step in used}
+
+    # What a job downloads was uploaded by one before.
+    for job in content["jobs"].values():
+        if "uses" not in job:
+            before = [content["jobs"][need] for need in listed(job.get("needs", []))]
+            ready = {name for needed in before for name in artifacts(needed, "upload")}
+            assert artifacts(job, "download") <= ready
+
 
 def test_the_tests_run_on_every_system_python_and_binding() -> None:
     job = workflow("tests")["jobs"]["tests"]
@@ -87,28 +103,6 @@ def test_the_containers_are_built_and_run_as_the_documentation_says() -> None:
     assert len(commands) == 4
     for command in commands:
         assert command in runs
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_what_is_downloaded_was_uploaded_by_a_job_before(name: str) -> None:
-    jobs = workflow(name)["jobs"]
-
-    def artifacts(job: Any, action: str) -> set[str]:
-        steps = job.get("steps", ())
-        if "uses" in job:
-            called = loaded(ROOT / job["uses"])["jobs"].values()
-            steps = [step for inner in called for step in inner["steps"]]
-        return {
-            step["with"]["name"]
-            for step in steps
-            if step.get("uses", "").startswith(f"actions/{action}-artifact@")
-        }
-
-    for job in jobs.values():
-        if "uses" not in job:
-            before = [jobs[need] for need in listed(job.get("needs", []))]
-            ready = {name for needed in before for name in artifacts(needed, "upload")}
-            assert artifacts(job, "download") <= ready
 
 
 def test_a_release_is_published_for_a_tag_and_without_a_secret() -> None:
