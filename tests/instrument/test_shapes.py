@@ -65,3 +65,21 @@ def test_products_of_functions_have_block_means_in_larger_pixels() -> None:
     coarse = shapes.coarsen(2).sum(numbers)
     # Fields that hardly change in a pixel, under an envelope that does.
     assert np.abs(coarse - means).max() < 0.02 * np.abs(means).max()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_neither_signs_nor_rounding_of_the_algorithm_change_shapes(monkeypatch, seed) -> None:
+    """Else the same seed would draw another beam with another number of threads."""
+    shapes = Shapes.of_length("beam", 16.0, np.ones((64, 64)))
+    rng, exactly = np.random.default_rng(seed), np.linalg.eigh
+
+    def otherwise(matrix):
+        values, vectors = exactly(matrix)
+        signs = rng.choice([-1, 1], len(values))
+        return values, signs * vectors * (1 + 1e-14 * rng.normal(size=vectors.shape))
+
+    monkeypatch.setattr(np.linalg, "eigh", otherwise)
+    again = Shapes.of_length("beam", 16.0, np.ones((64, 64)))
+    np.testing.assert_array_equal(again.places, shapes.places)
+    for mode, other in zip(shapes.modes, again.modes, strict=True):
+        np.testing.assert_allclose(other, mode, atol=1e-9)

@@ -66,7 +66,8 @@ class Shapes:
         shares = weights / weights.sum()
         means = along_y @ shares @ along_x.T
         squares = along_y**2 @ shares @ (along_x**2).T - means**2
-        order = np.argsort(squares, axis=None)[::-1]
+        # Those along y and x are equal in a square but for rounding, which must not order them.
+        order = np.argsort(-np.round(squares / squares.max(), 9), axis=None, kind="stable")
         held = np.cumsum(squares.ravel()[order]) / squares.sum()
         chosen = order[: int(np.searchsorted(held, share)) + 1]
         places = np.stack(np.unravel_index(chosen, squares.shape))
@@ -160,6 +161,7 @@ def _line_modes(size: int, length: float, share: float, most_places: int = 256) 
     held = np.cumsum(variances) / variances.sum()
     count = int(np.searchsorted(held, 1 - (1 - share) / 10)) + 1
     modes = (np.sqrt(variances) * vectors).T[:count]
+    modes *= np.sign(modes[:, :1])  # the algorithm leaves the signs open
     return np.array([np.interp(np.arange(size), places, mode) for mode in modes])
 
 
