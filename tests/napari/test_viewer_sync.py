@@ -1,10 +1,17 @@
 """Synchronisation with a viewer: events, the colour bar, images that are opened next to results."""
 
 import numpy as np
+import pytest
 
 from napari_shadowinv import add_to_viewer
 from napari_shadowinv._napari.layer_metadata import frame_of, metadata_for, role_of
-from napari_shadowinv._napari.viewer_sync import connect, connect_layers, without_proxy
+from napari_shadowinv._napari.viewer_sync import (
+    connect,
+    connect_layers,
+    error_text,
+    without_proxy,
+)
+from napari_shadowinv.errors import InputError
 
 
 def test_each_layer_is_followed_until_it_is_disconnected(viewer):
@@ -110,3 +117,15 @@ def test_what_has_a_place_keeps_it(viewer, solved, proton_setup, messages):
     assert tuple(with_scale.scale) == (2, 2)
     assert tuple(of_plugin.scale) == tuple(first.scale) == (1, 1)
     assert not any("same position" in text or "in pixels" in text for text in messages)
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("the image is empty", "The image is empty"),
+        ("shot.tif: the image is empty", "shot.tif: the image is empty"),
+        ("run_3/a has no image", "run_3/a has no image"),
+    ],
+)
+def test_a_sentence_begins_with_a_capital_but_no_name_of_a_file(text, shown):
+    assert error_text(InputError(text)) == shown

@@ -110,7 +110,8 @@ def error_text(error: BaseException) -> str:
     elif not isinstance(error, USER_ERRORS):
         first_line = text.partition("\n")[0]
         text = f"internal error: {type(error).__name__}: {first_line} (see the notification)"
-    return text[:1].upper() + text[1:]
+    starts_with_name = bool(set("./\\_") & set(text.partition(" ")[0].rstrip(":.")))  # of a file
+    return text if starts_with_name else text[:1].upper() + text[1:]
 
 
 def show_user_error(error: BaseException) -> None:
