@@ -190,6 +190,7 @@ def test_the_command_does_what_the_window_saves(filled, run, shot_file, tmp_path
     paint(filled.source_masks, np.s_[12:30], np.s_[22:45])
     mine = run(filled)
     filled.recipes.save(tmp_path / "how.toml")
+    assert filled.panel.status.text() == f"Saved the recipe in {tmp_path / 'how.toml'}"
     written = {path.name for path in tmp_path.glob("how*")}
     assert written == {"how.toml", "how_mask.png", "how_source_mask.png"}
     recipe, out = tmp_path / "how.toml", tmp_path / "a.shadowinv"

@@ -193,6 +193,7 @@ class RecipeButton(QPushButton):
             write(source_file, plane_of(beam.image, "the source"), overwrite=overwrite)
             changes["source"] = MeasuredSource(file=source_file)
         write_recipe(path, recipe.model_copy(update=changes), overwrite=overwrite)
+        tool.panel.say(f"Saved the recipe in {path.absolute()}")
 
 
 def _show_mask(picker: Any, usable: BoolArray | None, viewer: Any, image: Any) -> None:
