@@ -22,6 +22,7 @@ from napari_shadowinv.io.store import StackStore
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import rerun
+from napari_shadowinv.pipeline.files import command_of
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
     Bin,
@@ -162,6 +163,15 @@ def test_a_command_and_a_stack_give_the_result_of_python(folder: Path, name: str
     assert provenance.recipe.model_dump(exclude=of_image) == chosen
     described = done("info", "a.shadowinv")
     assert [words for words in case.words if words not in described] == []
+
+    command, _, *words = shlex.split(command_of(Recipe(**case.recipe), case.image))
+    assert command == "shadowinv"
+    done("invert", *words, "--out", "d.shadowinv")
+    assert_same(read("d.shadowinv"), dataset)
+    assert provenance_in("d.shadowinv").model_dump(exclude={"recipe"}) == provenance.model_dump(
+        exclude={"recipe"}
+    )
+    assert provenance_in("d.shadowinv").recipe.model_dump(exclude=of_image) == chosen
 
     # By its saved recipe, in which a flag overrides what it names, and by its result.
     again = ("--recipe", "s.toml", "--out", "b.shadowinv")

@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv.cli._flags import FitFlags, InversionFlags
-from napari_shadowinv.cli._settings import FILE_KEYS, Settings, source_from, with_steps
+from napari_shadowinv.cli._settings import (
+    FILE_KEYS,
+    Settings,
+    parse_choice,
+    source_from,
+    with_steps,
+)
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.preprocessing import MeasuredSource, Recipe
@@ -46,10 +52,15 @@ def recipe_from(flags: InversionFlags | FitFlags, settings: Settings) -> Recipe:
 
 
 def read_setup(path: Path | None, geometry: Any = None) -> Setup | None:
-    """Read a setup from its file, if there is one; complete it with a geometry."""
-    from napari_shadowinv.pipeline.files import setup_from
+    """Read a setup from its file or a text such as "proton energy=3"; complete it."""
+    from napari_shadowinv.physics.setup import SETUPS
+    from napari_shadowinv.pipeline.files import complete_setup, setup_from
 
-    return None if path is None else setup_from(path, geometry)
+    kind = str(path).partition(" ")[0]
+    if path is None or kind not in SETUPS or path.exists():
+        return None if path is None else setup_from(path, geometry)
+    _, values = parse_choice("--setup", str(path), SETUPS)
+    return complete_setup({"kind": kind, **values}, geometry or {}, "--setup")
 
 
 def setup_for(path: Path | None, shot: Shot, recipe: Recipe) -> Setup | None:

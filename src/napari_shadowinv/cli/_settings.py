@@ -150,7 +150,7 @@ def with_steps(
             primary = STEPS[name].primary
             _put_step(result, STEPS[name], {primary: value}, "", {primary: f"--{name}"})
     for text in texts:
-        kind, values = _parse_choice("--step", text, STEPS)
+        kind, values = parse_choice("--step", text, STEPS)
         _put_step(result, kind, values, f"--step '{text}'")
     return tuple(result)
 
@@ -176,13 +176,13 @@ def _put_step(
 
 def source_from(text: str, before: Estimate | None) -> Estimate:
     """Return the source of a text, such as ``"polynomial degree=3"``; the rest is as before."""
-    method, changes = _parse_choice("--source-from", text, ESTIMATES)
+    method, changes = parse_choice("--source-from", text, ESTIMATES)
     values = before.values() if before is not None and before.name() == method.name() else {}
     source: Estimate = validate(method, {**values, **changes}, f"--source-from '{text}'")
     return source
 
 
-def _parse_choice(flag: str, text: str, choices: Mapping[str, Any]) -> tuple[Any, dict[str, str]]:
+def parse_choice(flag: str, text: str, choices: Mapping[str, Any]) -> tuple[Any, dict[str, str]]:
     """Return the choice that a text names, and its parameters; quotes keep a space in one."""
     if len(text) > 10_000:
         raise InputError(f"{flag} has {len(text):,} characters: expected a name and parameters")
@@ -199,7 +199,7 @@ def _parse_choice(flag: str, text: str, choices: Mapping[str, Any]) -> tuple[Any
     for word in words:
         key, equals, value = word.partition("=")
         if not equals:
-            key, value = kind.primary, word
+            key, value = getattr(kind, "primary", ""), word
         if not key or key in values:
             raise InputError(f"{flag} is '{text}': expected name=value instead of '{word}'")
         values[key.replace("-", "_")] = value

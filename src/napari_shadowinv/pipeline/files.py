@@ -1,12 +1,13 @@
 """Files of recipes, setups and images.
 
-- recipes as TOML files: `read_recipe`, `write_recipe`
+- recipes as TOML files: `read_recipe`, `write_recipe`; as a command: `command_of`
 - the setup from a TOML file, completed from an image's file: `setup_from`
 """
 
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,9 @@ from typing import Any
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv._system.validation import map_paths, validate
 from napari_shadowinv.io import read_toml
-from napari_shadowinv.io.files import write_toml
+from napari_shadowinv.io.files import join_address, write_toml
 from napari_shadowinv.physics.setup import SETUPS, Setup, setup_from_dict
-from napari_shadowinv.preprocessing import Recipe
+from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
 _PIXEL_SIZES = {"pixel_size", "detector_pixel_size"}
 
@@ -51,6 +52,32 @@ def recipe_entries(recipe: Recipe) -> dict[str, Any]:
     if recipe.fit is not None:  # an empty section still requests a fit
         content["fit"] = recipe.fit.model_dump(exclude_defaults=True)
     return {name: _to_toml(value) for name, value in content.items() if value != ()}
+
+
+def command_of(recipe: Recipe, image: str | Path) -> str:
+    """Return the line for a shell that inverts an image by a recipe."""
+    entries = recipe_entries(recipe)
+
+    def described(choice: Mapping[str, Any], key: str) -> str:
+        values = (f"{k}={shlex.quote(str(v))}" for k, v in choice.items() if k != key)
+        return " ".join([choice[key], *values])
+
+    words = ["shadowinv", "invert", str(image)]
+    if "setup" in entries:
+        words += ["--setup", described(entries["setup"], "kind")]
+    source = recipe.source
+    if isinstance(source, MeasuredSource):
+        file = None if source.file is None else str(join_address(source.file, source.variable))
+        words += [] if file is None else ["--source", file]
+    elif source is not None:
+        words += ["--source-from", described(entries["source"], "method")]
+    for step in entries.get("steps", ()):
+        words += ["--step", described(step, "step")]
+    files = ("mask", "source_mask")
+    settings: dict[str, Any] = {name: entries[name] for name in files if name in entries}
+    for section in ("instrument", "options"):
+        settings |= {f"{section}.{key}": v for key, v in entries.get(section, {}).items()}
+    return shlex.join([*words, *(f"--set={key}={value}" for key, value in settings.items())])
 
 
 def setup_from(

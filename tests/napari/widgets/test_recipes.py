@@ -1,14 +1,17 @@
 """Recipes: the list of steps, the placement of results, and files for window and command."""
 
+import shlex
+
 import numpy as np
 import pytest
 from napari.components import ViewerModel
 from qtpy.QtWidgets import QApplication
 
-from helpers.command_line import undrawn
+from helpers.command_line import done, undrawn
 from helpers.forms import enter
 from helpers.jobs import run_job
 from helpers.layers import layer_of
+from helpers.results import provenance_in
 from napari_shadowinv import InputError, Instrument, InversionOptions, read, write
 from napari_shadowinv._napari.form import StepsSection
 from napari_shadowinv._napari.layer_metadata import frame_of, metadata_for, role_of, setup_origin_of
@@ -204,11 +207,17 @@ def test_the_command_does_what_the_window_saves(filled, run, shot_file, tmp_path
     np.testing.assert_array_equal(*pixels)
 
 
-def test_copied_python_makes_the_same_result(filled, run):
+def test_copied_lines_make_the_same_result(filled, run, tmp_path):
     clipboard = QApplication.clipboard()
     clipboard.setText("")
     mine = run(filled)
-    filled.recipes.copy()
+    python, command = filled.recipes.menu().actions()[2:4]
+    command.trigger()
+    done(*shlex.split(clipboard.text())[1:], "--out", tmp_path / "by.shadowinv")
+    by_command = read(tmp_path / "by.shadowinv")
+    np.testing.assert_array_equal(by_command.displacement, mine.displacement)
+    assert provenance_in(by_command).setup == mine.provenance.setup
+    python.trigger()
     lines, names = clipboard.text(), {}
     assert len(lines.splitlines()) <= 8
     exec(lines, names)
@@ -217,7 +226,7 @@ def test_copied_python_makes_the_same_result(filled, run):
     assert names["inversion"].setup == mine.provenance.setup
     clipboard.setText("")
     paint(filled.masks, np.s_[6:9], np.s_[12:15])
-    filled.recipes.copy()  # a mask in no file
+    python.trigger()  # a mask in no file
     assert clipboard.text() == ""
 
 

@@ -42,10 +42,10 @@ from napari_shadowinv.io.formats import (
 )
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import read_recipe, write_recipe
-from napari_shadowinv.pipeline.files import recipe_entries
+from napari_shadowinv.pipeline.files import command_of, recipe_entries
 from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
 from napari_shadowinv.pipeline.rerun import Rerun, collect_rerun
-from napari_shadowinv.preprocessing import MeasuredSource
+from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
 
 @dataclass(eq=False)
@@ -110,7 +110,8 @@ class RecipeButton(QPushButton):
         menu.addAction("Load recipe…").triggered.connect(lambda: self._ask_and_load())
         menu.addAction("Save…").triggered.connect(lambda: self._ask_and_save())
         if tool.command == "invert":
-            menu.addAction("Copy as Python").triggered.connect(lambda: self.copy())
+            menu.addAction("Copy as Python").triggered.connect(lambda: self.copy(_python_of))
+            menu.addAction("Copy as command").triggered.connect(lambda: self.copy(command_of))
         menu.addAction("Repeat").triggered.connect(lambda: self.repeat())
         self.setMenu(menu)
 
@@ -124,30 +125,23 @@ class RecipeButton(QPushButton):
             self.save(path)
 
     @notify_errors
-    def copy(self) -> None:
-        """Put lines of Python on the clipboard that make the same result from the image's file."""
+    def copy(self, text_of: Callable[[Recipe, str], str]) -> None:
+        """Put the text on the clipboard that makes the same result from the image's file."""
         tool = self._tool
         image = tool.chosen_image()
         path = None if image is None else about.metadata_of(image).get("path") or image.source.path
         if not path or tool.image.is_stack:
-            raise InputError("Python reads a single image from its file: open one, or save it")
+            raise InputError("a single image is read from its file: open one, or save it")
         recipe = tool.recipe_to_save()
         masks = (each.usable(image) for each in tool.mask_pickers.values() if not each.isHidden())
         is_drawn = any(mask is not None for mask in masks)
         if is_drawn or tool.source.to_write(recipe, image) is not None:
             raise InputError(
                 "masks or the source are in no file: save the recipe, which writes them, and use "
-                "it by read_recipe"
+                "it by read_recipe, or by --recipe"
             )
-        lines = (
-            "from napari_shadowinv import Recipe",
-            "from napari_shadowinv.pipeline import run",
-            "",
-            f"recipe = Recipe.model_validate({recipe_entries(recipe)!r})",
-            f"inversion = run(recipe, {str(path)!r})",
-        )
-        QApplication.clipboard().setText("\n".join([*lines, ""]))
-        show_info("Copied Python that makes this result")
+        QApplication.clipboard().setText(text_of(recipe, str(path)))
+        show_info("Copied what makes this result")
 
     @notify_errors
     def repeat(self) -> None:
@@ -194,6 +188,17 @@ class RecipeButton(QPushButton):
             changes["source"] = MeasuredSource(file=source_file)
         write_recipe(path, recipe.model_copy(update=changes), overwrite=overwrite)
         tool.panel.say(f"Saved the recipe in {path.absolute()}")
+
+
+def _python_of(recipe: Recipe, path: str) -> str:
+    lines = (
+        "from napari_shadowinv import Recipe",
+        "from napari_shadowinv.pipeline import run",
+        "",
+        f"recipe = Recipe.model_validate({recipe_entries(recipe)!r})",
+        f"inversion = run(recipe, {path!r})",
+    )
+    return "\n".join([*lines, ""])
 
 
 def _show_mask(picker: Any, usable: BoolArray | None, viewer: Any, image: Any) -> None:
