@@ -34,7 +34,6 @@ def evaluated(viewer, tool, pack_doses, tmp_path):
     tool.file.restore({"file": str(tmp_path / "another.toml")})
     viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
     assert tool.file.state() == {}
-    assert tool.request().pack == pack_doses.pack
     return tool
 
 
@@ -166,6 +165,7 @@ def test_cancelling_removes_what_was_written_for_the_run(
 
 
 def test_films_become_images_that_can_be_fitted(viewer, opened, evaluated, pack_doses, rest):
+    assert evaluated.request().pack == pack_doses.pack
     evaluated.to_fit.click()
     rest(evaluated)
     images = [layer for layer in viewer.layers if role_of(layer) == "shot"]
