@@ -291,12 +291,9 @@ def test_result_of_a_later_version_is_not_taken_for_a_script() -> None:
     np.save("shot.npy", SHOT)
     dataset = run(Recipe(options={"n_sites": 60}), "shot.npy").to_dataset()
     provenance = json.loads(dataset.attrs["provenance"])
-    for text, message in (
-        (json.dumps(provenance | {"version": "99.0", "lens": 1}), "was made by version 99.0"),
-        ("{", "has a damaged provenance"),
-    ):
+    for text in (json.dumps(provenance | {"version": "99.0", "lens": 1}), "{"):
         write("later.shadowinv", dataset.assign_attrs(provenance=text), overwrite=True)
-        refused("rerun", "later.shadowinv", names=message)
+        refused("rerun", "later.shadowinv", names="a damaged provenance, or one of another version")
 
 
 @pytest.mark.parametrize(
