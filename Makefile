@@ -49,7 +49,7 @@ test: $(VENV)/installed-dev
 
 test-pyside: $(VENV)/installed-dev
 	QT_API=pyside6 PYTEST_QT_API=pyside6 $(ON_SCREEN) $(BIN)/python -m pytest -q \
-		tests/napari/widgets/test_tools.py tests/napari/widgets/test_forms.py
+		tests/napari/widgets/test_windows.py tests/napari/widgets/test_forms.py
 
 # Compiled beforehand, so that not every process of the tests compiles them.
 kernels: $(VENV)/installed-dev
