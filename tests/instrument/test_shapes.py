@@ -24,6 +24,13 @@ def test_a_smooth_field_has_the_correlation_of_its_length() -> None:
     np.testing.assert_allclose(modes.mean(axis=1), 0, atol=1e-12)
 
 
+def test_a_field_without_a_length_keeps_its_variance() -> None:
+    """Its components are single pixels, of which most are 0 at the border."""
+    field = Shapes.of_length("field", 0.05, np.ones((6, 8)), share=1 - 1e-9)
+    assert sum(field.mean_squares) == pytest.approx(1)
+    assert len(field) >= 47
+
+
 def test_random_waves_have_the_correlation_of_their_length() -> None:
     """At places one and two lengths apart."""
     places = 7.0 * np.array([[0, 0], [1, 0], [0, 2]])

@@ -161,7 +161,7 @@ def _line_modes(size: int, length: float, share: float, most_places: int = 256) 
     held = np.cumsum(variances) / variances.sum()
     count = int(np.searchsorted(held, 1 - (1 - share) / 10)) + 1
     modes = (np.sqrt(variances) * vectors).T[:count]
-    modes *= np.sign(modes[:, :1])  # the algorithm leaves the signs open
+    modes *= np.where(modes[:, :1] < 0, -1.0, 1.0)  # the algorithm leaves the signs open
     return np.array([np.interp(np.arange(size), places, mode) for mode in modes])
 
 
