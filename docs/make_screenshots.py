@@ -192,6 +192,13 @@ def first_windows() -> None:
     photograph(viewer, "tutorial-first-profile.png")
 
 
+def make_pair() -> None:
+    """Write shot.tif and reference.tif as the tutorial on a radiograph does."""
+    text = (HERE.parent / "tutorials" / "proton-radiograph.md").read_text(encoding="utf-8")
+    (making,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(compile(making, "proton-radiograph.md", "exec"), {})
+
+
 class MovingPicture:
     """Pictures of a window, each with the time that it is shown and where the pointer is."""
 
@@ -207,7 +214,7 @@ class MovingPicture:
         picture = Image.fromarray(pixels[..., :3])
         if at is not None:
             window = self.viewer.window._qt_window
-            place = at if isinstance(at, QPoint) else at.mapTo(window, at.rect().center())
+            place = at.mapTo(window, at.rect().center())
             corners = [(place.x() + x, place.y() + y) for x, y in POINTER]
             ImageDraw.Draw(picture).polygon(corners, fill="white", outline="black", width=2)
         self.pictures.append(picture.resize(TOUR_SIZE, Image.Resampling.LANCZOS))
@@ -225,10 +232,8 @@ class MovingPicture:
 
 def tour() -> None:
     """The README's twelve seconds: open a pair with its setup, Run, a line across the field."""
-    text = (HERE.parent / "tutorials" / "proton-radiograph.md").read_text(encoding="utf-8")
-    (making,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
-        exec(compile(making, "proton-radiograph.md", "exec"), {})
+        make_pair()
         viewer = new_window("napari")
         film = MovingPicture(viewer)
         viewer.open(["reference.tif", "shot.tif"])
@@ -262,10 +267,8 @@ def tour() -> None:
 
 def proton_windows() -> None:
     """Tutorial: a radiograph from a file, its geometry typed by hand, its caustics."""
-    text = (HERE.parent / "tutorials" / "proton-radiograph.md").read_text(encoding="utf-8")
-    (making,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
-        exec(compile(making, "proton-radiograph.md", "exec"), {})
+        make_pair()
         viewer = new_window("proton radiograph")
         viewer.open(["shot.tif", "reference.tif"])
         tool = open_widget(viewer, "Invert")
