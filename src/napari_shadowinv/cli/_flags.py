@@ -31,7 +31,7 @@ SourceFile = Annotated[Path | None, Option(help="Image of the beam. Default: uni
 MaskFile = Annotated[Path | None, Option(help="Image, 0 at unusable pixels.")]
 RecipeFile = Annotated[Path | None, Option(help="TOML file of steps, files and options.")]
 SaveRecipe = Annotated[Path | None, Option(help="Write the recipe to a TOML file.")]
-SetupFile = Annotated[Path | None, Option(help="TOML file of the geometry, or 'optical …'.")]
+SetupFile = Annotated[Path | None, Option(help="Geometry, for SI units: TOML or 'proton …'.")]
 Channel = Annotated[str | None, Option(help="red, green, blue, mean or an index.")]
 ChosenShots = Annotated[str | None, Option(help="Shots such as 3, 3:20, ::10 or 1,4,9.")]
 Figure = Annotated[Path | None, Option(help=".png, .pdf or .svg. Default: a PNG.")]

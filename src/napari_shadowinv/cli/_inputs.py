@@ -52,13 +52,15 @@ def recipe_from(flags: InversionFlags | FitFlags, settings: Settings) -> Recipe:
 
 
 def read_setup(path: Path | None, geometry: Any = None) -> Setup | None:
-    """Read a setup from its file or a text such as "proton energy=3"; complete it."""
+    """Read a setup from its file or a text such as "proton energy=3"; a geometry completes it."""
     from napari_shadowinv.physics.setup import SETUPS
     from napari_shadowinv.pipeline.files import complete_setup, setup_from
 
+    if path is None:
+        return None
     kind = str(path).partition(" ")[0]
-    if path is None or kind not in SETUPS or path.exists():
-        return None if path is None else setup_from(path, geometry)
+    if kind not in SETUPS or path.exists():
+        return setup_from(path, geometry)
     _, values = parse_choice("--setup", str(path), SETUPS)
     return complete_setup({"kind": kind, **values}, geometry or {}, "--setup")
 

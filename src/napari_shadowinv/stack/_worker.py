@@ -364,7 +364,7 @@ class ShotOutcome:
 
     @property
     def reason(self) -> str:
-        """Why it failed; empty for another."""
+        """Why it failed; empty if it did not."""
         return str(self.report.get("reason", ""))
 
 

@@ -131,17 +131,17 @@ class RecipeButton(QPushButton):
         image = tool.chosen_image()
         path = None if image is None else about.metadata_of(image).get("path") or image.source.path
         if not path or tool.image.is_stack:
-            raise InputError("a single image is read from its file: open one, or save it")
+            raise InputError("only choices for a single image from a file are copied: open one")
         recipe = tool.recipe_to_save()
         masks = (each.usable(image) for each in tool.mask_pickers.values() if not each.isHidden())
         is_drawn = any(mask is not None for mask in masks)
         if is_drawn or tool.source.to_write(recipe, image) is not None:
             raise InputError(
                 "masks or the source are in no file: save the recipe, which writes them, and use "
-                "it by read_recipe, or by --recipe"
+                "it with read_recipe or --recipe"
             )
         QApplication.clipboard().setText(text_of(recipe, str(path)))
-        show_info("Copied what makes this result")
+        show_info("Copied to the clipboard")
 
     @notify_errors
     def repeat(self) -> None:
