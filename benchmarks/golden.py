@@ -63,8 +63,6 @@ COMMANDS = {
     "unknown": "fit low.npy high.npy --energies 14.7,30 --setup low.toml --source unknown "
     "--noise poisson --out unknown.shadowinv",
     "assumed": "fit low.npy high.npy --energies 14.7,30 --setup low.toml --out assumed.shadowinv",
-    "compare": "fit low.npy high.npy --energies 14.7,30 --setup low.toml --source beam.npy "
-    "--compare",
     "batch": "batch low.npy high.npy blurred.npy --source beam.npy --set options.n_sites=1500 "
     "--out run.shadowinv.zarr",
     "table": "batch shots.csv --setup low.toml --set options.n_sites=1500 "

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from helpers.command_line import done, flat, shadowinv
-from napari_shadowinv import InputError, ProtonSetup, fit, invert, predict_image, run_stack
+from napari_shadowinv import InputError, fit, invert, predict_image, run_stack
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.io import read, read_shot, write
 from napari_shadowinv.io.pradformat import check_pradformat_setup
@@ -22,7 +22,7 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import read_recipe, run_fit, write_recipe
 from napari_shadowinv.pipeline.files import setup_from
-from napari_shadowinv.pipeline.fit_run import compared_fields, refinement_choices, run_refinement
+from napari_shadowinv.pipeline.fit_run import refinement_choices, run_refinement
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot, shots_of
@@ -145,9 +145,7 @@ def test_text_image_states_a_new_kind(table, setups, images):
     assert "photon energy (keV) 8" in done("info", "shot.txt")
 
 
-def test_comparison_and_rows_know_a_new_kind(setups, table):
-    assert compared_fields(setups) == (("electrons",),)
-    assert compared_fields([ProtonSetup.example()]) == (("B",), ("E",), ("B", "E"))
+def test_rows_know_a_new_kind(table):
     rows = table_rows(table)
     assert [row.beam for row in rows] == [{"photon_energy": 8.0}, {"photon_energy": 12.0}]
     assert rows[1].beam_text == "12 keV"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import tomllib
 from collections.abc import Callable, Sequence
@@ -321,29 +320,3 @@ def test_the_recipe_on_the_page_works(fit_arguments: dict[str, Any]) -> None:
 
 
 # Comparison of fields
-
-
-def test_fields_are_compared_and_the_likeliest_is_written(
-    monkeypatch: pytest.MonkeyPatch, make_fit: Callable[..., Fit]
-) -> None:
-    """Of those that are nearly as likely, the one with the fewest fields."""
-    evidences = {("B",): 0.0, ("E",): -50.0, ("B", "E"): 3.0}
-
-    def fit(_: Any, *, fields: tuple[str, ...], options: FitOptions, **__: Any) -> Fit:
-        made = make_fit(names=fields, options=options)
-        report = dataclasses.replace(made.report, log_evidence=evidences[fields])
-        return dataclasses.replace(made, report=report)
-
-    monkeypatch.setattr("napari_shadowinv.pipeline.fit_run.fit", fit)
-    result = shadowinv(*PAIR, "--compare")
-    rows = [line.split() for line in result.stdout.partition("Comparison")[2].splitlines()]
-    names_and_evidence = [
-        (row[0].rstrip(","), row[-2]) for row in rows if row and row[0].rstrip(",") in "BE"
-    ]
-    assert names_and_evidence == [("B", "likeliest"), ("B", "+3.0"), ("E", "-50.0")]
-    assert [field.name for field in fit_in("a_fit.shadowinv").fields] == ["B"]
-    choices = provenance_in("a_fit.shadowinv").recipe.fit
-    assert choices.fields == ("B",)
-    assert choices.options.evidence
-    done(*PAIR, "--compare", "--set=fit.fields=E", "--overwrite")
-    assert [field.name for field in fit_in("a_fit.shadowinv").fields] == ["E"]

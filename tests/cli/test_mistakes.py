@@ -141,10 +141,6 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
         "'fading' or 'free'",
     ),
     "fit a.tif --set options.samples=2": "options.samples: did you mean fit.options.samples?",
-    "fit a.tif b.tif --energies 14.7,5 --setup lengths.toml --compare --set fit.fields=plasma": (
-        "plasma",
-        "B; E; B,E",
-    ),
     f"batch a.tif {STORE} --set fit.fields=B --set options.tolerance=1e-3": (
         "options.tolerance",
         "fit.options",
@@ -218,9 +214,6 @@ WRONG_FILES: dict[str, dict[str, str | tuple[str, ...]]] = {
     },
     "fit --energies 3 a.csv": {
         "file\na.tif\n": "column 'energy'",
-    },
-    "fit --compare a.csv": {
-        "file,strength\na.tif,1\nb.tif,2\n": "needs the setup",
     },
     f"batch {STORE} --set fit.fields=B a.csv": {
         "file,psf\na.tif,1\n": ("line 2 does not say which shot", "column 'shot'"),

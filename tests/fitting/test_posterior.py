@@ -218,26 +218,6 @@ def test_the_same_seed_draws_the_same_samples(
     assert (first != third).any()
 
 
-def test_the_log_volume_falls_by_that_of_better_data(
-    tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
-) -> None:
-    """Half the change of log det H as the data improve, within the scatter of the probes."""
-    scene, unknowns, matrix, _ = tiny
-    better = replace(scene, weights=16 * scene.weights)
-    dense, _ = dense_hessian(better, unknowns)
-    exact = [half_log_determinant(hessian) for hessian in (matrix, dense)]
-    volumes = [
-        np.mean(
-            [
-                Posterior(each, unknowns, rng).log_volume([rng])
-                for rng in map(np.random.default_rng, (4, 5))
-            ]
-        )
-        for each in (scene, better)
-    ]
-    assert volumes[1] - volumes[0] == pytest.approx(exact[1] - exact[0], rel=0.1)
-
-
 @pytest.mark.parametrize("true", [30.0, 300.0])
 def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
     """A field drawn from the prior, images with noise: λ comes back within a factor of two."""

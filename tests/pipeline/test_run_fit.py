@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.fit_images import bump, counted, noisy, of_each
+from helpers.fit_images import of_each
 from napari_shadowinv import Fit, InputError, Instrument, ProtonSetup, fit
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.io import read, write
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.pipeline import run_comparison, run_fit
+from napari_shadowinv.pipeline import run_fit
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing import (
     Bin,
@@ -174,25 +174,3 @@ def test_what_a_fit_cannot_take_or_repeat_is_refused(
 ) -> None:
     with pytest.raises(InputError, match=words):
         collect_fit_inputs(Recipe(), [Shot(images[k], **each) for k, each in enumerate(known)])
-
-
-def test_a_field_that_is_not_there_does_not_make_the_images_likelier() -> None:
-    """Images of B alone, at three energies: B before both, E far behind."""
-    setups = [
-        ProtonSetup(
-            source_object_distance=0.01, object_image_distance=0.3, pixel_size=2e-5, energy=energy
-        )
-        for energy in (5, 10, 20)
-    ]
-    size, noise = (48, 56), 0.03
-    weak = bump(0.4, 8, (22, 29))
-    weaker = [setups[0].momentum / setup.momentum for setup in setups]
-    images = [counted(lambda y, x: s * weak(y, x), size) for s in weaker]  # noqa: B023
-    options = FitOptions(samples=0, spacing=0.25)
-    shots = shots_of(noisy(images, noise), setup=setups, noise=noise, source=np.ones(size))
-    fits = run_comparison(Recipe(fit=FitChoices(options=options)), shots)
-    assert [len(each.fields) for each in fits] == [1, 2, 1]
-    assert fits[0].fields[0].name == "B"
-    evidence = [each.report.log_evidence for each in fits]
-    assert abs(evidence[1] - evidence[0]) < 10
-    assert evidence[2] < evidence[0] - 100

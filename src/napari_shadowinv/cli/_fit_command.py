@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from typer import Option
 
@@ -16,20 +15,12 @@ from napari_shadowinv.cli._outputs import (
     check_setup,
     result_and_figure,
 )
-from napari_shadowinv.cli._settings import FILE_KEYS, FIT_SECTIONS, Settings, settings_of
+from napari_shadowinv.cli._settings import FILE_KEYS, FIT_SECTIONS, settings_of
 from napari_shadowinv.cli._summary import result_rows
-from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.cli._terminal import notify_errors, work_callbacks
 from napari_shadowinv.facts import ResultKind
 from napari_shadowinv.io.files import split_address
 from napari_shadowinv.io.formats import RESULT
-
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from napari_shadowinv.fitting import Fit
-    from napari_shadowinv.physics.setup import Setup
-    from napari_shadowinv.preprocessing import Recipe
 
 EPILOG = """
 shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --set fit.fields=B,E
@@ -59,79 +50,31 @@ def fit(
 
     Rays may cross, images may be blurred, and the beam may be unknown.
     """
-    from napari_shadowinv.pipeline import run_comparison, run_fit, write_recipe
+    from napari_shadowinv.pipeline import run_fit, write_recipe
     from napari_shadowinv.pipeline.fit_run import read_row_images
     from napari_shadowinv.pipeline.shot_table import shot_rows
 
     rows = shot_rows(images, flags.setup, flags.energies, "--energies")
     first, outputs = split_address(rows[0].file)[0], Outputs(overwrite, quiet)
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
-    result, figure = result_and_figure(first, target, figure)
+    file, figure = result_and_figure(first, target, figure)
     inputs = [*images, flags.fiducials, flags.recipe]
     inputs += [file for row in rows for file in row.files.values()]
-    outputs.check_result(ResultKind.FIT, result, figure, recipe=save_recipe, inputs=inputs)
+    outputs.check_result(ResultKind.FIT, file, figure, recipe=save_recipe, inputs=inputs)
     stated = settings_of(settings or (), FIT_SECTIONS, flags.by_key, FILE_KEYS[:1])
     recipe = recipe_from(flags, stated)
     outputs.protect_files_of(recipe)
     shots = read_row_images(rows, recipe, channel=flags.channel)
     shots = (replace(shots[0], fiducials=flags.fiducials), *shots[1:])
-    check_setup(result, shots[0].setup, recipe.fit.fields if recipe.fit else None)
+    check_setup(file, shots[0].setup, recipe.fit.fields if recipe.fit else None)
     outputs.warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
-    fields = _wanted_fields(recipe, stated, shots[0].setup) if flags.compare else set()
     names = [str(row.file) for row in rows]
     with work_callbacks(quiet) as callbacks:
-        if flags.compare:
-            fits = run_comparison(recipe, shots, **callbacks)
-        else:
-            fits = (run_fit(recipe, shots, **callbacks),)
-        written = next((each for each in fits if _fields_of(each) == fields), fits[0])
-    outputs.write_result(written, names, result, figure)
+        result = run_fit(recipe, shots, **callbacks)
+    outputs.write_result(result, names, file, figure)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, recipe.model_copy(update={"setup": common}), overwrite=overwrite)
-    if flags.compare and not quiet:
-        say(_comparison_table(fits))
-    outputs.show("Fit", result_rows(written, outputs.printed, names=names))
-    outputs.exit_unless_sound(written, result)
-
-
-def _fields_of(fit: Fit) -> set[str]:
-    return {field.name for field in fit.fields}
-
-
-def _wanted_fields(recipe: Recipe, stated: Settings, setup: Setup | None) -> set[str]:
-    """Return the fields of the fit to write, among those to compare; none for the likeliest."""
-    from napari_shadowinv.pipeline.fit_run import compared_fields
-
-    written = stated.values.get("fit.fields")
-    if written is None or recipe.fit is None:
-        return set()
-    compared = compared_fields(None if setup is None else [setup])
-    fields = set(recipe.fit.fields or ())
-    if fields not in map(set, compared):
-        choices = "; ".join(",".join(choice) for choice in compared)
-        raise InputError(
-            f"received fit.fields={written} and --compare, which compares {choices}: write one of "
-            "these, or leave out fit.fields to write the likeliest"
-        )
-    return fields
-
-
-def _comparison_table(fits: Sequence[Fit]) -> Table:
-    """Build a table of the choices of fields, the likeliest first."""
-    from rich import box
-    from rich.table import Table
-
-    headings = "fields", "χ²", "log evidence", "verdict"
-    table = Table(*headings, title="Comparison", title_justify="left", box=box.SIMPLE)
-    table.caption = "A difference of 10 is decisive."
-    best = fits[0].report.log_evidence or 0.0
-    for fit in fits:
-        names = ", ".join(field.name for field in fit.fields)
-        chi2 = ", ".join(f"{value:.3g}" for value in fit.chi2)
-        evidence = (
-            "likeliest" if fit is fits[0] else f"{(fit.report.log_evidence or 0.0) - best:+.1f}"
-        )
-        table.add_row(names, chi2, evidence, fit.verdict)
-    return table
+    outputs.show("Fit", result_rows(result, outputs.printed, names=names))
+    outputs.exit_unless_sound(result, file)

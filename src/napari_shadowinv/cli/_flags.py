@@ -126,9 +126,6 @@ class FitFlags(ShotFlags):
     )
     noise: Annotated[str | None, Option(help="poisson, proportional or a deviation.")] = None
     fiducials: Annotated[Path | None, Option(help="Table (.csv) of known displacements.")] = None
-    compare: Annotated[
-        bool, Option("--compare", help="Compare the fits of B, of E and of both.")
-    ] = False
 
     @property
     def by_key(self) -> dict[str, tuple[str, Any]]:

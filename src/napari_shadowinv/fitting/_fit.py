@@ -28,7 +28,6 @@ from napari_shadowinv.fitting.measurements import FitData, collect_data
 from napari_shadowinv.fitting.pattern import (
     Pattern,
     find_pattern,
-    log_evidence,
     noise_amplification,
 )
 from napari_shadowinv.fitting.result import Basin, Fit
@@ -51,7 +50,7 @@ from napari_shadowinv.options import FitOptions, Instrument
 
 # Of the names of steps; those of starts are 0.
 _STAGES = {"smoothness": 1} | dict.fromkeys(
-    ("other starts", "full size", "point spread", "rivals", "samples", "evidence"), 2
+    ("other starts", "full size", "point spread", "rivals", "samples"), 2
 )
 
 
@@ -134,9 +133,6 @@ def fit(
         amplification = max(noise_amplification(pattern.correlation) * least, 1.0)
         errors = field_errors(data, minima.scene, summary, amplification)
         report = report_of(data, minima.instrument, refined, summary, pattern)
-        if options.evidence:
-            evidence = log_evidence(data, minima.scene, minima.best, on_step)
-            report = replace(report, log_evidence=evidence)
     report = replace(report, seconds=seconds)
     return summarise(data, refined, basins, summary, errors, report, pattern)
 

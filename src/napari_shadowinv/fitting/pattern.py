@@ -2,7 +2,6 @@
 
 - tests of the residuals: `pattern_strength`, `correlation_length`, `blur_score`
 - the noise of counts: `lack_of_noise`
-- the likelihood of a choice of fields: `log_evidence`
 
 χ² hides structure: a beam that is 2 % wrong adds 0.1 to χ² at 5 % noise, spread over the whole
 image, and bends the field by tens of per cent. Smoothed, the same residual stands out of white
@@ -13,22 +12,15 @@ the noise in each pixel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from zlib import crc32
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, laplace
 
-from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.measurements import FitData
 from napari_shadowinv.fitting.search import (
-    SMOOTHNESS_RATIO,
     FineMinimum,
-    Minimum,
-    posterior_of,
-    settle_minimum,
 )
 
 
@@ -210,16 +202,3 @@ def find_pattern(data: FitData, refined: FineMinimum, least_counts: float = 5.0)
         missing_counts=missing,
         counts_deviation=deviation,
     )
-
-
-def log_evidence(data: FitData, scene: Scene, best: Minimum, on_step: OnStep) -> float:
-    """Return the log evidence at the likeliest λ and κ, where it depends least on their accuracy.
-
-    The fields have random probes that are the same for all models.
-    """
-    if data.options.smoothness is None:
-        scene = replace(scene, smoothness=scene.smoothness / SMOOTHNESS_RATIO)
-    ended = settle_minimum(scene, best, on_step, "evidence", least_gain=0.1)
-    seeds = [[data.options.seed, crc32(name.encode())] for name in data.fields]
-    chances = list(map(np.random.default_rng, seeds))
-    return posterior_of(scene, ended, chances[0], on_step, "evidence").log_evidence(chances)

@@ -1,6 +1,6 @@
 """Uncertainty of the best unknowns by the Gauss-Newton Hessian, and the error bars from it.
 
-- random changes that the data leave open, and the evidence: `Posterior`, `Sample`, `Response`
+- random changes that the data leave open, `Posterior`, `Sample`, `Response`
 - error bars by random changes, such as those by the noise: `displacement_errors`
 - by an unmeasured or inexact beam: `shifts_by_beam`, `draw_variations`
 - fields that noise, beam and instrument leave possible: `sampled_potentials`
@@ -22,8 +22,7 @@ from operator import add
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.fft import dctn, idctn
-from scipy.linalg import eigh_tridiagonal
+from scipy.fft import dctn
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._system.machine import available_threads
@@ -368,38 +367,6 @@ class Posterior:
         slopes = [self._linear.pull(np.sqrt(self.scene.weights) * each) for each in images]
         return self._changes(slopes, tolerance)
 
-    def log_volume(
-        self, chances: Sequence[np.random.Generator], probes: int = 8, powers: int = 25
-    ) -> float:
-        """Return half the log-determinant of the Hessian relative to the prior of potentials.
-
-        By stochastic Lanczos quadrature in the space of some `powers` of the Hessian, with the
-        same probes for both, and for each field those of its own generator: a field that the data
-        do not show adds nothing to others.
-        """
-        # What is fixed has no scale, and no part in the volume; nor what nothing holds.
-        ones = self._unknowns.like(np.ones(self._unknowns.flat().size))
-        moved = self._scales.times(ones)._replace(potentials=ones.potentials)
-        if np.isinf(self.scene.decay):
-            moved.potentials[:, 0, 0] = 0
-        free = moved.flat() != 0
-        is_potential = np.arange(free.size) < ones.potentials.size
-        total = 0.0
-        for _ in range(probes):
-            of_fields = [chance.choice([-1.0, 1.0], free.size) for chance in chances]
-            probe = self._unknowns.like(of_fields[0])
-            for m, of_field in enumerate(of_fields):
-                probe.potentials[m] = self._unknowns.like(of_field).potentials[0]
-            signs = free * probe.flat()
-            total += self._log_determinant(self._times, signs, powers)
-            total -= self._log_determinant(self._prior_times, is_potential * signs, powers)
-        return total / probes / 2 - self._scales.log_size()
-
-    def log_evidence(self, chances: Sequence[np.random.Generator]) -> float:
-        """Return the log evidence but for a constant, by a random generator for each field."""
-        value = self.scene.value(self._unknowns, self._counts)
-        return -value - self.log_volume(chances)
-
     def _times(self, flat: FloatArray) -> FloatArray:
         self._after_step()
         return self._scales.hessian_times(self._linear, flat)
@@ -410,35 +377,6 @@ class Posterior:
             self._times, right, tolerance=tolerance, iterations=most_steps, modes=self._modes
         )
         return self._scales.times(self._unknowns.like(scaled))
-
-    def _prior_times(self, flat: FloatArray) -> FloatArray:
-        """The potentials' prior in scales in which it is about the identity."""
-        like, prior = self._unknowns, self.scene.prior
-        scale = 1 / np.sqrt(prior.of_potentials())
-        waves = scale * like.like(flat).potentials
-        change = like.zeros()._replace(potentials=idctn(waves, axes=(1, 2), norm="ortho"))
-        turned = scale * dctn(prior.times(change).potentials, axes=(1, 2), norm="ortho")
-        return like.zeros()._replace(potentials=turned).flat()
-
-    def _log_determinant(
-        self, times: Callable[[FloatArray], FloatArray], signs: FloatArray, powers: int
-    ) -> float:
-        """Estimate the trace of a matrix's logarithm from a probe."""
-        size = float(np.abs(signs).sum())
-        # Diagonal and off-diagonal of the matrix in the space of its first powers.
-        vectors, diagonal, beside = [signs / np.sqrt(size)], [], []
-        for _ in range(powers):
-            image = times(vectors[-1])
-            diagonal.append(product(image, vectors[-1]))
-            for vector in vectors:
-                image -= product(image, vector) * vector
-            length = float(np.sqrt(product(image, image)))
-            if length < 1e-10:
-                break
-            beside.append(length)
-            vectors.append(image / length)
-        values, eigenvectors = eigh_tridiagonal(diagonal, beside[: len(diagonal) - 1])
-        return size * float((eigenvectors[0] ** 2 * np.log(np.maximum(values, 1e-12))).sum())
 
 
 def draw_variations(

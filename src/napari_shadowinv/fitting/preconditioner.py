@@ -181,11 +181,6 @@ class Preconditioner:
             return np.asarray(self._potentials[0] * waves)
         return np.asarray(np.einsum(sums, self._potentials, waves))
 
-    def log_size(self) -> float:
-        """Return log |det S| plus about half the log-determinant of the prior."""
-        scales = np.append(self.others, np.diag(self._coupling.root))
-        return -self.log_ratio + float(np.log(scales[scales > 0]).sum())
-
 
 def _number_scales(scene: Scene) -> tuple[FloatArray, FloatArray]:
     """Return approximate standard deviations of an instrument's numbers, (n,) and (L, n)."""

@@ -175,9 +175,6 @@ class FitReport:
     seconds : dict of str to float
         Time of each stage; of "samples" what they take longer than "full size", beside which they
         are drawn.
-    log_evidence : float or None
-        Logarithm of the evidence, up to a constant that is the same for all choices of fields; None
-        if it was not requested.
     pattern : float or None
         How far the smoothed residual of an image stands out of white noise, in standard
         deviations; the largest of all images. See `pattern_strength`.
@@ -194,7 +191,6 @@ class FitReport:
     iterations: int
     converged: bool
     seconds: dict[str, float]
-    log_evidence: float | None = None
     pattern: float | None = None
     numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
     sampling: str = "linear"

@@ -125,11 +125,6 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
         "2 to 5 times as long as a linear one; for strong folds and instruments that are known "
         "poorly; always used where the beams of energies differ.",
     )
-    evidence: bool = Field(
-        default=False,
-        description="Compute the log evidence, to compare choices of fields; takes as long as a "
-        "few samples.",
-    )
     spacing: float | None = Field(
         default=None,
         ge=0.05,

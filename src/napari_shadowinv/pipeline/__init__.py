@@ -1,8 +1,7 @@
 """From a shot to its result by a recipe, for Python, commands and windows.
 
 - apply a recipe to a shot: `run`; sites and sources that a window reuses: `Cache`
-- fit several images of one object by a recipe: `run_fit`; find the fields that explain them:
-  `run_comparison`
+- fit several images of one object by a recipe: `run_fit`
 - repeat a result from its provenance: module `rerun`
 - an experiment before its shot, by simulated shots: `plan_experiment`, with `ExperimentOptions`
 - recipes as files: `read_recipe`, `write_recipe`

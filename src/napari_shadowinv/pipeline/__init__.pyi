@@ -3,7 +3,7 @@ from .experiment import plan_experiment
 from .experiment_options import ExperimentOptions
 from .files import read_recipe, write_recipe
 from .film_files import read_pack, write_layers
-from .fit_run import run_comparison, run_fit
+from .fit_run import run_fit
 from .inversion_run import Cache, run
 from .rerun import Rerun, rerun
 from .run_options import RunOptions, WatchOptions
@@ -19,7 +19,6 @@ __all__ = [
     "read_recipe",
     "rerun",
     "run",
-    "run_comparison",
     "run_film",
     "run_fit",
     "write_layers",

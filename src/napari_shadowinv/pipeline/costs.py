@@ -21,7 +21,6 @@ _TIME_PER_SAMPLE, _TIME_PER_BEAM_SAMPLE = 0.008, 0.012
 # Where the beam changes between energies, samples are fitted, and are this many at least; up to
 # twice as long for images of less than 100² px.
 _TIME_PER_FITTED_SAMPLE, _LEAST_FITTED_SAMPLES = 0.1, 16
-_EVIDENCE_IN_SAMPLES = 20
 # Of an inversion; measured on two cores with images of 0.25 to 4 Mpx and 5,000 to 1,000,000 sites,
 # including the layers of the result.
 _SECONDS_PER_PIXEL, _SECONDS_PER_SITE = 3e-6, 11e-6
@@ -75,8 +74,7 @@ def fit_cost(
     of_samples = samples * per_sample
     if samples and images > 1 and instrument is not None and instrument.beam_between:
         of_samples = max(samples, _LEAST_FITTED_SAMPLES) * _TIME_PER_FITTED_SAMPLE
-    of_evidence = _EVIDENCE_IN_SAMPLES * per_sample if choices.options.evidence else 0
-    seconds *= 1 + of_samples + of_evidence
+    seconds *= 1 + of_samples
     seconds *= pace or 1
     count = "one image" if images == 1 else f"{images} images"
     more = f", {fields} fields" if fields > 1 else ""

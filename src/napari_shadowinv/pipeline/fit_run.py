@@ -1,4 +1,4 @@
-"""From several images of one object to its fields by a recipe: `run_fit`, `run_comparison`.
+"""From several images of one object to its fields by a recipe: `run_fit`.
 
 - the complete inputs of a fit: `collect_fit_inputs`
 - images of a table's rows or of flags: `read_row_images`; their setup: `row_setup`
@@ -128,22 +128,17 @@ class FitInputs:
         return values_of(self.shots, "setup")
 
     def run(
-        self,
-        fields: tuple[str, ...] | None = None,
-        options: FitOptions | None = None,
-        *,
-        on_progress: OnProgress | None = None,
-        should_stop: ShouldStop | None = None,
+        self, on_progress: OnProgress | None = None, should_stop: ShouldStop | None = None
     ) -> Fit:
-        """Fit the fields, or others with other options, to the images.
+        """Fit the fields to the images.
 
         The fit has its setups and its provenance, whose recipe names its fields.
         """
         result = fit(
             self.shots,
-            fields=fields or self.fields,
+            fields=self.fields,
             instrument=self.provenance.recipe.instrument,
-            options=options or self.choices.options,
+            options=self.choices.options,
             on_progress=on_progress,
             should_stop=should_stop,
         )
@@ -188,39 +183,6 @@ def run_fit(
     """
     inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
     return inputs.run(on_progress=on_progress, should_stop=should_stop)
-
-
-def run_comparison(
-    recipe: Recipe,
-    shots: Sequence[AnyShot],
-    *,
-    decisive: float = 10.0,
-    on_progress: OnProgress | None = None,
-    should_stop: ShouldStop | None = None,
-) -> tuple[Fit, ...]:
-    """Fit each of the `compared_fields` to the same images, otherwise as `run_fit`.
-
-    The likeliest comes first, by ``report.log_evidence``; of those nearer to it than what is
-    `decisive`, that with the fewest fields. An `InputError` also refuses images without setups.
-    """
-    inputs = collect_fit_inputs(recipe, shots, should_stop=should_stop)
-    if any(shot.setup is None or shot.strength is not None for shot in inputs.shots):
-        raise InputError(
-            "comparing fields needs the setup of each image, and no strengths: how much each field "
-            "displaces follows from the setups"
-        )
-    options = inputs.choices.options.model_copy(update={"evidence": True})
-    fits = [
-        inputs.run(fields, options, on_progress=on_progress, should_stop=should_stop)
-        for fields in compared_fields(inputs.setups)
-    ]
-    evidences = {each: each.report.log_evidence or 0.0 for each in fits}
-    least = max(evidences.values()) - decisive
-
-    def rank(one: Fit) -> tuple[float, float]:
-        return (len(one.fields) if evidences[one] > least else np.inf), -evidences[one]
-
-    return tuple(sorted(fits, key=rank))
 
 
 def collect_fit_inputs(
@@ -375,13 +337,6 @@ def _prepare_image(inputs: Inputs, name: str, should_stop: ShouldStop | None) ->
         return replace(shot, source=source, cautions=(*shot.cautions, *doubts))
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
-
-
-def compared_fields(setups: Sequence[Setup] | None) -> tuple[tuple[str, ...], ...]:
-    """Return the choices of fields to compare: each cause of a deflection alone, and all."""
-    keys = tuple(cause.key for cause in setups[0].deflectors) if setups else ("B", "E")
-    alone = tuple((key,) for key in keys)
-    return (*alone, keys) if len(keys) > 1 else alone
 
 
 def usual_fields(setups: Sequence[Setup] | None) -> tuple[str, ...]:

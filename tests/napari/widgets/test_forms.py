@@ -38,7 +38,7 @@ STATED = [
     ProtonSetup.example(),
     OpticalSetup.example(),
     InversionOptions(**CHANGED),
-    FitOptions(smoothness=1.5, evidence=True, align="shift"),
+    FitOptions(smoothness=1.5, align="shift"),
     Instrument(detector="film", beam_source="laser", gamma=0, noise_correlation=0),
     Crop(y=(3, 40), x=(5, None)),
     Dark(level=Path("dark.tif")),
