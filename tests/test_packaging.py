@@ -98,7 +98,6 @@ LIGHT = {
     "import napari_shadowinv; napari_shadowinv.__version__": f"numpy scipy {HEAVY} {WINDOWS}",
     "from napari_shadowinv.io import read, write": f"scipy {HEAVY} {WINDOWS}",
     "from napari_shadowinv.cli import app": f"scipy.fft zarr {HEAVY} {WINDOWS}",
-    "from helpers.command_line import done; done('info', '--system')": WINDOWS,
 }
 
 

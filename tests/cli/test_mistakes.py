@@ -75,8 +75,6 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     "info shots.h5::shop": ("shots.h5", "'shop'", "day/beam"),
     "info shots.h5::day": ("no array 'day'", "day/beam"),
     "info missing.tif": "missing.tif",
-    "info": "--system",
-    "info shot.npy --system": "no file",
     "info shots --all": "is not a stack of shots",
     "info none.shadowinv.zarr": "none.shadowinv.zarr does not exist",
     "export shots --format csv": "is not a stack of shots",

@@ -2,13 +2,11 @@
 
 import json
 import os
-import platform
 import re
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +29,11 @@ from helpers.command_line import (
 )
 from helpers.results import provenance_in
 from napari_shadowinv import __version__
-from napari_shadowinv._system.machine import physical_memory
-from napari_shadowinv.cli import _info
 from napari_shadowinv.cli._inputs import setup_for
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit
-from napari_shadowinv.inversion import Inversion, machine_code
+from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read, read_shot, write
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -287,51 +283,6 @@ def test_info_describes_a_file(
     text = done("info", name)
     for words in DESCRIBED[name].split("|"):
         assert words in text
-
-
-def system_report() -> dict[str, str]:
-    lines = shadowinv("info", "--system").stdout.splitlines()
-    return dict(re.split(r"\s{2,}", line, maxsplit=1) for line in lines)
-
-
-def test_info_reports_the_installation(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    entries = system_report()
-    assert entries["napari-shadowinv"] == __version__
-    assert entries["python"].startswith(platform.python_version())
-    for package in ("numpy", "scipy", "numba", "dask", "xarray", "zarr", "h5py"):
-        assert entries[package] == metadata.version(package)
-    assert platform.machine() in entries["platform"]
-    assert entries["cores"].startswith(f"{os.cpu_count()}, ")
-    size = physical_memory()
-    assert entries["memory"] == ("unknown" if size is None else f"{size / 2**30:.1f} GiB")
-    code = Path(entries["compiled code"].rpartition(" (")[0]).expanduser()
-    assert code == machine_code.code_folder()
-    monkeypatch.setattr(Path, "home", lambda: folder)
-    monkeypatch.setattr(machine_code, "code_folder", lambda: folder / "kept")
-    text = shadowinv("info", "--system").stdout
-    assert str(Path("~") / "kept") in text
-    assert str(folder) not in text
-
-
-def test_the_report_survives_missing_packages_and_a_compiler_that_fails(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def without_windows(name: str) -> str:
-        if name in ("napari", "npe2", "qtpy", *_info.QT_BINDINGS):
-            raise metadata.PackageNotFoundError(name)
-        return metadata.version(name)
-
-    def broken() -> None:
-        raise ImportError("llvmlite does not\nload")
-
-    monkeypatch.setattr(_info, "version", without_windows)
-    monkeypatch.setattr(machine_code, "code_folder", broken)
-    entries = system_report()
-    assert {entries[name] for name in ("napari", "npe2", "qtpy", "Qt")} == {"not installed"}
-    reason = "unknown: ImportError: llvmlite does not load"
-    assert shadowinv("info", "--system").stdout.splitlines()[-1].endswith(reason)
-    monkeypatch.setattr(_info, "_version", {"PySide6_Essentials": "6.11.0"}.get)
-    assert system_report()["Qt"] == "PySide6_Essentials 6.11.0"
 
 
 def test_info_of_a_result_shows_options_with_a_value_and_peak(folder: Path, shot: Path) -> None:

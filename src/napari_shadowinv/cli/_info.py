@@ -1,16 +1,11 @@
-"""The output of `shadowinv info`: `file_table`, and `system_report` for a bug report."""
+"""The output of `shadowinv info` for a file: `file_table`."""
 
 from __future__ import annotations
 
-import os
-import platform
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv import __version__
-from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.cli import _summary
@@ -27,12 +22,6 @@ if TYPE_CHECKING:
 
     from napari_shadowinv._typing import AnyArray
     from napari_shadowinv.io.formats import Format
-
-PACKAGES = (
-    "numpy scipy numba llvmlite dask distributed xarray zarr h5py h5netcdf scikit-image matplotlib "
-    "pydantic typer napari npe2 qtpy"
-)
-QT_BINDINGS = ("PyQt6", "PySide6", "PySide6_Essentials", "PyQt5", "PySide2")
 
 
 @as_file_errors
@@ -172,45 +161,3 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
         for fact in each.facts
         if fact.key in each.variables
     ]
-
-
-def system_report() -> str:
-    """List versions and the system, without loading napari or Qt, which may be broken."""
-    memory = physical_memory()
-    bindings = [f"{name} {number}" for name in QT_BINDINGS if (number := _version(name))]
-    rows = [
-        ("napari-shadowinv", __version__),
-        ("python", f"{platform.python_version()} ({platform.python_implementation()})"),
-        *[(name, _version(name) or "not installed") for name in PACKAGES.split()],
-        ("Qt", ", ".join(bindings) or "not installed"),
-        ("platform", f"{platform.platform()}, {platform.machine()}"),
-        ("cores", f"{os.cpu_count() or 'unknown'}, {available_threads(None)} usable"),
-        ("memory", "unknown" if memory is None else f"{memory / 2**30:.1f} GiB"),
-        ("compiled code", _compiled_code()),
-    ]
-    width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:{width}}  {value}" for name, value in rows)
-
-
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-def _compiled_code() -> str:
-    """Return the folder of the machine code; ~ hides the name of the user."""
-    try:
-        from napari_shadowinv.inversion.machine_code import code_folder, is_compiled
-
-        folder = code_folder()
-        if folder is None:
-            return "not cached: compiled again in each process"
-        state = "compiled" if is_compiled() else "not compiled yet"
-    except Exception as error:  # a broken numba must not stop the report
-        return f"unknown: {type(error).__name__}: {' '.join(str(error).split())}"
-    home = Path.home()
-    if folder.is_relative_to(home):
-        folder = Path("~") / folder.relative_to(home)
-    return f"{folder} ({state})"

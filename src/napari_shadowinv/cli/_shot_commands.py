@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
-from typer import Exit, Option, echo
+from typer import Exit, Option
 
 from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._inputs import recipe_from, setup_for
@@ -38,7 +38,6 @@ HELP = {
     "Default: the files named in the result, in its folder or the current one.",
     "rerun_out": "Result file. Default: the result's name with _again, in the current folder.",
     "other_folders": "Also read the files in other folders that the result names.",
-    "system": "Print the versions and the system instead, for a bug report.",
     "noise": "Standard deviation of the noise, as a fraction of the mean.",
     "verify": "Compare all files of a store with their checksums; exit code 1 if one is damaged.",
 }
@@ -138,22 +137,14 @@ def rerun(
 
 @notify_errors
 def info(
-    file: Annotated[Path | None, _flags.argument(help="An image, a result or a store.")] = None,
+    file: Annotated[Path, _flags.argument(help="An image, a result or a store.")],
     every: Annotated[bool, Option("--all", help="List each shot of a store.")] = False,
     verify: Annotated[bool, Option("--verify", help=HELP["verify"])] = False,
-    system: Annotated[bool, Option("--system", help=HELP["system"])] = False,
 ) -> None:
     """Describe a file and its contents, or the shots of a store and why some failed."""
     from napari_shadowinv.cli import _info
     from napari_shadowinv.io import is_stack
 
-    if system:
-        if file is not None:
-            raise InputError("--system describes the installation: it takes no file")
-        echo(_info.system_report())
-        return
-    if file is None:
-        raise InputError("no file given: name an image or a result, or use --system")
     if is_stack(file):
         from napari_shadowinv.cli._batch import status_tables
 
