@@ -148,12 +148,12 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     f"watch shots {STORE} --pattern inner/*.tif": "the pattern is 'inner/*.tif'",
     f"watch shots {STORE} --idle 0": "--idle is 0.0: it must be greater than 0",
     "forward d.npy --deflector plasma": "--recorded-with",
-    "forward d.npy --set trace.counts=3": "d.npy is no 3-D field",
+    "forward d.npy --set trace.counts=3": "trace.counts, which does not apply to d.npy",
     "forward grid.nc": "there is no setup",
     "forward grid.nc --setup setup.toml --set view.beam=x --set view.right=x": "different axes",
     "forward grid.nc --setup setup.toml --set trace.source_size=1e-5": "use output 'counts'",
     "forward grid.nc --setup setup.toml --set trace.step=3": "trace.step is '3'",
-    "forward grid.nc --setup setup.toml --deflector plasma": "leave them out",
+    "forward grid.nc --setup setup.toml --deflector plasma": "leave it out",
     "forward grid.nc::4 --setup setup.toml": "no openPMD file",
     "analyse ring.shadowinv": "received no product, expected at least one: profile [label=TEXT]",
     "analyse ring.shadowinv 'fluxx 1,1 2,2'": "did you mean 'flux'?",
@@ -173,7 +173,7 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     "plan blob --counts -1": "--counts is -1",
     "plan blob --set instrument.background=2": "instrument.background is '2'",
     "plan blob --deflector plasma": "does not apply to blob, a phantom",
-    "plan grid.nc": "particles through it need --setup",
+    "plan grid.nc": "there is no setup",
     "plan grid.nc --setup setup.toml --deflector 'magnetic field'": "does not apply to grid.nc",
     "plan toroid --setup setup.toml --set view.beam=x --set view.right=y": (
         "received view.beam, view.right, which does not apply to toroid"

@@ -42,7 +42,6 @@ from napari_shadowinv.pipeline.experiment import plan_experiment
 from napari_shadowinv.pipeline.experiment_object import (
     PlannedObject,
     object_of_displacement,
-    object_of_field,
     setups_of_text,
     shape_of_text,
 )
@@ -144,17 +143,14 @@ class PlanJob(Job):
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> ExperimentPlan:
         choices = {"shape": self.shape, "instrument": self.instrument, "options": self.options}
         keywords: Any = {**choices, "on_progress": on_progress, "should_stop": should_stop}
-        target: Any = self.object
-        if isinstance(target, GridFile):
-            Reporter(on_progress, should_stop)("field", 0, None)
-            setup = next(iter(self.setups), None)
-            target = object_of_field(target.field(), setup, title=target.file.name)
+        Reporter(on_progress, should_stop)("field", 0, None)
+        target = self.object.field() if isinstance(self.object, GridFile) else self.object
         return plan_experiment(target, self.setups or None, **keywords)
 
     def layers(self, plan: ExperimentPlan) -> LayerData:
         """Describe the image of the first draw."""
         setup = plan.setups[0] if plan.setups else None
-        image, name = plan.images[0], f"{plan.title}, planned"
+        image, name = plan.images[0], f"{self.object.title}, planned"
         return [shot_layer(image, name, setup, intensity_limits(image), unit="counts")]
 
 

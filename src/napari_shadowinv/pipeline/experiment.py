@@ -30,10 +30,15 @@ from napari_shadowinv.inversion.compilation import ensure_compiled as ensure_inv
 from napari_shadowinv.inversion.error_budget import ErrorBudget
 from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
 from napari_shadowinv.physics.beam import BeamSetup
+from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.poisson import potential_from_displacement
 from napari_shadowinv.physics.setup import Setup, deflector_titles
-from napari_shadowinv.pipeline.experiment_object import PlannedObject, object_of_phantom
+from napari_shadowinv.pipeline.experiment_object import (
+    PlannedObject,
+    object_of_field,
+    object_of_phantom,
+)
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan, PlannedShot
 from napari_shadowinv.pipeline.experiment_shots import ExperimentInputs, ShotSimulator
@@ -48,7 +53,7 @@ _OF_SEARCH = (Verdict.UNCERTAIN, Verdict.SEVERAL, Verdict.AMBIGUOUS)
 
 
 def plan_experiment(
-    object: PlannedObject | PhantomRecipe,
+    object: PlannedObject | PhantomRecipe | FieldGrid,
     setups: Setup | Sequence[Setup] | None = None,
     *,
     shape: tuple[int, int] | None = None,
@@ -61,7 +66,7 @@ def plan_experiment(
 
     Parameters
     ----------
-    object : PlannedObject or PhantomRecipe
+    object : PlannedObject, PhantomRecipe or FieldGrid
         The object: a phantom, or a field that is known from elsewhere.
     setups : Setup or sequence of Setup, optional
         The experiment of each image, with the same pixels at the object. Default: one image, and
@@ -110,7 +115,7 @@ def _checked_inputs(
 ) -> ExperimentInputs:
     options = as_model(ExperimentOptions, options, "options")
     instrument = as_model(Instrument, instrument, "instrument")
-    check_instance(object, (PlannedObject, PhantomRecipe), "object")
+    check_instance(object, (PlannedObject, PhantomRecipe, FieldGrid), "object")
     if object is None:
         raise InputError("the object is None: expected a phantom or a field")
     listed = (setups,) if setups is None or isinstance(setups, BeamSetup) else tuple(setups)
@@ -118,6 +123,8 @@ def _checked_inputs(
         raise InputError("the setups have gaps: expected the setup of each image")
     for setup in listed:
         check_instance(setup, BeamSetup, "setup")
+    if isinstance(object, FieldGrid):
+        object = object_of_field(object, listed[0])
     is_phantom = isinstance(object, PhantomRecipe)
     size = shape or ((200, 200) if is_phantom else object.shape)
     if len(size) != 2 or min(size) < _MIN_SIDE_PX:

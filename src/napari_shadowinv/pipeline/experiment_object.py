@@ -81,6 +81,7 @@ class PlannedObject:
     deflector: str | None = None  # title of the cause. Default: see `default_deflector`
     finer: int = 1  # samples along a side of a pixel
     shadow: BoolArray | None = None  # (h, w), where the object stops the beam
+    source: FloatArray | None = None  # (h, w), the beam in which it was seen, if it is known
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -259,18 +260,19 @@ def object_of_displacement(
     *,
     deflector: str | None = None,
     title: str = "a displacement",
+    source: FloatArray | None = None,
 ) -> PlannedObject:
     """Return an object with a displacement, (2, H, W) in px of a setup.
 
-    The deflector is the title of the cause of the deflection. An `InputError` if the shape is
-    another or a value is not finite.
+    The deflector is the title of the cause of the deflection, the source its beam, (H, W). An
+    `InputError` if the shape is another or a value is not finite.
     """
     samples = checked_displacement(displacement)
     if not np.isfinite(samples).all():
         raise InputError(
             "the displacement of the object has values that are not finite: expected numbers in px"
         )
-    return PlannedObject(samples, title=title, setup=setup, deflector=deflector)
+    return PlannedObject(samples, title=title, setup=setup, deflector=deflector, source=source)
 
 
 def object_of_result(result: Any) -> PlannedObject:
@@ -291,6 +293,11 @@ def object_of_result(result: Any) -> PlannedObject:
     if displacement is None:
         raise InputError(f"got a {content.kind.noun}, expected a result with a field")
     cause = deflector_titles().get(getattr(field, "name", ""))
+    source = getattr(content, "source", None)
     return object_of_displacement(
-        displacement, content.setup, deflector=cause, title="an earlier result"
+        displacement,
+        content.setup,
+        deflector=cause,
+        title="an earlier result",
+        source=None if source is None else source.reshape(-1, *source.shape[-2:])[0],
     )

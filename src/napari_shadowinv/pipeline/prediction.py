@@ -16,18 +16,22 @@ from napari_shadowinv.physics.particle_flight import check_particles
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
 from napari_shadowinv.physics.projection import transferred_displacement
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.physics.tracing import trace
+from napari_shadowinv.physics.trace_options import TraceOptions
+from napari_shadowinv.physics.tracing import TracedImage, trace
 from napari_shadowinv.pipeline.experiment_object import PlannedObject
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """The image that an object casts, with its displacement and source."""
+    """The image that an object casts, with its displacement, setup and source."""
 
     image: FloatArray  # in the unit of the source
     displacement: FloatArray  # px
+    setup: Setup | None
     source: FloatArray | None  # the beam past opaque parts of the object; None if uniform
+    inside: float  # share of the flux that lands inside the image
     warning: str = ""  # about caustics, lost flux and assumptions
+    traced: TracedImage | None = None  # of a 3-D field
 
 
 def predict(
@@ -37,15 +41,17 @@ def predict(
     *,
     source: FloatArray | None = None,
     deflector: str | None = None,
+    options: TraceOptions | None = None,
     on_progress: OnProgress | None = None,
     should_stop: ShouldStop | None = None,
 ) -> Prediction:
     """Return the image of a phantom, of a 3-D field, or of the displacement of a result.
 
     Its (height, width) is the `shape`, or that of the source or the displacement. A `deflector`,
-    such as an "electric field", converts a displacement to another setup than its own.
+    such as an "electric field", converts a displacement to another setup than its own; in its own,
+    it has its own source by default.
     """
-    shadow, warnings = None, []
+    shadow, traced, warnings = None, None, []
     if isinstance(target, FieldGrid):
         particles = check_particles(setup)
         size = shape if source is None else np.shape(source)
@@ -53,6 +59,7 @@ def predict(
             target,
             particles,
             (size[0], size[1]),
+            options=options,
             profile=source,
             on_progress=on_progress,
             should_stop=should_stop,
@@ -63,6 +70,9 @@ def predict(
         warnings += [f"{text[0].upper()}{text[1:]}." for text in doubts]
     else:
         if isinstance(target, PlannedObject):
+            setup = setup or target.setup
+            if source is None and target.setup == setup:
+                source = target.source
             displacement, warnings = _transfer(target, setup, source, deflector)
         else:
             displacement = target.phantom(shape, setup).displacement
@@ -83,7 +93,7 @@ def predict(
     inside = float(image.sum() / flux) if flux else 1.0
     if inside < 0.99:
         warnings.append(f"Only {percent(inside)} of the flux lands inside the image.")
-    return Prediction(image, displacement, source, " ".join(warnings))
+    return Prediction(image, displacement, setup, source, inside, " ".join(warnings), traced)
 
 
 def _transfer(

@@ -28,7 +28,7 @@ from napari_shadowinv.physics.phantoms import coaxial_line, four_toroids, wakefi
 from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
-from napari_shadowinv.pipeline.experiment_object import object_of_displacement, object_of_field
+from napari_shadowinv.pipeline.experiment_object import object_of_displacement
 
 
 @pytest.fixture
@@ -231,13 +231,13 @@ def test_a_3d_field_is_planned_as_in_python(traced, cube, image, refused):
     layer = image(traced)
     grid = read_field_grid(cube).turned("x", "y").centred()
     expected = plan_experiment(
-        object_of_field(grid, ProtonSetup.example()),
+        grid,
         ProtonSetup.example(),
         instrument=Instrument(beam_rms=0.0),
         options=ExperimentOptions(draws=3, counts=3000.0),
     )
     np.testing.assert_array_equal(layer.data, expected.images[0])
-    assert layer.name == "cube.nc, planned"
+    assert layer.name == "cube, planned"
     texts = texts_of(traced.report)
     assert texts["Error made"] == next(f.text for f in expected.facts if f.title == "Error made")
     traced.setup.set_kind("none")
