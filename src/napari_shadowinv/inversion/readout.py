@@ -182,7 +182,7 @@ class LinearResponse:
         self.area = self._masses(np.ones(solution.level.shape), self._triangulation)
         ground = objective.ground(solution.weights)
         self._network = diagram.laplacian()
-        self._factors = FactorisedLaplacian(self._network, solution.level.sites, ground)
+        self._factors = FactorisedLaplacian(self._network, ground)
 
     @property
     def sites(self) -> FloatArray:

@@ -134,8 +134,8 @@ Seed = np.random.SeedSequence
 
 _SAMPLE_SHARE = 0.2  # of the noise's flux errors that a sample may leave unsolved
 _LOOSEST_TOLERANCE = 0.1
-_MOST_FACTORISED = 1_100_000  # sites; their factors take 0.7 GB and 18 seconds
-_BYTES_FACTORISED = 2_600  # a site, at most, while they are factorised
+_MOST_FACTORISED = 1_100_000  # sites; their factors take 0.9 GB and half a minute
+_BYTES_FACTORISED = 1_300  # a site, at most, while they are factorised
 _LINEAR_TOLERANCE = 0.02
 _ROWS = 64  # read out between two calls of `should_stop`
 
@@ -392,7 +392,7 @@ class LinearResampling:
         if is_room and len(level.sites) <= _MOST_FACTORISED:
             with suppress(RuntimeError):  # the multigrid reports it if it fails as well
                 laplacian, ground = self._network
-                self._factors = FactorisedLaplacian(laplacian, level.sites, ground)
+                self._factors = FactorisedLaplacian(laplacian, ground)
         self._readout = LinearReadout(plan, level, threads)
         self._solvers = threading.local()  # each has vectors of its own
         self._gains = None if samples.instrument is None else self._flux_gains(threads)

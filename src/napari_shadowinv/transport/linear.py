@@ -2,8 +2,7 @@
 
 - solve systems one after the other whose matrices change little: `SimilarSystems`
 - several with the same matrix: `LaplacianSolver`
-- many with factors of the matrix, `WIDTH` at a time, for two substitutions each:
-  `FactorisedLaplacian`
+- many with factors of the matrix, by SuperLU: `FactorisedLaplacian`
 
 Flexible conjugate gradients, preconditioned by one cycle over the levels. One Gauss–Seidel sweep
 before and its mirror image after each visit of the next level smooth the error. Constants on
@@ -19,24 +18,21 @@ the vectors of all levels are single arrays.
 References
 ----------
 Y. Notay, Electron. Trans. Numer. Anal. 37, 123 (2010); A. Napov and Y. Notay, SIAM J.
-Sci. Comput. 34, A1079 (2012); A. George, SIAM J. Numer. Anal. 10, 345 (1973) (dissection).
+Sci. Comput. 34, A1079 (2012).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import splu
 
 from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.geometry.compiler import kernel, njit
-from napari_shadowinv.geometry.interpolation import WIDTH
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.transport._coarsening import (
     Blocks,
@@ -49,73 +45,34 @@ from napari_shadowinv.transport._coarsening import (
 )
 
 
-@njit(nogil=True, cache=True)
-def _substitute(
-    starts: Indices, rows: Indices, factor: FloatArray, pivots: FloatArray, x: FloatArray
-) -> None:
-    """Solve L D Lᵀ x = b in place; each column of L begins with its diagonal, which is 1."""
-    n = len(pivots)
-    unknown = np.empty(WIDTH)
-    for j in range(n):
-        for s in range(WIDTH):
-            unknown[s] = x[j, s]
-        for k in range(starts[j] + 1, starts[j + 1]):
-            i, value = rows[k], factor[k]
-            for s in range(WIDTH):
-                x[i, s] -= value * unknown[s]
-    for j in range(n - 1, -1, -1):
-        for s in range(WIDTH):
-            unknown[s] = x[j, s] / pivots[j]
-        for k in range(starts[j] + 1, starts[j + 1]):
-            i, value = rows[k], factor[k]
-            for s in range(WIDTH):
-                unknown[s] -= value * x[i, s]
-        for s in range(WIDTH):
-            x[j, s] = unknown[s]
-
-
 class FactorisedLaplacian:
     """Factors of a Laplacian as `LaplacianSolver` takes it, which threads may share.
 
-    The positions of its nodes, (n, 2), keep the factors sparse (nested dissection). A graph that
-    is not connected, or that rounding makes look so, raises a RuntimeError.
+    A graph that is not connected, or that rounding makes look so, raises a RuntimeError.
     """
 
-    def __init__(
-        self, laplacian: csr_array, positions: FloatArray, ground: FloatArray | None = None
-    ) -> None:
+    def __init__(self, laplacian: csr_array, ground: FloatArray | None = None) -> None:
         require_connected(laplacian)
-        self._n, self._pinned = int(laplacian.shape[0]), int(ground is None)
-        order = self._pinned + _dissection_order(
-            laplacian[self._pinned :, self._pinned :], positions[self._pinned :]
+        # Without a ground one unknown is free: all but the first are solved for.
+        self._pinned = int(ground is None)
+        matrix = _with_ground(laplacian, ground)[self._pinned :, self._pinned :].tocsc()
+        self._factors = splu(
+            matrix,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
         )
-        grounded = _with_ground(laplacian, ground)
-        factors = _factors(grounded[order][:, order], "NATURAL")
-        self._pivots = factors.U.diagonal()
-        # Rows are exchanged as the columns are, so U = D Lᵀ, as long as each pivot is positive.
-        if not (np.array_equal(factors.perm_r, factors.perm_c) and (self._pivots > 0).all()):
-            raise RuntimeError("the Laplacian is not positive")
-        self._places = np.empty(len(order), dtype=np.intp)
-        self._places[order - self._pinned] = factors.perm_c
-        lower = factors.L
-        lower.sort_indices()
-        self._lower = lower.indptr, lower.indices, lower.data
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve L x = b for each column of b, (n, k).
 
         Without a ground the mean of b is ignored, and x is zero at the first node.
         """
-        solution = np.zeros((self._n, right.shape[1]))
+        solution = np.zeros(right.shape)
         if self._pinned:
             right = (right - right.mean(axis=0))[1:]
-        for start in range(0, right.shape[1], WIDTH):
-            columns = slice(start, start + WIDTH)
-            ordered = np.zeros((len(right), WIDTH))
-            ordered[self._places, : right[:, columns].shape[1]] = right[:, columns]
-            _substitute(*self._lower, self._pivots, ordered)
-            solved = ordered[self._places]
-            solution[self._pinned :, columns] = solved[:, : solution[:, columns].shape[1]]
+        if len(right):
+            solution[self._pinned :] = self._factors.solve(right)
         return solution
 
 
@@ -498,7 +455,6 @@ class SimilarSystems:
     ) -> FloatArray:
         """Solve L x = b as `LaplacianSolver` does, or by factors if small or too hard for it."""
         if len(right) < self.direct_nodes:
-            require_connected(laplacian)
             return _solve_by_factors(laplacian, right, ground)
         length = float(np.sqrt(np.sum(right * right)))
         if self._solver is not None and length < self._longest:
@@ -521,70 +477,5 @@ class SimilarSystems:
 def _solve_by_factors(
     laplacian: csr_array, right: FloatArray, ground: FloatArray | None
 ) -> FloatArray:
-    if ground is not None:
-        return np.asarray(_factors(_with_ground(laplacian, ground)).solve(right))
-    # Without a ground one unknown is free: all but the first are solved for.
-    solution = np.zeros(len(right))
-    if len(right) > 1:
-        solution[1:] = _factors(laplacian[1:, 1:]).solve(right[1:] - right.mean())
-    solution -= solution.mean()
-    return solution
-
-
-def _factors(matrix: csr_array, order: str = "MMD_AT_PLUS_A") -> SuperLU:
-    options = {"SymmetricMode": True}
-    return splu(matrix.tocsc(), permc_spec=order, diag_pivot_thresh=0.0, options=options)
-
-
-def _dissection_order(
-    matrix: csr_array, positions: FloatArray, *, undivided: int = 16
-) -> NDArray[np.intp]:
-    """Order nodes so that those which separate two halves come after both, in each half again."""
-    n = len(positions)
-    depth = max(0, math.ceil(math.log2(max(n, 1) / undivided)))
-    spans = np.ptp(positions, axis=0) if n else np.zeros(2)
-    axes = np.empty(depth, np.int64)
-    for division in range(depth):
-        axes[division] = np.argmax(spans)
-        spans[axes[division]] /= 2
-    orders = np.argsort(positions.T, axis=1, kind="stable")
-    halves = np.zeros(n, np.int64)  # a binary digit for each division
-    divisions = np.full(n, depth + 1)  # the one that a node separates
-    _dissect(matrix.indptr, matrix.indices, orders, axes, halves, divisions)
-    above = depth + 1 - divisions
-    ends = ((halves >> above) + 1) << above
-    return np.argsort((depth + 2) * ends - divisions, kind="stable")
-
-
-@njit(nogil=True, cache=True)
-def _dissect(
-    starts: NDArray[np.int32],
-    neighbors: NDArray[np.int32],
-    orders: NDArray[np.int64],
-    axes: NDArray[np.int64],
-    halves: NDArray[np.int64],
-    divisions: NDArray[np.int64],
-) -> None:
-    """Divide nodes along axes, and find those that separate the halves of each division."""
-    n = halves.size
-    is_upper = np.empty(n, np.bool_)
-    for division in range(1, axes.size + 1):
-        first = np.zeros((1 << (division - 1)) + 1, np.int64)  # of each part, in the order
-        for i in range(n):
-            first[halves[i] + 1] += 1
-        first = first.cumsum()
-        middle = (first[:-1] + first[1:]) // 2
-        for i in orders[axes[division - 1]]:
-            part = halves[i]
-            is_upper[i] = first[part] >= middle[part]
-            first[part] += 1
-        for i in range(n):
-            halves[i] = 2 * halves[i] + is_upper[i]
-        for i in range(n):
-            if divisions[i] < division:
-                continue
-            for k in range(starts[i], starts[i + 1]):
-                j = neighbors[k]
-                if divisions[j] >= division and halves[i] < halves[j]:
-                    divisions[i] = division
-                    break
+    solution = FactorisedLaplacian(laplacian, ground).solve(right[:, None])[:, 0]
+    return solution - solution.mean() if ground is None else solution
