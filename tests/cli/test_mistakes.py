@@ -89,7 +89,6 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     "fit a.tif --source nothing.tif": "nothing.tif does not exist",
     "fit a.tif --source small.npy": "a.tif: source has shape (20, 20)",
     "plan missing.shadowinv": "missing.shadowinv",
-    "film": "received no pack file",
     "film lost.toml": "lost.toml does not exist: expected a TOML file",
     f"batch no/*.tif {STORE}": "no file matches no/*.tif",
     f"batch shots/*.npy {STORE} --source x.tif": "not exist",

@@ -12,7 +12,6 @@ from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._outputs import Outputs, result_and_figure
 from napari_shadowinv.cli._summary import fact_rows
 from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import ResultKind
 
 if TYPE_CHECKING:
@@ -27,12 +26,9 @@ HELP = {
     "batch.",
     "corners": "Table (.csv) for the detected corners of the films, to correct and name in the "
     "pack file.",
-    "new": "Folder of scans: only write a pack.toml for them, to be completed.",
     "out": "Result file. Default: the pack's name with .shadowinv, in the current folder.",
 }
 EPILOG = """
-shadowinv film --new scans
-
 shadowinv film scans/pack.toml --layers layers
 
 Exit codes: 0 written; 1 no figure; 2 invalid input, nothing written; 130 cancelled.
@@ -41,12 +37,11 @@ Exit codes: 0 written; 1 no figure; 2 invalid input, nothing written; 130 cancel
 
 @notify_errors
 def film(
-    pack: Annotated[Path | None, _flags.argument(help=HELP["pack"])] = None,
+    pack: Annotated[Path, _flags.argument(help=HELP["pack"])],
     layers: Annotated[Path | None, Option(help=HELP["layers"])] = None,
     corners: Annotated[Path | None, Option("--save-corners", help=HELP["corners"])] = None,
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
-    new: Annotated[Path | None, Option(help=HELP["new"])] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
@@ -59,29 +54,9 @@ def film(
     from napari_shadowinv.io import replacing
     from napari_shadowinv.io.formats import TABLE
     from napari_shadowinv.pipeline import read_pack, run_film, write_layers
-    from napari_shadowinv.pipeline.film_files import (
-        LAYERS_TABLE,
-        draft_pack,
-        missing_entries,
-        write_new_pack,
-    )
+    from napari_shadowinv.pipeline.film_files import LAYERS_TABLE
 
     outputs = Outputs(overwrite, quiet)
-    if new is not None:
-        if pack is not None:
-            raise InputError(
-                f"received --new, which writes a pack file, and the pack file {pack}: use one of "
-                "them"
-            )
-        entries = draft_pack(new)
-        outputs.files.append(write_new_pack(new, entries, overwrite=overwrite))
-        rows = [("layers", str(len(entries["layers"])))]
-        outputs.show("New pack", [*rows, *(("to complete", t) for t in missing_entries(entries))])
-        return
-    if pack is None:
-        raise InputError(
-            "received no pack file: name one, or write one for a folder of scans with --new"
-        )
     result, figure = result_and_figure(pack, out, figure)
     outputs.check_result(ResultKind.FILM_DOSES, result, figure)
     table = None if layers is None else layers / LAYERS_TABLE

@@ -2,15 +2,11 @@
 
 - read the description of a pack: `read_pack`
 - write its layers as images with a table: `write_layers`
-- draft a description from a folder of scans, with the layers in the order of their names and the
-  calibrations of the folder: `draft_pack`; as a file: `write_new_pack`
-- list the entries still to be added: `missing_entries`
 - a pack with corners and masks by hand: `corrected_pack`; their files: `copy_corrections`
 """
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,14 +18,12 @@ import numpy as np
 from napari_shadowinv._system.tables import read_rows, write_cells
 from napari_shadowinv._system.validation import map_paths, validate
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.film import Calibration, Pack, PackLayer, read_corners, write_corners
-from napari_shadowinv.film.pack import FILM_TYPES
+from napari_shadowinv.film import Pack, PackLayer, read_corners, write_corners
 from napari_shadowinv.film.scans import common_shape, upright
 from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io import read_shot, read_toml, replacing, write
-from napari_shadowinv.io.files import in_counting_order, make_folder, write_toml
-from napari_shadowinv.io.formats import SCAN_SUFFIXES, TABLE, TIFF
+from napari_shadowinv.io.files import make_folder, write_toml
+from napari_shadowinv.io.formats import TABLE, TIFF
 
 LAYERS_TABLE = f"layers{TABLE.suffix}"
 _COLUMNS = ("file", "mask", "setup", "energy", "strength", "exclude")
@@ -89,88 +83,6 @@ def write_layers(
     with replacing(table, overwrite) as temporary:
         write_cells(temporary, columns, rows)
     return [*written, table]
-
-
-PACK_FILE = "pack.toml"
-_USUAL_FILM = "HDV2"
-_UNEXPOSED_NAME = re.compile("unexposed|blank|background", re.IGNORECASE)
-
-
-def draft_pack(folder: Path) -> dict[str, Any]:
-    """Return the entries of a pack file for the scans of a folder.
-
-    Each scan is a layer, in the order of the names (film_2 before film_10), without filters. A scan
-    that is named after a film type, or with "unexposed" or "blank", shows unexposed film. A table
-    (.csv) that can be read as a calibration belongs to the type in its name, or to all types. A
-    `FileFormatError` if the folder cannot be read; an `InputError` if it has no scans.
-    """
-    folder = Path(folder)
-    try:
-        files = in_counting_order(path for path in folder.iterdir() if path.is_file())
-    except OSError as error:
-        raise FileFormatError(
-            f"{folder} cannot be read as a folder ({error.strerror}): choose the folder of the "
-            "scans"
-        ) from None
-    scans = [path for path in files if path.suffix.lower() in SCAN_SUFFIXES]
-    unexposed = [p for p in scans if p.stem in FILM_TYPES or _UNEXPOSED_NAME.search(p.stem)]
-    scans = [path for path in scans if path not in unexposed]
-    if not scans:
-        raise InputError(f"{folder} has no scans of films: expected images in colour, such as TIFF")
-    tables = [path for path in files if path.suffix.lower() in TABLE.suffixes]
-    calibrations = [path for path in tables if _is_calibration(path)]
-    layers: list[dict[str, Any]] = [
-        {"film": _film_type_of(path) or _USUAL_FILM, "filters": [], "file": path.name}
-        for path in scans
-    ]
-    films: dict[str, dict[str, str]] = {}
-    for kind in sorted({layer["film"] for layer in layers}):
-        for part, candidates in (("calibration", calibrations), ("unexposed", unexposed)):
-            by_type = {path: _film_type_of(path) for path in candidates}
-            of_kind = [path for path, film_type in by_type.items() if film_type == kind]
-            of_any = [path for path, film_type in by_type.items() if film_type is None]
-            if matching := of_kind or of_any:
-                films.setdefault(kind, {})[part] = matching[0].name
-    return {"films": films, "layers": layers}
-
-
-def missing_entries(entries: Mapping[str, Any]) -> list[str]:
-    """Return the missing and recommended entries of a pack, one clause for each."""
-    missing = []
-    if not any(layer["filters"] for layer in entries["layers"]):
-        missing.append("filters: those in front of each film, such as 13 um Al; 25 um Fe")
-    for kind in sorted({layer["film"] for layer in entries["layers"]}):
-        if "calibration" not in entries["films"].get(kind, {}):
-            missing.append(f"calibration of {kind}: a table (.csv) of doses and pixels")
-    if "seen_from" not in entries:
-        missing.append("seen from: source or detector, which decides the sign of B")
-    if "setup" not in entries:
-        missing.append("setup: distances, without which results are in px")
-    return missing
-
-
-def write_new_pack(folder: Path, entries: Mapping[str, Any], *, overwrite: bool = False) -> Path:
-    """Write the entries of a pack to ``pack.toml`` of a folder, and return its path.
-
-    A `FileFormatError` if the file exists, unless `overwrite`, or cannot be written; an
-    `InputError` with the reason if the entries do not describe a pack.
-    """
-    path = Path(folder) / PACK_FILE
-    validate(Pack, dict(entries), str(path))
-    write_toml(path, entries, overwrite)
-    return path
-
-
-def _film_type_of(path: Path) -> str | None:
-    return next((kind for kind in FILM_TYPES if kind.lower() in path.stem.lower()), None)
-
-
-def _is_calibration(path: Path) -> bool:
-    try:
-        Calibration.from_csv(path)
-    except (FileFormatError, InputError):
-        return False
-    return True
 
 
 def corrected_pack(
