@@ -10,8 +10,7 @@
 - all kinds: `PRODUCTS`; products of a table or a line of text: `product_from_dict`,
   `product_from_text`
 - products in files and tables: `add_products`, `products_in`, `products_table`
-- a product over successive shots: `analyse_shots` of a store, `time_series` of results; its
-  `growth_rate`
+- a product over successive shots: `analyse_shots` of a store, `time_series` of results
 - add a product: a subclass of `Product`, in a module that `kinds` imports
 """
 

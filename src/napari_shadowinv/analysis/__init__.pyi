@@ -10,7 +10,7 @@ from .maps import ChargeDensity, CurrentDensity, PhaseCurvature
 from .product import Product
 from .regions import Region
 from .result import ProductResult, add_products, products_in, products_table
-from .series import analyse_shots, growth_rate, time_series
+from .series import analyse_shots, time_series
 from .spectra import TurbulenceSpectrum
 
 __all__ = [
@@ -35,7 +35,6 @@ __all__ = [
     "add_products",
     "analyse",
     "analyse_shots",
-    "growth_rate",
     "product_from_dict",
     "product_from_text",
     "products_in",

@@ -1,4 +1,4 @@
-"""A product over successive shots: `time_series`, `analyse_shots`; its `growth_rate`.
+"""A product over successive shots: `time_series`, `analyse_shots`.
 
 - the time of each shot from the time between two: `shot_times`
 """
@@ -17,18 +17,14 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._analyse import analyse
 from napari_shadowinv.analysis.product import (
-    BANDS,
     Coordinate,
     Measurand,
     Product,
-    has_bands,
-    value_text,
 )
 from napari_shadowinv.analysis.result import SERIES_AXES, ProductResult
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level
+from napari_shadowinv.facts import Fact
 from napari_shadowinv.inversion.error_bars import Quantity
-from napari_shadowinv.physics.units import prefix_for
 
 if TYPE_CHECKING:
     import xarray
@@ -39,61 +35,6 @@ _TIME, _SHOT = SERIES_AXES
 _AXES = {"s": (_TIME, "time"), "": (_SHOT, "number of the shot")}
 
 
-def growth_rate(series: ProductResult, name: str, *, samples: int = 1000) -> Quantity:
-    """Return the rate γ in 1/s of exponential growth, such as of the r.m.s. of a region.
-
-    It is the slope of the logarithm over time, by least squares in which a shot counts as its
-    relative error allows; the band follows from the samples. Without them it follows from the
-    scatter of at least three shots about the line (Student's t).
-
-    Parameters
-    ----------
-    series : ProductResult
-        Of `time_series` or `analyse_shots`.
-    name : str
-        One of its numbers.
-    samples : int
-        Number of draws that represent the scatter.
-
-    Raises
-    ------
-    InputError
-        If there is no such number, or it does not keep its sign.
-    """
-    quantities = series.quantities
-    if name not in quantities:
-        raise InputError(f"got the number {name!r}, expected one of {', '.join(quantities)}")
-    quantity = quantities[name]
-    if not _keeps_sign(quantity):
-        raise InputError(
-            f"{name} is zero or changes its sign in the series: expected numbers that grow or "
-            "decay, such as an r.m.s."
-        )
-    (times,) = (places.values for places in series.coordinates.values())
-    sign, count = np.sign(quantity.value[0]), len(times)
-    weights = np.ones(count)
-    if has_bands(quantity):
-        weights = (quantity.value / np.maximum(quantity.std, 1e-300)) ** 2
-    from_middle = times - (weights * times).sum() / weights.sum()
-    factors = weights * from_middle / (weights * from_middle**2).sum()
-
-    def slope(values: FloatArray) -> FloatArray:
-        return np.asarray(np.log(np.maximum(sign * values, 1e-300)) @ factors)
-
-    rate = slope(quantity.value)
-    if has_bands(quantity) or count <= 2:
-        return Quantity(rate, slope(quantity.samples))
-    logarithms = np.log(sign * quantity.value)
-    residual = logarithms - logarithms.mean() - rate * from_middle
-    error = np.sqrt((residual**2).sum() / (count - 2) / (from_middle**2).sum())
-    normal = np.random.default_rng(0).standard_t(count - 2, samples)
-    return Quantity(rate, rate + error * normal)
-
-
-def _keeps_sign(quantity: Quantity) -> bool:
-    return bool((np.sign(quantity.value[0]) * quantity.value > 0).all())
-
-
 def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None) -> ProductResult:
     """Join the numbers of one product in several shots.
 
@@ -102,13 +43,13 @@ def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None
     results : sequence of ProductResult
         Of the same product and field, one for each shot, as `analyse` returns them.
     times : array_like, shape (n,), optional
-        Of the shots, in s, increasing. Default: shots are numbered, and growth rates are by shot.
+        Of the shots, in s, increasing. Default: shots are numbered.
 
     Returns
     -------
     ProductResult
         The numbers along the axis of the shots; errors of different shots are independent in its
-        samples. Its facts are the growth rates.
+        samples.
 
     Raises
     ------
@@ -118,8 +59,7 @@ def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None
     Notes
     -----
     Samples of different shots are drawn by the same random numbers, so they are shuffled here.
-    Errors that all shots share, such as the energy's, then count as independent, which makes the
-    interval of a growth rate too wide rather than too narrow.
+    Errors that all shots share, such as the energy's, then count as independent.
     """
     if times is None:
         return _join(results, np.arange(float(len(results))), "")
@@ -162,7 +102,7 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Pr
         coordinates={axis: Coordinate(places, unit, long_name)},
         stored={},
     )
-    return replace(result, facts=tuple(_facts(result, unit)))
+    return replace(result, facts=tuple(_facts(result)))
 
 
 def _single_numbers(result: ProductResult) -> dict[str, Measurand]:
@@ -179,8 +119,8 @@ def _single_numbers(result: ProductResult) -> dict[str, Measurand]:
     return variables
 
 
-def _facts(series: ProductResult, unit: str) -> Iterator[Fact]:
-    """Yield each number in the first and last shot, its growth, and the contents of the band."""
+def _facts(series: ProductResult) -> Iterator[Fact]:
+    """Yield each number in the first and last shot, and the contents of the band."""
     for name, quantity in series.quantities.items():
         variable = series.variables[name]
         title = variable.title or name.replace("_", " ")
@@ -189,27 +129,7 @@ def _facts(series: ProductResult, unit: str) -> Iterator[Fact]:
         of_unit = "" if symbol == "1" else f" {symbol}"
         text = f"{first:.4g} to {last:.4g}{of_unit}, first to last shot"
         yield Fact(name, f"{title[:1].upper()}{title[1:]}", text, short=text)
-        is_length = name in series.product.lengths
-        if is_length or not _keeps_sign(quantity) or np.ptp(quantity.value) == 0:
-            continue
-        rate = growth_rate(series, name)
-        factor, symbol = _rate_unit(float(rate.value), unit)
-        bands = [rate.band(share) for share in BANDS] if has_bands(rate) else []
-        ends = [(factor * float(low), factor * float(high)) for low, high in bands]
-        text = value_text(factor * float(rate.value), ends, symbol)
-        yield Fact(f"growth_{name}", f"Growth of {title}", text, short=text)
-    if series.has_bands:
-        yield from (fact for fact in series.facts if fact.key == "bands")
-    else:
-        text = "of growth rates, by the scatter of the shots about exponential growth"
-        yield Fact("bands", "Bands", text, Level.DOUBTFUL)
-
-
-def _rate_unit(rate: float, unit: str) -> tuple[float, str]:
-    if not unit:
-        return 1.0, "per shot"
-    factor, prefix = prefix_for(1 / max(abs(rate), 1e-300))
-    return 1 / factor, f"1/{prefix}{unit}"
+    yield from (fact for fact in series.facts if fact.key == "bands")
 
 
 def shot_times(numbers: Sequence[float], shots: Sequence[int], received: str) -> list[float]:
@@ -241,8 +161,7 @@ def analyse_shots(
 ) -> list[ProductResult]:
     """Measure products in each shot of a stack.
 
-    A store keeps fields without the errors of their pixels, so the numbers have no bands; growth
-    rates have one by the scatter of the shots.
+    A store keeps fields without the errors of their pixels, so the numbers have no bands.
 
     Parameters
     ----------
