@@ -103,13 +103,7 @@ def _cpsa(path: Path) -> None:
 
 
 def _table(path: Path) -> None:
-    np.savetxt(path, _shot(), header="energy = 14.7\npixel_size = 10 um", fmt="%d")
-
-
-def _pradreader(path: Path) -> None:
-    blocks = np.vstack([_shot(), _shot(), np.zeros(_shot().shape)])
-    told = "\n".join(f"{name} {_shot().shape}" for name in ("flux2D", "flux2D_ref", "mask"))
-    np.savetxt(path, blocks, delimiter=",", header=told, fmt="%d")
+    np.savetxt(path, _shot(), header="a shot", fmt="%d")
 
 
 def _inversion() -> Any:
@@ -181,7 +175,6 @@ FORMATS: dict[str, Writer] = {
     "shot.spe": _spe,
     "scan.cpsa": _cpsa,
     "shot.txt": _table,
-    "pradreader.txt": _pradreader,
     "pradformat.h5": lambda path: _hdf5(path, object_type="radiograph"),
     "inversion.h5": _result,
     "result.shadowinv": _result,

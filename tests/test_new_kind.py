@@ -15,13 +15,12 @@ import pytest
 from helpers.command_line import done, flat, shadowinv
 from napari_shadowinv import InputError, fit, invert, predict_image, run_stack
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.io import read, read_shot, write
+from napari_shadowinv.io import read, write
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import read_recipe, run_fit, write_recipe
-from napari_shadowinv.pipeline.files import setup_from
 from napari_shadowinv.pipeline.fit_run import refinement_choices, run_refinement
 from napari_shadowinv.pipeline.shot_table import ShotRow, table_rows
 from napari_shadowinv.preprocessing import Recipe
@@ -133,16 +132,6 @@ def test_command_fits_a_table_of_a_new_kind(table):
     quick = [f"--set=fit.options.{key}" for key in keys]
     result = shadowinv("fit", table, "--setup", "xray.toml", "--out", "fit.shadowinv", *quick)
     assert "8 keV" in flat(result.output), result.output
-
-
-def test_text_image_states_a_new_kind(table, setups, images):
-    head = "photon_energy: 8000 eV\nsource_object_distance: 10 cm\nobject_image_distance: 1 m\n"
-    np.savetxt("shot.txt", images[0], header=f"{head}pixel_size: 1 um")
-    assert read_shot(Path("shot.txt")).setup == setups[0]
-    Path("harder.toml").write_text("photon_energy = 12")
-    shot = read_shot(Path("shot.txt"))
-    assert setup_from(Path("harder.toml"), shot.metadata["geometry"]) == setups[1]
-    assert "photon energy (keV) 8" in done("info", "shot.txt")
 
 
 def test_rows_know_a_new_kind(table):

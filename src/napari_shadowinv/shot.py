@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 # Others come from the user, and precede those of the image's file.
-_OF_FILE = ("image", "path", "metadata", "cautions", "in_file")
+_OF_FILE = ("image", "path", "metadata", "cautions", "setup_in_file")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -71,9 +71,9 @@ class Shot(Summarised):
         ``geometry``, the part of the setup in the file.
     cautions : tuple of Caution
         Reasons to doubt the content of the file.
-    in_file : mapping
-        Attributes that came in the image's file, such as its ``source``: a recipe precedes them,
-        as it does not precede those that were given.
+    setup_in_file : Setup, optional
+        The setup in the image's file, which a recipe's precedes; a setup that was given precedes
+        both.
 
     Examples
     --------
@@ -97,7 +97,7 @@ class Shot(Summarised):
     path: Path | None = None
     metadata: Mapping[str, Any] = field(default_factory=dict)
     cautions: tuple[Caution, ...] = ()
-    in_file: Mapping[str, Any] = field(default_factory=dict)
+    setup_in_file: Setup | None = None
 
     def __post_init__(self) -> None:
         if self.setup is not None and not hasattr(self.setup, "pixel_sizes"):
@@ -147,14 +147,9 @@ class Shot(Summarised):
         return isinstance(self.source, str) and self.source == "unknown"
 
     @property
-    def has_own_source(self) -> bool:
-        """Whether its source came in the file of its image, so that a recipe may replace it."""
-        return self.source is not None and self.given("source") is None
-
-    def given(self, name: str) -> Any:
-        """Return an attribute; None if it came in the image's file."""
-        value = getattr(self, name)
-        return None if value is self.in_file.get(name) else value
+    def given_setup(self) -> Setup | None:
+        """The setup, unless it came in the image's file."""
+        return None if self.setup is self.setup_in_file else self.setup
 
     def completed_by(self, recorded: Shot) -> Shot:
         """Return the shot as read from its file, with all that is known beside the file."""
@@ -175,19 +170,14 @@ class Shot(Summarised):
         self, values: Callable[[FloatArray], FloatArray], masks: Callable[[BoolArray], BoolArray]
     ) -> Shot:
         """Return the same with a function applied to image and source, another to the masks."""
-        return self._changed(
+        return replace(
+            self,
             image=values(self.image),
             source=None if self.source is None else values(self.source),
             dark=None if self.dark is None else values(self.dark),
             mask=None if self.mask is None else masks(self.mask),
             source_mask=None if self.source_mask is None else masks(self.source_mask),
         )
-
-    def _changed(self, **values: Any) -> Shot:
-        """Return the same with values made from its own; those of the file stay the file's."""
-        of_file = {name: value for name, value in values.items() if name in self.in_file}
-        kept = {name: value for name, value in of_file.items() if self.given(name) is None}
-        return replace(self, **values, in_file={**self.in_file, **kept})
 
     def bin_pixels(self, factor: int) -> Shot:
         """Sum blocks of `factor` × `factor` pixels; the setup's pixel grows with them.
@@ -220,8 +210,11 @@ class Shot(Summarised):
             lambda plane: block_sums(plane, factor),
             lambda mask: block_sums(mask, factor) == factor**2,
         )
-        binned = merged._changed(
-            setup=None if self.setup is None else bin_setup(self.setup, factor),
+        setup = None if self.setup is None else bin_setup(self.setup, factor)
+        binned = replace(
+            merged,
+            setup=setup,
+            setup_in_file=None if self.given_setup else setup,
             metadata={**self.metadata, "bin": factor * int(self.metadata.get("bin", 1))},
         )
         rows, columns = height % factor, width % factor

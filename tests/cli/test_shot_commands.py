@@ -27,6 +27,7 @@ from helpers.command_line import (
     refused,
     shadowinv,
 )
+from helpers.image_files import save_pradformat
 from helpers.results import provenance_in
 from napari_shadowinv import __version__
 from napari_shadowinv.cli._inputs import setup_for
@@ -37,7 +38,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read, read_shot, write
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
-from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.preprocessing import Recipe
 
 BLOB = gaussian_blob((24, 32), 6.0, 4.0, (10, 18))
@@ -187,41 +188,21 @@ def test_forward_traces_a_3d_field(folder: Path) -> None:
     np.testing.assert_allclose(field[10, 15], -0.5 * 4e-4, rtol=1e-6)
 
 
-def as_text(*images: np.ndarray) -> str:
-    return "\n".join(" ".join(f"{v:.9f}" for v in row) for row in np.concatenate(images))
-
-
-def test_geometry_in_a_text_image_is_used_and_shown(folder: Path) -> None:
-    geometry = "# source_object_distance = 1 cm\n# object_image_distance = 30 cm\n# bin_um = 310\n"
-    rows = as_text(synthetic_image(BLOB.displacement))
-    (folder / "half.txt").write_text(geometry + rows)
-    (folder / "all.txt").write_text(f"{geometry}# Ep_MeV = 14.7\n{rows}")
-    text = done("info", "half.txt")
-    for words in ("numbers as text", "source object distance (m) 0.01", "not the energy; give it"):
+def test_geometry_in_a_file_is_used_and_shown(folder: Path) -> None:
+    geometry = {"source_object_dist": 0.01, "object_image_dist": 0.3, "pixel_width": 310e-6}
+    image = synthetic_image(BLOB.displacement)
+    save_pradformat(folder / "half.h5", image, **geometry)
+    save_pradformat(folder / "all.h5", image, **geometry, spec_energy=14.7e6)
+    text = done("info", "half.h5")
+    for words in ("radiograph", "source object distance (m) 0.01", "not the energy; give it"):
         assert words in text
-    assert "14.7 MeV proton, magnification 31, pixel 10 µm at the object" in done("info", "all.txt")
+    assert "14.7 MeV proton, magnification 31, pixel 10 µm at the object" in done("info", "all.h5")
     # What the file leaves out comes from the setup, with and without a kind.
     proton = 14.7, 0.3, pytest.approx(1e-5)
     for entries in ("energy = 14.7\n", 'kind = "proton"\nenergy = 14.7\n'):
         (folder / "energy.toml").write_text(entries)
-        setup = setup_for(Path("energy.toml"), read_shot("half.txt"), Recipe())
+        setup = setup_for(Path("energy.toml"), read_shot("half.h5"), Recipe())
         assert (setup.energy, setup.object_image_distance, setup.object_pixel_size) == proton
-    (folder / "light.toml").write_text("wavelength = 5e-7\nsource_object_distance = inf\n")
-    setup = setup_for(Path("light.toml"), read_shot("all.txt"), Recipe())
-    assert isinstance(setup, OpticalSetup)
-    assert (setup.object_image_distance, setup.magnification) == (0.3, 1)
-
-
-def test_reference_in_a_text_image_is_the_source_unless_a_flag_says_otherwise(folder: Path) -> None:
-    source = np.tile(np.linspace(90, 110, 32), (24, 1))
-    rows = as_text(synthetic_image(BLOB.displacement, source), source)
-    (folder / "both.txt").write_text(f"# flux2D (24, 32)\n# flux2D_ref (24, 32)\n{rows}")
-    done("invert", "both.txt")
-    np.testing.assert_allclose(read("both.shadowinv")["source"], source, rtol=1e-9)
-    done("invert", "both.txt", "--source-from", "uniform", "--overwrite")
-    assert np.ptp(read("both.shadowinv")["source"].values) == 0
-    flat_image = ("--step=high-pass 3", "--overwrite")
-    refused("invert", "both.txt", *flat_image, names="would flatten the image but not the source")
 
 
 def test_rerun_lists_the_changes(folder: Path, shot: Path) -> None:

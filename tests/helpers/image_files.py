@@ -48,6 +48,15 @@ def save_spe(
     return path
 
 
+def save_pradformat(path: Path, image: Array | None, **attributes: object) -> Path:
+    """Write a radiograph, or one without its image."""
+    with h5py.File(path, "w") as file:
+        file.attrs.update(object_type="radiograph", **attributes)
+        if image is not None:
+            file["image"] = image
+    return path
+
+
 def save_mat73(path: Path, arrays: dict[str, Array], userblock: int = 512) -> Path:
     """Write columns first and marked arrays, with MATLAB's name in front."""
     with h5py.File(path, "w", userblock_size=userblock) as file:

@@ -16,7 +16,7 @@ import tifffile
 from PIL import Image
 from scipy.io import savemat
 
-from helpers.image_files import save_b16, save_mat73, save_spe
+from helpers.image_files import save_b16, save_mat73, save_pradformat, save_spe
 from napari_shadowinv._system.safety import LIMIT_VARIABLE
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io import read
@@ -51,13 +51,7 @@ def spe(array: Array, code: int = 3, footer: bytes = b"", **header: int) -> Writ
 
 
 def prad(array: Array | None, **attributes: object) -> Write:
-    def write(path: Path) -> None:
-        with h5py.File(path, "w") as file:
-            file.attrs.update(object_type="radiograph", **attributes)
-            if array is not None:
-                file["image"] = array
-
-    return write
+    return partial(save_pradformat, image=array, **attributes)
 
 
 def npy(array: Array) -> Write:
@@ -181,10 +175,6 @@ ZERO = NOISE[:0]
 RANDOM = np.random.default_rng(7).integers(128, 256, 9000).astype(np.uint8).tobytes()
 CUT = GOOD.keys() - {"shot.txt"}  # whose first rows are an image, too
 
-GEOMETRY = """# source_object_distance = 0.01
-# object_image_distance = 0.2
-# pixel_size = 1e-5
-"""
 STACKS: tuple[dict[str, Any], ...] = (
     {},
     {"imagej": True},
@@ -280,14 +270,7 @@ BAD: dict[str, tuple[str, Write, str]] = {
     "names": ("a.csv", text("x,y,z\n1,2,3\n"), "could not convert string 'x'"),
     "one row": ("a.csv", text("1 2 3\n"), "holds 1 row of numbers: expected at least two"),
     "no row": ("a.csv", text("# nothing\n\n"), "holds 0 rows of numbers"),
-    "energy in cm": ("a.csv", text("# energy = 14.7 cm\n1 2\n"), "line 1 has '14.7 cm' .* to MeV"),
-    "fruit": (
-        "a.csv",
-        text("# pixel size: 3 apples\n1 2\n"),
-        "line 1 has '3 apples' for pixel_size",
-    ),
-    "no energy": ("a.txt", text(f"{GEOMETRY}# energy = 0\n1 2\n3 4\n"), "'energy' is 0"),
-    "mask of twos": ("a.txt", text("# flux2D (1, 2)\n# mask (1, 2)\n1 2\n1 2\n"), "other than 0"),
+    "PRadReader": ("a.txt", text("# flux2D (1, 2)\n# mask (1, 2)\n1 2\n1 2\n"), "PRadReader's"),
     # Values that are no measure of light, or of which a program says what it does not hold
     "objects": ("a.npy", lambda path: np.save(path, [{}], allow_pickle=True), "Python objects"),
     "complex npy": ("a.npy", npy(NOISE * 1j), "complex128"),

@@ -7,14 +7,6 @@ from helpers.public_data import public_file
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.io import read, read_shot
-from napari_shadowinv.physics.setup import ProtonSetup
-
-VALUES = np.random.default_rng(3).normal(0, 1e3, (5, 7))
-
-
-def lines(path: Path, *rows: str) -> Path:
-    path.write_text("\n".join(rows), encoding="utf-8")
-    return path
 
 
 def test_separators_decimal_commas_byte_order_mark_and_blank_lines(tmp_path: Path) -> None:
@@ -25,104 +17,11 @@ def test_separators_decimal_commas_byte_order_mark_and_blank_lines(tmp_path: Pat
     np.testing.assert_array_equal(read(path).image, [[1, 2], [3, 40]])
 
 
-@pytest.mark.parametrize(
-    "comments",
-    [
-        (
-            "# source_object_distance = 0.014",
-            "# object_image_distance = 0.2",
-            "# pixel_size = 1e-5",
-            "# energy = 14.7",
-        ),
-        (
-            "% Source-object distance: 1.4 cm",
-            "% OBJECT IMAGE DISTANCE (mm): 200",
-            "% pixel size: 10 µm",
-            "% energy: 14700 keV",
-        ),
-        ("# s2r_cm 1.4", "# s2d_cm 21.4", "# bin_um 152.857142857", "# Ep_MeV 14.7"),
-    ],
-)
-def test_comments_tell_the_setup(tmp_path: Path, comments: tuple[str, ...]) -> None:
-    path = lines(tmp_path / "shot.txt", "# PROBLEM, run 3: 2019-05-01", *comments, "1 2", "3 4")
-    setup = read_shot(path).setup
-    assert isinstance(setup, ProtonSetup)
-    assert setup.energy == pytest.approx(14.7)
-    assert setup.source_object_distance == pytest.approx(0.014)
-    assert setup.object_image_distance == pytest.approx(0.2)
-    assert setup.object_pixel_size == pytest.approx(1e-5)
-
-
-def test_comments_that_state_a_part_of_a_setup_or_nothing(tmp_path: Path) -> None:
+def test_comments_are_not_read(tmp_path: Path) -> None:
     path = tmp_path / "shot.txt"
-    path.write_bytes("# pixel_size = 25 µm\n1 2\n3 4\n".encode("latin-1"))
-    radiograph = read_shot(path)
-    assert radiograph.setup is None
-    assert radiograph.metadata["geometry"] == {"pixel_size": pytest.approx(25e-6)}
-    comments = ("# energy 3 of 5 shots", "# bin 4", "# shot 17", "# taken: 12:30", "#" * 3_000_000)
-    assert read_shot(lines(path, *comments, "1 2", "3 4")).metadata["geometry"] == {}
-
-
-def pradreader(path: Path, *header: str, blocks: int = 3) -> Path:
-    """Write shot, reference and a mask that leaves the last two columns out."""
-    mask = np.zeros(VALUES.shape)
-    mask[:, -2:] = 1
-    with path.open("w") as file:
-        file.write("".join(f"# {line}\n" for line in header))
-        for block in (VALUES, VALUES + 1, mask, mask)[:blocks]:
-            np.savetxt(file, block, delimiter=",", fmt="%.17g")
-    return path
-
-
-ALL = ("flux2D (5, 7)", "flux2D_ref (5, 7)", "mask (5, 7)")
-SELECTED = ("x-mask 0.0 % - 100.0 %", "y-mask 0.0 % - 100.0 %")
-
-
-@pytest.mark.parametrize(
-    ("header", "blocks"),
-    [
-        (ALL, 3),
-        ((*ALL[:2], *SELECTED), 3),
-        (("flux2D (5, 7)", "flux2D_ref", "mask"), 3),
-        ((*ALL[:2], SELECTED[0]), 2),
-    ],
-)
-def test_pradreader_stacks_image_reference_and_mask(
-    tmp_path: Path, header: tuple[str, ...], blocks: int
-) -> None:
-    radiograph = read_shot(pradreader(tmp_path / "input.txt", *header, blocks=blocks))
-    np.testing.assert_array_equal(radiograph.image, VALUES)
-    assert radiograph.source is not None
-    np.testing.assert_array_equal(radiograph.source, VALUES + 1)
-    expected = np.arange(7) < np.full((5, 1), 5 if blocks == 3 else 7)
-    np.testing.assert_array_equal(radiograph.usable, expected)
-
-
-def test_pradreader_selects_rows_and_columns_by_their_share(tmp_path: Path) -> None:
-    header = (*ALL[:2], "x-mask 20 % - 80 %", "y-mask 0.0 % - 100.0 %")
-    mask = read_shot(pradreader(tmp_path / "input.txt", *header, blocks=2)).mask
-    assert mask is not None
-    np.testing.assert_array_equal(mask.all(axis=1), [False, True, True, True, False])
-    assert read_shot(pradreader(tmp_path / "all.txt", *ALL[:2], blocks=2)).mask is None
-
-
-@pytest.mark.parametrize(
-    ("header", "blocks"),
-    [
-        (ALL, 2),
-        (ALL, 4),
-        (ALL[:2], 3),
-        (ALL[:1], 2),
-        (("flux2D (4, 7)", "flux2D_ref (4, 7)"), 2),
-        (("flux2D (5, 8)", "flux2D_ref (5, 8)"), 2),
-        (("flux2D (5, 7)", "flux2D_ref (6, 7)"), 2),
-    ],
-)
-def test_blocks_unlike_the_header_are_refused(
-    tmp_path: Path, header: tuple[str, ...], blocks: int
-) -> None:
-    with pytest.raises(FileFormatError, match=r"rows of 7 numbers, but its header gives flux2D"):
-        read_shot(pradreader(tmp_path / "input.txt", *header, blocks=blocks))
+    path.write_bytes("# pixel size = 25 µm\n% energy = 3\n1 2\n3 4\n".encode("latin-1"))
+    np.testing.assert_array_equal(read_shot(path).image, [[1, 2], [3, 4]])
+    assert read_shot(path).setup is None
 
 
 def test_published_example() -> None:

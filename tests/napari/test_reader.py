@@ -397,17 +397,6 @@ def test_a_scan_of_film_is_told_and_so_is_its_result(viewer, tmp_path):
     assert cautions_of(viewer.add_image(film)) == ()
 
 
-def test_pradreader_brings_its_source_and_its_mask(viewer, shot, tmp_path):
-    mask = np.zeros(shot.shape)
-    mask[:, :3] = 1
-    header = "\n".join(f"{name} {shot.shape}" for name in ("flux2D", "flux2D_ref", "mask"))
-    np.savetxt(tmp_path / "input.txt", np.vstack([shot, shot + 1, mask]), header=header)
-    layers = viewer.open(tmp_path / "input.txt", plugin=PLUGIN)
-    assert [role_of(layer) for layer in layers] == ["source", "mask", "shot"]
-    np.testing.assert_array_equal(layers[1].data, mask)  # painted is unusable
-    np.testing.assert_array_equal(layers[2].data, shot)
-
-
 def test_images_of_an_hdf5_file_are_layers(viewer, tmp_path):
     path = tmp_path / "run 1.nxs"
     frames = np.arange(60.0).reshape(3, 4, 5)

@@ -16,10 +16,9 @@ import tifffile
 
 from helpers.fit_images import without_causes
 from napari_shadowinv import FitOptions, InputError, InversionOptions, ProtonSetup, rerun, run_stack
-from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InversionCancelled
 from napari_shadowinv.film_doses import FilmDoses
-from napari_shadowinv.io import read_dataset, read_shot, write
+from napari_shadowinv.io import read_dataset, write
 from napari_shadowinv.io.store import read_stack
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.forward import synthetic_image
@@ -272,26 +271,6 @@ def test_arrays_of_one_file_are_found_again(tmp_path: Path) -> None:
         again = rerun(write(Path("a.shadowinv"), first))
     assert not first.mask[rejected != 0].any()
     assert again.changes == ()
-    assert again.is_identical
-
-
-def pradreader(path: Path, image: FloatArray, hidden: FloatArray) -> Path:
-    """Write an image and its mask (0: use) as one file."""
-    size = f"({SHAPE[0]}, {SHAPE[1]})"
-    header = f"ls (cm): 1\nld (cm): 30\nenergy (MeV): 8\nflux2D {size}\nmask {size}"
-    np.savetxt(path, np.concatenate([image, hidden]), header=header)
-    return path
-
-
-def test_a_mask_in_a_file_that_was_not_used_is_not_used_again(tmp_path: Path) -> None:
-    hidden = np.zeros(SHAPE)
-    hidden[:, :20] = 1
-    path = pradreader(tmp_path / "shot.txt", np.load(record(tmp_path)[0]), hidden)
-    recorded = read_shot(path)
-    np.testing.assert_array_equal(recorded.mask, hidden == 0)
-    first = run(Recipe(options=InversionOptions(n_sites=150)), replace(recorded, mask=None))
-    assert first.mask.all()
-    again = rerun(write(tmp_path / "a.shadowinv", first))
     assert again.is_identical
 
 

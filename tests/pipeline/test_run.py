@@ -365,9 +365,9 @@ def test_a_shot_keeps_the_doubts_about_its_file(tmp_path: Path, image: FloatArra
     inversion = run(Recipe(options=OPTIONS), Shot(path))
     assert "gamma" in {caution.code for caution in inversion.cautions}
     doubts = (Caution("gamma", "not linear"),)
-    recorded = Shot(image, name="stored", path=path, cautions=doubts, in_file={"psf": 1.0})
+    recorded = Shot(image, name="stored", path=path, cautions=doubts)
     known = Shot(path, name="given").completed_by(recorded)
-    of_file = ("image", "path", "metadata", "cautions", "in_file")
+    of_file = ("image", "path", "metadata", "cautions", "setup_in_file")
     assert all(getattr(known, name) is getattr(recorded, name) for name in of_file)
     assert known.name == "given"
 

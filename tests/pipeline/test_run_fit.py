@@ -97,12 +97,10 @@ def test_a_source_is_estimated_from_each_image_after_the_steps(images: list[Floa
 
 
 def test_an_unknown_beam_takes_no_source_and_is_no_assumed_one(images: list[FloatArray]) -> None:
-    """By the recipe also where a file brings its own source."""
     unknown = Recipe(fit=FitChoices(beam="unknown"))
-    for recipe, source in ((Recipe(), "unknown"), (unknown, None), (unknown, np.ones(SHAPE))):
+    for recipe, source in ((Recipe(), "unknown"), (unknown, None)):
         shots = [
-            Shot(image, setup, source=source, in_file={"source": source})
-            for image, setup in zip(images, SETUPS, strict=True)
+            Shot(image, setup, source=source) for image, setup in zip(images, SETUPS, strict=True)
         ]
         inputs = collect_fit_inputs(recipe, shots)
         assert inputs.choices.beam == "unknown"

@@ -89,8 +89,6 @@ def _shot_rows(shot: Shot) -> _summary.Rows:
     }
     kind, cautions = str(shot.metadata["kind"]), shot.cautions
     rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image, shot.metadata["dtype"])]
-    if shot.source is not None:
-        rows.append(("source", "in the same file, below the image"))
     if shot.mask is not None:
         rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels excluded"))
     if shot.setup is not None:

@@ -199,10 +199,7 @@ def collect_fit_inputs(
         replace(shot, brightness=None) if shot.brightness == "free" else shot for shot in recorded
     ]
     by_default = choices.beam == "unknown"
-    flags = [
-        shot.beam_unknown or (by_default and (shot.source is None or shot.has_own_source)) or None
-        for shot in recorded
-    ]
+    flags = [shot.beam_unknown or (by_default and shot.source is None) or None for shot in recorded]
     unknown = common_values(names, flags, "unknown source") is not None
     if unknown and recipe.source is not None:
         raise InputError(_SOURCE_AND_UNKNOWN)

@@ -215,7 +215,7 @@ def run(
         Steps and options.
     shot : Shot, array_like of shape (H, W), or path
         The image, with its attributes. What is given with the shot precedes the recipe's setup and
-        source, which precede those in the image's file; a pixel is used where the masks of both are
+        source, and these the setup in the image's file; a pixel is used where the masks of both are
         true.
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.invert`.
@@ -388,7 +388,7 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     """Collect the inputs of a recipe: read files, and fill in defaults of the shot."""
     entered = shot if isinstance(shot, Shot) else Shot(shot)
     loaded = load_shot(entered, "the image")
-    setup = loaded.given("setup") or recipe.setup or loaded.setup
+    setup = loaded.given_setup or recipe.setup or loaded.setup
     beam = _beam_of(recipe, loaded)
     if setup is not None:
         check_spacing(entered.image, "the image", setup.pixel_sizes)
@@ -396,8 +396,7 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     # A mask's file precedes the recipe's; of arrays, both hold.
     is_file = isinstance(loaded.mask, (str, Path))
     usable = _mask([loaded.mask, None if is_file else recipe.mask], "mask", loaded.shape)
-    given = entered.given("source")
-    is_array = given is not None and not isinstance(given, Shot | str | Path)
+    is_array = entered.source is not None and not isinstance(entered.source, Shot | str | Path)
     lit = beam.mask if is_array and beam is not None else None  # of a masked array
     usable = _without_gaps(usable, lit, loaded, beam)
     bare = _mask((loaded.source_mask, recipe.source_mask), "source mask", loaded.shape)
@@ -448,20 +447,18 @@ def load_shot(shot: AnyShot, name: str) -> Shot:
 
 
 def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
-    """Return the source of a shot: its own, the recipe's, or the one in the image's file."""
+    """Return the source of a shot, or the recipe's."""
     if shot.beam_unknown:
         raise InputError(
             "the source is 'unknown', which only a fit can find: give an image of it, or none"
         )
     kind = recipe.source
-    if shot.source is not None and not shot.has_own_source:
+    if shot.source is not None:
         return load_shot(shot.source, "the source")
     if isinstance(kind, MeasuredSource) and (file := _source_file(kind, shot)) is not None:
         # The channel is that of both.
         channel = shot.metadata.get("channel")
         return read_shot(file, channel=channel, variable=kind.variable)
-    if shot.source is not None and recipe.estimate is None:
-        return replace(shot, image=shot.source, source=None, mask=None)
     return None
 
 

@@ -336,16 +336,14 @@ class _Reader:
 
     def _shot(self, provenance: Provenance, k: int, image: Shot, source_name: str) -> Shot:
         origin, source = provenance.images[k], None
-        if origin.source is not None and (
-            (origin.source.file, origin.source.variable) != (origin.file, origin.variable)
-        ):
+        if origin.source is not None:
             source = self._read(origin.source, source_name, self.source)
         mask, source_mask = map(provenance.mask_of, (origin.mask, origin.source_mask))
         return replace(
             image,
             # The provenance has the other contents of the file that were used.
             setup=origin.setup or provenance.recipe.setup,
-            source=image.source if source is None else source,
+            source=source,
             mask=join_masks(image.mask, mask and mask.mask()),
             source_mask=None if source_mask is None else source_mask.mask(),
             measured=origin.measured,

@@ -30,7 +30,7 @@ from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import name_of, sha256, split_address, text_of
-from napari_shadowinv.io.formats import HDF5, PRADFORMAT, TEXT, format_of
+from napari_shadowinv.io.formats import HDF5, PRADFORMAT, format_of
 from napari_shadowinv.io.frames import FileFrame, find_frames
 from napari_shadowinv.io.read_write import read_frame, read_shot
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
@@ -182,7 +182,7 @@ class FileExposure(Exposure):
     def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
         digest = sha256(self.frame.path) if self.frame.number is None else ""
         shot = self.reader.read(self.frame)
-        cautions = file_cautions(shot)
+        cautions = list(shot.cautions)
         metadata = {
             "sha256": digest or checksum(shot.image),
             **({"cautions": cautions} if cautions else {}),
@@ -215,7 +215,7 @@ class RowsExposure(Exposure):
         if self.recipe.fit is not None:
             return images, origin
         (image,) = images
-        cautions = file_cautions(image)
+        cautions = list(image.cautions)
         if unused := [name for name in _OF_FITS if getattr(image, name) is not None]:
             text = f"the row has {', '.join(unused)}, which only fits use: fit the image to use it"
             cautions.append(Caution("file", text))
@@ -280,14 +280,6 @@ def stamp(path: Path) -> dict[str, int]:
     """Return size and time of a file, which identify its content."""
     status = path.stat()
     return {"size": status.st_size, "mtime_ns": status.st_mtime_ns}
-
-
-def file_cautions(shot: Shot) -> list[Caution]:
-    """Return the reasons to doubt the image of a file in a stack."""
-    if not shot.has_own_source:
-        return list(shot.cautions)
-    text = "the file contains its own source, which a stack ignores: pass one for the whole stack"
-    return [*shot.cautions, Caution("file", text)]
 
 
 def _plain_image(image: Any) -> AnyArray:
@@ -544,7 +536,7 @@ def _with_absolute_paths(rows: Sequence[ShotRow]) -> tuple[ShotRow, ...]:
 def _read_geometry(row: ShotRow, channel: str | int | None) -> Shot:
     """Read an image if its file may contain a geometry; return an empty one otherwise."""
     try:
-        if format_of(row.file) in (PRADFORMAT, HDF5, TEXT):
+        if format_of(row.file) in (PRADFORMAT, HDF5):
             return read_shot(row.file, channel=channel)
     except (OSError, ValueError):
         pass  # its shot fails, by name

@@ -460,40 +460,6 @@ def test_what_the_table_rounds_is_taken_exactly(viewer, opened):
     assert inputs_of(tool).setups == tuple(setups)
 
 
-def pradreader(path, *planes):
-    """Write an image, its source and its mask (0: use) as one file, with a complete geometry."""
-    lines = ["# ls (cm): 0.13", "# ld (cm): 2", "# energy (MeV): 14.7"]
-    blocks = [f"# {name} ({SHAPE[0]}, {SHAPE[1]})" for name in ("flux2D", "flux2D_ref", "mask")]
-    path.write_text("\n".join([*lines, *blocks, ""]))
-    with path.open("a") as file:
-        for plane in planes:
-            np.savetxt(file, plane)
-
-
-def test_what_a_file_holds_and_was_not_used_is_not_used_again(
-    viewer, opened, of_files, run, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    hidden = np.zeros(SHAPE)
-    hidden[:, :20] = 1
-    beam = 300 + np.arange(SHAPE[1]) + np.zeros(SHAPE)
-    for name, image in zip(("a.txt", "b.txt"), images(), strict=True):
-        pradreader(tmp_path / name, image, beam, hidden)
-    tool = of_files("a.txt", "b.txt")
-    assert tool.masks.layer is not None
-    tool.masks.layer = None
-    result = run(tool)
-    assert result.mask.all()
-    save(viewer, result, tmp_path / "window.shadowinv")
-    assert "bit for bit" in command("rerun", "window.shadowinv", "--out", "again.shadowinv")
-    single = opened(Invert)
-    single.image.layer = viewer.layers["b"]
-    single.masks.layer = None
-    single.source.layer = viewer.layers["a source"]
-    assert single.request().shot.source.path is None
-    assert single.request().shot.mask is None
-
-
 def test_what_a_reader_tells_of_its_file_counts_for_that_file_only(viewer, tool, tmp_path):
     facts = {"path": str(tmp_path / "a.h5"), "file": {"sha256": "1" * 64}}
     doubt = Caution("film-scan", "it may be film")

@@ -7,6 +7,7 @@ import pytest
 from napari.layers import Image
 
 from helpers.forms import enter
+from helpers.image_files import save_pradformat
 from helpers.reports import texts_of
 from napari_shadowinv import InputError, ProtonSetup
 from napari_shadowinv._napari.layer_metadata import (
@@ -228,9 +229,9 @@ def test_an_error_calls_the_fields_of_a_setup_by_their_labels():
 
 @pytest.mark.parametrize("is_by_us", [True, False])
 def test_sizes_in_the_file_begin_a_setup(tmp_path, picker, is_by_us):
-    """`dr` of a text image is its pixel at the detector; napari itself knows nothing of it."""
-    path = tmp_path / "shot.txt"
-    np.savetxt(path, np.ones((8, 9)), header="pixel_width: 2.5e-05\nobject_image_dist: 0.1")
+    """Napari itself knows nothing of them."""
+    path = tmp_path / "shot.h5"
+    save_pradformat(path, np.ones((8, 9)), pixel_width=2.5e-05, object_image_dist=0.1)
     geometry = read_shot(path).metadata["geometry"]
     assert geometry["detector_pixel_size"] == 2.5e-5
     layer = Image(np.ones((8, 9)), name="shot")
