@@ -70,7 +70,7 @@ def test_only_computed_and_chosen_frames_are_loaded(nexus, loaded):
 
 
 def test_wrong_names_and_indices_are_refused(nexus):
-    listed = r"\? it holds 'entry/single'"
+    listed = r"\? it holds 'entry/data/data'"
     for name, words in (
         ("entry/data/data[1]", r"frames from \[0,0\] to \[1,2\]"),
         ("entry/data/data[1,3]", r"frames from \[0,0\] to \[1,2\]"),

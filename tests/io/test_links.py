@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
-from napari_shadowinv.errors import FileFormatError
+from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.io import read, read_shot, write
 
@@ -37,10 +36,10 @@ def virtual(file: h5py.File, name: str) -> None:
 
 
 ELSEWHERE = {
-    "links to 'other.h5'": external_link,
-    "links to 'other.h5' ": link_to_a_link,
-    "in the raw file 'other.bin'": raw_storage,
-    "as a virtual array from 'other.h5'": virtual,
+    "other.h5": external_link,
+    " other.h5": link_to_a_link,
+    "other.bin": raw_storage,
+    "  other.h5": virtual,
 }
 
 
@@ -61,7 +60,7 @@ def test_what_lies_elsewhere_is_refused(folder: Path, place: str, inversion: Inv
         file["own"] = IMAGE
         file["again"] = h5py.SoftLink("own")
     for variable in (None, "image"):
-        with pytest.raises(FileFormatError, match=place.strip()) as error:
+        with pytest.raises(FileFormatError, match=rf"which is in .*{place.strip()}") as error:
             read(path, variable=variable)
         assert "image" in str(error.value)
     for variable in ("own", "again", "/own"):
@@ -75,23 +74,12 @@ def test_what_lies_elsewhere_is_refused(folder: Path, place: str, inversion: Inv
     path = write(folder / "shot.shadowinv", inversion)
     with h5py.File(path, "r+") as file:
         ELSEWHERE[place](file, "more")
-    with pytest.raises(FileFormatError, match=place.strip()):
+    with pytest.raises(FileFormatError, match="which is in"):
         read(path)
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="needs pipes")
-def test_links_to_a_pipe_and_in_a_circle_end(folder: Path) -> None:
-    os.mkfifo(folder / "pipe.h5")
-    path = folder / "shot.h5"
-    with h5py.File(path, "w") as file:
-        file.attrs["object_type"] = "radiograph"
-        file["image"] = h5py.ExternalLink("pipe.h5", "image")
-    with h5py.File(folder / "loop.h5", "w") as file:
+    loop = folder / "loop.h5"
+    with h5py.File(loop, "w") as file:
         file["here"], file["there"] = h5py.SoftLink("/there"), h5py.SoftLink("/here")
-    for file, variable, words in (
-        (path, None, r"links to 'pipe\.h5'"),
-        (path, "image", r"links to 'pipe\.h5'"),
-        (folder / "loop.h5", "here", "form a loop"),
-    ):
-        with pytest.raises(FileFormatError, match=words):
-            read(file, variable=variable)
+        file["gone"] = h5py.ExternalLink("nowhere.h5", "image")
+    for name, words in (("here", "too many links"), ("gone", "'nowhere.h5'")):
+        with pytest.raises((FileFormatError, InputError), match=words):
+            read(loop, variable=name)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ from napari_shadowinv.io.hdf5 import (
     member,
     open_hdf5,
     plain_value,
-    walk,
 )
 from napari_shadowinv.physics.field_grid import AXES, FieldGrid, field_grid
 
@@ -44,8 +42,8 @@ def is_field_grid(path: Path) -> bool:
         return False
     with open_hdf5(path) as content:
         return "openPMD" in content.attrs or any(
-            _COMPONENT.fullmatch(name) and getattr(item, "ndim", 0) >= len(AXES)
-            for name, item in takewhile(lambda entry: "/" not in entry[0], walk(content))
+            getattr(content.get(name), "ndim", 0) >= len(AXES)
+            for name in filter(_COMPONENT.fullmatch, content)
         )
 
 

@@ -8,8 +8,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,14 +32,12 @@ from napari_shadowinv.io.conventions import (
 )
 from napari_shadowinv.io.field_grids import is_field_grid
 from napari_shadowinv.io.hdf5 import (
-    MAX_LINKS,
-    check_array,
+    items_of,
     load_dataset,
     member,
     open_hdf5,
     plain_value,
     stored_elsewhere,
-    walk,
 )
 
 _DEFAULTS = ("signal", "default")  # attributes of a NeXus group: its array, or the group to look in
@@ -54,7 +50,7 @@ def read_hdf5(path: Path, name: str) -> AnyArray:
     with open_hdf5(path) as file:
         dataset, number = _find_array(path, file, name)
         stored = _stored(path, dataset, number)
-        return decode_values(path, dataset, stored, number)
+        return decode_values(path, dataset, stored)
 
 
 def read_plane(path: Path, name: str, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
@@ -94,21 +90,10 @@ def list_images(path: Path) -> tuple[list[str], list[ArrayEntry]]:
 
 
 def _stored(path: Path, dataset: Any, number: int | None) -> AnyArray:
-    """Return all values of an array or one frame, rows first: MATLAB stores columns first.
-
-    Refuses a frame that is not written, which HDF5 would replace by zeros.
-    """
-    if number is None or dataset.ndim == 2:
-        values = load_dataset(path, dataset)
-    else:
-        check_array(path, dataset, math.prod(dataset.shape[-2:]))
-        index = tuple(map(int, np.unravel_index(number, dataset.shape[:-2])))
-        if not _is_written(dataset, index):
-            raise FileFormatError(
-                f"{path} does not hold frame {number} of {dataset.name!r} yet: wait until it is "
-                "written, or copy the file again"
-            )
-        values = np.asarray(dataset[index])
+    """Return all values of an array or one frame, rows first: MATLAB stores columns first."""
+    is_frame = number is not None and dataset.ndim > 2
+    index = np.unravel_index(number or 0, dataset.shape[:-2]) if is_frame else ()
+    values = load_dataset(path, dataset, tuple(map(int, index)))
     return values.swapaxes(-1, -2) if is_of_matlab(dataset) else values
 
 
@@ -130,7 +115,7 @@ def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
     import h5py
 
     item = member(path, file, name)
-    for _ in range(MAX_LINKS):
+    for _ in range(16):
         if not isinstance(item, h5py.Group):
             break
         default = next((plain_value(item.attrs[k]) for k in _DEFAULTS if k in item.attrs), None)
@@ -138,27 +123,17 @@ def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
     return item if isinstance(item, h5py.Dataset) else None
 
 
-def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:
-    """Return whether all chunks of a frame are in the file."""
-    if dataset.chunks is None:
-        return bool(dataset.id.get_storage_size())
-    sides = zip(dataset.shape[-2:], dataset.chunks[-2:], strict=True)
-    places = itertools.product(*(range(0, length, chunk) for length, chunk in sides))
-    chunks = (dataset.id.get_chunk_info_by_coord((*index, *place)) for place in places)
-    return all(chunk.byte_offset is not None for chunk in chunks)
-
-
 @as_file_errors
 def list_sizes(path: Path, *, most: int = 40) -> list[tuple[str, str]]:
     """Return the names of the first arrays, and their shapes and types."""
     with open_hdf5(path) as file:
-        return [(each.name, each.size) for each in itertools.islice(_entries(file), most)]
+        return [(each.name, each.size) for each in _entries(file)][:most]
 
 
-def _entries(file: Any, most_visits: int = 10_000) -> Iterator[ArrayEntry]:
-    """Yield the arrays of a file from the top down."""
-    for name, item in walk(file, most_visits):
-        if name.rpartition("/")[2][:1] == "#":  # MATLAB's own
+def _entries(file: Any) -> Iterator[ArrayEntry]:
+    """Yield the arrays of a file."""
+    for name, item in items_of(file):
+        if name[:1] == "#":  # MATLAB's own
             continue
         if isinstance(item, str):
             yield ArrayEntry(name, "", f"in another file, {item!r}")
