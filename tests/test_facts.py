@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import dataclasses
-import re
 import textwrap
 from pathlib import Path
 
-import imageio.v3 as iio
 import numpy as np
 import pytest
 
@@ -134,23 +131,6 @@ def test_a_result_prints_a_few_lines_and_no_array(results):
             assert lines[1] == textwrap.shorten(str(result.headline), 160, placeholder=" …")
     assert "more" not in repr(results[0])
     assert repr(results[1]).endswith("and 6 more")
-
-
-def test_a_notebook_shows_the_picture_of_a_result(image, results):
-    for result in results:
-        shown = result._repr_html_()
-        assert "<script>" not in shown
-        assert "<b>.tif" not in shown
-        assert ("<img" in shown) == hasattr(result, "image") or hasattr(result, "fields")
-    mask = np.ones(image.shape, bool)
-    mask[5:9, 20:30] = False
-    masked = invert(image, mask=mask, options=InversionOptions(n_sites=400))
-    data = re.search('base64,([^"]+)"', masked._repr_html_())[1]
-    picture = iio.imread(base64.b64decode(data))
-    np.testing.assert_array_equal(picture[..., 3] > 0, mask)
-    length = np.where(mask, np.hypot(*masked.displacement), -1)
-    strongest = np.unravel_index(length.argmax(), mask.shape)
-    np.testing.assert_array_equal(picture[strongest][:3], (253, 231, 37))
 
 
 @pytest.mark.parametrize("function", [invert, fit])

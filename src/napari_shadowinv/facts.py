@@ -2,7 +2,7 @@
 
 The verdict on a field with its limit and the next step: `Assessment`, by rules: `assess`.
 
-A few lines and a picture of a result, as in a notebook: `Summarised`.
+A few lines of a result, as Python prints it: `Summarised`.
 
 Numbers in words: `to_figures`, `percent`, `with_error`; their power of ten: `power_of_ten`.
 
@@ -16,8 +16,6 @@ the file's description in `cli`, the layers in `_napari`.
 
 from __future__ import annotations
 
-import base64
-import html
 import math
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -25,16 +23,12 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
-
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.cautions import Caution
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 Case = TypeVar("Case")
-
-_COLOURS = (68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37)
 
 
 def power_of_ten(largest: float, least: float = 1e-3, greatest: float = 1e5) -> tuple[int, str]:
@@ -100,7 +94,7 @@ def with_error(value: float, error: float, sign: str = "") -> str:
 
 
 class Summarised:
-    """Mixin: shows its headline, its cautions and a picture instead of all its arrays."""
+    """Mixin: shows its headline and its cautions instead of all its arrays."""
 
     def _summary(self) -> list[str]:
         """Return the lines below the title, the most important first."""
@@ -110,45 +104,11 @@ class Summarised:
             return [*lines, *(f"{fact.title}: {fact.text}" for fact in result.facts)]
         return lines + [each.text for each in result.cautions if each.code != "verdict"]
 
-    def _picture(self) -> FloatArray | None:
-        """Return the plane to show, NaN where there is nothing; None without a picture."""
-        return None
-
-    def _lines(self, most: int = 5, letters: int = 160) -> list[str]:
-        plane, title = self._picture(), type(self).__name__
-        if plane is not None:
-            title += f", {plane.shape[1]} × {plane.shape[0]} px (width × height)"
+    def __repr__(self, most: int = 5, letters: int = 160) -> str:
         lines = [textwrap.shorten(line, letters, placeholder=" …") for line in self._summary()]
         if len(lines) > most:
             lines[most - 1 :] = [f"and {len(lines) - most + 1} more"]
-        return [title, *lines]
-
-    def __repr__(self) -> str:
-        return "\n".join(self._lines())
-
-    def _repr_html_(self) -> str:
-        title, *lines = map(html.escape, self._lines())
-        items = "".join(f"<li>{line}</li>" for line in lines)
-        plane = self._picture()
-        picture = "" if plane is None else _picture_html(plane)
-        return f"<b>{title}</b><ul>{items}</ul>{picture}"
-
-
-def _picture_html(
-    plane: FloatArray, side: int = 256, percentiles: tuple[float, float] = (0.5, 99.5)
-) -> str:
-    import imageio.v3 as iio
-
-    step = -(-max(plane.shape) // side)
-    shown = np.asarray(plane[::step, ::step], float)
-    is_shown = np.isfinite(shown)
-    low, high = np.percentile(shown[is_shown], percentiles) if is_shown.any() else (0, 1)
-    share = np.clip((np.where(is_shown, shown, low) - low) / ((high - low) or 1.0), 0, 1)
-    stops = np.linspace(0, 1, len(_COLOURS))
-    channels = [np.interp(share, stops, channel) for channel in zip(*_COLOURS, strict=True)]
-    pixels = np.stack([*channels, 255.0 * is_shown], axis=-1).astype(np.uint8)
-    data = base64.b64encode(iio.imwrite("<bytes>", pixels, plugin="pillow", format="PNG")).decode()
-    return f'<img src="data:image/png;base64,{data}" width="{side}">'
+        return "\n".join([type(self).__name__, *lines])
 
 
 class ResultKind(StrEnum):

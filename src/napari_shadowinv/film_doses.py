@@ -132,10 +132,6 @@ class FilmDoses(Summarised):
     setups: tuple[ProtonSetup, ...] = ()
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
-    def _picture(self) -> FloatArray:
-        has_dose = np.isfinite(self.dose).any(axis=(1, 2))
-        return np.asarray(self.dose[int(has_dose.argmax())])
-
     @property
     def pack(self) -> Pack:
         """The pack that was evaluated."""

@@ -123,9 +123,6 @@ class Shot(Summarised):
         parts += [f"with {name}" for name in ("source", "mask") if getattr(self, name) is not None]
         return [", ".join(parts) or "no setup", *(caution.text for caution in self.cautions)]
 
-    def _picture(self) -> FloatArray | None:
-        return np.asarray(self.image) if np.ndim(self.image) == 2 else None
-
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (H, W) of the image."""

@@ -282,9 +282,6 @@ class Fit(Summarised):
         noise = self.noise if is_plane else self.noise[:, None, None]
         return np.where(self.mask, self.residual / noise, np.nan)
 
-    def _picture(self) -> FloatArray:
-        return np.where(self.used, np.hypot(*self.fields[0].displacement), np.nan)
-
     @property
     def used(self) -> BoolArray:
         """Pixels that at least one image uses, shape (H, W); elsewhere the fields have no data."""

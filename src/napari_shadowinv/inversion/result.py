@@ -222,9 +222,6 @@ class Inversion(Summarised):
     provenance: Provenance | None = None
     errors: ErrorBudget | None = None
 
-    def _picture(self) -> FloatArray:
-        return self.main_field.magnitude
-
     @property
     def total_error(self) -> float | None:
         """Total error as a share of the displacement (r.m.s.); None if not estimated."""
@@ -636,9 +633,6 @@ class RetrievedField(Summarised):
     cautions: ClassVar[tuple[Caution, ...]] = ()
 
     dataset: xarray.Dataset
-
-    def _picture(self) -> FloatArray:
-        return np.asarray(np.hypot(*self.displacement))
 
     @property
     def displacement(self) -> FloatArray:

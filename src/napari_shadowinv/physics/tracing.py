@@ -117,9 +117,6 @@ class TracedImage(Summarised):
     steps: int
     particles: TracedParticles | None = None
 
-    def _picture(self) -> FloatArray:
-        return self.image
-
     @property
     def thin_displacement(self) -> FloatArray:
         """Displacement in px, shape (2, H, W), if the object were thin.

@@ -112,9 +112,6 @@ class ExperimentPlan(Summarised):
     seconds: dict[str, float]  # of each stage
     is_thin: bool = True  # whether the object is taken as thin, not traced
 
-    def _picture(self) -> FloatArray:
-        return np.asarray(self.images[0])
-
     @property
     def verdicts(self) -> dict[Verdict, int]:
         """How many shots have each verdict, the most frequent first."""
