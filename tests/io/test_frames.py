@@ -155,9 +155,7 @@ def test_burst_in_one_file_is_a_stack(tmp_path, name):
     if path.suffix == ".spe":
         # Eight bytes of times follow each frame.
         body = np.pad(planes.reshape(6, -1).view(np.uint8), ((0, 0), (0, 8)))
-        footer = b'<DataBlock type="Frame" count="6" size="70" stride="78">'
-        shape = {"frames": 6, "height": 5, "width": 7}
-        save_spe(path, body, footer=footer, **shape)
+        save_spe(path, body, footer=b"<SpeFormat/>", frames=6, height=5, width=7)
     elif path.suffix == ".npy":
         np.save(path, planes)
     elif path.suffix == ".tif":

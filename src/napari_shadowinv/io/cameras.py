@@ -12,7 +12,6 @@ Teledyne Princeton Instruments, SPE 3.0 File Format Specification, 4411-0140 (20
 
 from __future__ import annotations
 
-import re
 import struct
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,8 +34,7 @@ _SPE_FIELDS = np.dtype(
     }
 )
 _SPE_TYPES = {0: "<f4", 1: "<i4", 2: "<i2", 3: "<u2", 5: "<f8", 6: "u1", 8: "<u4"}
-_SPE_REGION = re.compile(rb'<DataBlock\b[^>]*\btype="Region"[^>]*>')
-_SPE_STRIDE = re.compile(rb'<DataBlock\b(?=[^>]*\btype="Frame")[^>]*\bstride="(\d{1,12})"')
+_SPE_TIMES = 64  # bytes behind a frame of version 3, at most
 
 
 def read_b16(path: Path) -> tuple[AnyArray, dict[str, Any]]:
@@ -91,30 +89,22 @@ def _spe_layout(path: Path) -> _Spe:
     if code not in _SPE_TYPES:
         raise ValueError(f"its data type is {code}, which no SPE file has")
     dtype = np.dtype(_SPE_TYPES[code])
-    stride = height * width * dtype.itemsize
+    stride = size = height * width * dtype.itemsize
     if frames < 1:
         raise ValueError(f"it holds {frames} frames")
-    if version >= 3:
-        stride = max(stride, _footer_stride(path, footer))
-    end = _SPE_HEADER + (frames - 1) * stride + height * width * dtype.itemsize
+    if version >= 3:  # the XML behind all frames begins where they end
+        check_promise(path, "SPE", footer, path.stat().st_size)
+        stride = (footer - _SPE_HEADER) // frames
+        if stride < size:
+            raise ValueError("its XML begins within its frames")
+        if stride > size + _SPE_TIMES:
+            raise FileFormatError(
+                f"{path} holds several regions of the sensor in a frame: expected one; export the "
+                "region you need as TIFF"
+            )
+    end = _SPE_HEADER + (frames - 1) * stride + size
     check_promise(path, "SPE", end, path.stat().st_size)
     return _Spe(frames, (height, width), dtype, stride, version)
-
-
-def _footer_stride(path: Path, start: int, most_bytes: int = 2_000_000) -> int:
-    """Return the stride of frames by the XML at the end; refuse several sensor regions in each."""
-    check_promise(path, "SPE", start, path.stat().st_size)
-    with path.open("rb") as file:
-        file.seek(start)
-        footer = file.read(most_bytes)  # one frame has some kilobytes
-    regions = len(_SPE_REGION.findall(footer))
-    if regions > 1:
-        raise FileFormatError(
-            f"{path} holds {regions} regions of the sensor: expected one; export the region you "
-            "need as TIFF"
-        )
-    stride = _SPE_STRIDE.search(footer)
-    return int(stride[1]) if stride else 0
 
 
 def _read_frame(
