@@ -279,7 +279,7 @@ BAD: dict[str, tuple[str, Write, str]] = {
     "ink": ("a.jpg", ink, "kind CMYK"),
     "16-bit colours": ("a.png", png(4, 16, 2, bytes(100)), "16 bits per channel"),
     "colour b16": ("a.b16", b16(NOISE, colour=1), "colour camera"),
-    "regions": ("a.spe", spe(NOISE, footer=2 * b'<DataBlock type="Region">'), "holds 2 regions"),
+    "regions": ("a.spe", spe(NOISE, footer=b"<SpeFormat/>", height=32), "several regions"),
     "codec": (
         "a.tif",
         retagged(Compression=60123),
@@ -316,6 +316,10 @@ BAD: dict[str, tuple[str, Write, str]] = {
         )
         for options in STACKS
         for share in (1 / 3, 0.6, 0.99)
+    },
+    **{
+        f"all of {options}": ("a.tif", tiff(np.stack([NOISE] * 3), **options), "lists 3 frames")
+        for options in STACKS[3:]
     },
     "no image prad": ("a.h5", prad(None), "with no image"),
     "oblong prad": (

@@ -113,12 +113,6 @@ TRANSPARENT: dict[str, tuple[Callable[[Path], Any], Any]] = {
         ),
         ALPHA > 0,
     ),
-    "TIFF, no data": (
-        lambda path: tifffile.imwrite(
-            path, SHOT, extratags=[(42113, "s", 0, f"{SHOT[3, 4]}", True)], metadata=None
-        ),
-        SHOT[3, 4] != SHOT,
-    ),
 }
 
 

@@ -69,9 +69,7 @@ def frames_of(path: Path) -> Any:
 @pytest.mark.parametrize(
     "options",
     [
-        {"imagej": True, "truncate": True},
         {"imagej": True},
-        {"truncate": True},
         {"metadata": {"axes": "TYX"}, "ome": True},
         {"metadata": {"axes": "ZYX"}, "imagej": True, "bigtiff": False},
         {"compression": "zlib", "metadata": None},
@@ -85,7 +83,7 @@ def test_all_frames_of_a_stack_are_shots(path: Path, options: dict[str, Any]) ->
 
 def test_axes_of_time_depth_and_channel_count_together(path: Path) -> None:
     stack = np.arange(2 * 3 * 2 * 4 * 5, dtype=np.uint16).reshape(2, 3, 2, 4, 5)
-    tifffile.imwrite(path, stack, imagej=True, metadata={"axes": "TZCYX"}, truncate=True)
+    tifffile.imwrite(path, stack, imagej=True, metadata={"axes": "TZCYX"})
     np.testing.assert_array_equal(frames_of(path), stack.reshape(-1, 4, 5))
 
 

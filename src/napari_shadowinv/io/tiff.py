@@ -50,8 +50,7 @@ _UNITS_M: dict[Any, float] = {2: INCH_M, 3: 0.01, 4: 1e-3, 5: 1e-6, "inch": INCH
 class _Layout(NamedTuple):
     """Where the frames of a TIFF are."""
 
-    n_frames: int
-    pages: tuple[int, ...]  # numbers of their directories; only one if they follow each other
+    pages: tuple[int, ...]  # numbers of their directories
     left_out: tuple[str, ...] = ()  # sizes of smaller pictures
 
 
@@ -101,13 +100,9 @@ def _find_frames(path: Path, _modified_ns: int, size: int) -> _Layout:
                 f"{path} holds pictures of {'×'.join(map(str, _sides(largest)))} and of "
                 f"{', '.join(sizes)} pixels: expected shots of one size; save them separately"
             )
-        count = sum(series.size // series.keyframe.size for series in shots)
-        if count > len(tiff.pages):
-            return _Layout(count, (_first_of_stored_together(path, shots, size),), sizes)
-        if count == 1:
-            _check_imagej_promise(path, tiff, shots[0].keyframe, size)
+        _check_listed(path, tiff, shots)
         pages = tuple(sorted(page.index for series in shots for page in series))
-        return _Layout(count, pages, sizes)
+        return _Layout(pages, sizes)
 
 
 def _sides(series: Any) -> tuple[int, int]:
@@ -124,46 +119,34 @@ def _check_directories(path: Path, tiff: Any, size: int) -> None:
     check_promise(path, "TIFF", following, size)
 
 
-def _first_of_stored_together(path: Path, shots: list[Any], size: int) -> int:
-    """Return the directory of frames that follow each other behind it."""
-    page, start = shots[0].keyframe, shots[0].dataoffset
-    if len(shots) > 1 or start is None or not page.is_final:
-        raise FileFormatError(
-            f"{path} lists more frames than it has directories: expected one directory for each; "
-            "save the stack again"
-        )
-    check_promise(path, "TIFF", start + shots[0].nbytes, size)
-    return int(page.index)
-
-
-def _check_imagej_promise(path: Path, tiff: Any, page: Any, size: int) -> None:
-    """Refuse a stack that ends before the frames that ImageJ lists."""
+def _check_listed(path: Path, tiff: Any, shots: list[Any]) -> None:
+    """Refuse a stack with fewer directories than frames: they do not say where the others are."""
     stated = tiff.imagej_metadata or {}
-    promised = [stated.get("images", 1)]
-    promised += [math.prod(stated.get(axis, 1) for axis in ("frames", "slices", "channels"))]
-    if page.is_final and max(promised) > page.samplesperpixel:
-        check_promise(path, "TIFF", page.dataoffsets[0] + max(promised) * page.nbytes, size)
+    listed = [sum(series.size // series.keyframe.size for series in shots)]
+    if shots[0].keyframe.samplesperpixel == 1:
+        listed += [stated.get("images", 1)]
+        listed += [math.prod(stated.get(axis, 1) for axis in ("frames", "slices", "channels"))]
+    if max(listed) > len(tiff.pages):
+        raise FileFormatError(
+            f"{path} lists {max(listed)} frames and has {len(tiff.pages)} directories: it is "
+            "truncated, or larger than 4 GB, where ImageJ leaves them out; copy it again, or save "
+            "it as BigTIFF or in one file for each frame"
+        )
 
 
 def count_tiff_frames(path: Path) -> int:
     """Return how many frames a TIFF has."""
-    return _layout_of(path).n_frames
+    return len(_layout_of(path).pages)
 
 
 def read_tiff(path: Path, number: int = 0) -> tuple[AnyArray, dict[str, Any]]:
     """Read frame `number`, from 0, of a TIFF."""
     layout = _layout_of(path)
-    is_stored_together = layout.n_frames > len(layout.pages)
     with _open_tiff(path) as tiff:
-        page = tiff.pages[layout.pages[0 if is_stored_together else number]].aspage()
+        page = tiff.pages[layout.pages[number]].aspage()
         _check_kind(path, page)
         _check_complete(path, page)
-        if is_stored_together:
-            start = page.dataoffsets[0] + number * page.nbytes
-            dtype = page.dtype.newbyteorder(tiff.byteorder)
-            array = np.fromfile(path, dtype, page.size, offset=start).reshape(page.shape)
-        else:
-            array = page.asarray()
+        array = page.asarray()
         if "S" in page.axes:
             array = np.moveaxis(array, page.axes.index("S"), -1)
         missing = _missing_pixels(page, array)
@@ -232,14 +215,10 @@ def _without_alpha(page: Any, array: AnyArray) -> AnyArray:
     return array[..., 0] if array.shape[-1] == 2 else array[..., :-1]
 
 
-def _missing_pixels(page: Any, array: AnyArray) -> BoolArray:
-    """Return where a frame is transparent, or has no data as GDAL states it."""
-    if array.ndim == 3 and _without_alpha(page, array) is not array:
-        return np.asarray(array[..., -1] == 0)
-    is_missing = np.zeros(array.shape[:2], bool)
-    if 42113 in page.tags:
-        is_missing |= (array == page.nodata).reshape(*array.shape[:2], -1).all(axis=-1)
-    return is_missing
+def _missing_pixels(page: Any, array: AnyArray) -> BoolArray | None:
+    """Return where a frame is transparent; None if it is nowhere."""
+    is_opaque = array.ndim < 3 or _without_alpha(page, array) is array
+    return None if is_opaque else np.asarray(array[..., -1] == 0)
 
 
 def _convert_values(
