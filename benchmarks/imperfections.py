@@ -421,10 +421,8 @@ def fitted_row(name: str, shots: Shots, seed: int, is_right: bool) -> tuple[str,
         ProtonSetup.example().model_copy(update={"energy": energy}) for energy in shots.energies
     ]
     images = shots.images(seed)
-    if shots.mask is not None:
-        images = np.ma.array(images, mask=np.broadcast_to(~shots.mask, np.shape(images)))
     noise = "poisson" if shots.quanta else CONSTANT_NOISE
-    known = {"setup": setups, "noise": noise, **shots.keywords}
+    known = {"setup": setups, "noise": noise, "mask": shots.mask, **shots.keywords}
     result = fit(shots_of(images, **known), options=FitOptions(seed=seed))
     seconds = time.perf_counter() - begun
     truth = shots.displacement()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import dask.array as da
 import numpy as np
 import pytest
 import xarray as xr
@@ -41,15 +40,6 @@ SETUP = OpticalSetup(
 )
 TRUTH = gaussian_blob((32, 40), 20.0, 6.0).displacement
 SHOT = 300 * synthetic_image(TRUTH)
-
-
-@pytest.fixture
-def burnt() -> np.ma.MaskedArray[Any, Any]:
-    """A shot with a saturated spot that is masked."""
-    image, mask = SHOT.copy(), np.zeros(SHOT.shape, bool)
-    mask[4:8, 5:9] = True
-    image[mask] = 1e6
-    return np.ma.MaskedArray(image, mask)
 
 
 def turned(image: Any) -> xr.DataArray:
@@ -91,14 +81,7 @@ def _seen(shots: Sequence[Shot]) -> np.ndarray[Any, Any]:
 def _stack_of(image: Any) -> Any:
     if isinstance(image, xr.DataArray):
         return xr.concat([image, image], "shot").transpose(..., "shot")
-    return np.ma.stack([image, image]) if isinstance(image, np.ma.MaskedArray) else [image, image]
-
-
-@pytest.mark.parametrize("entry", INVERT)
-def test_masked_array_is_the_same_as_a_mask(entry: str, burnt: np.ma.MaskedArray[Any, Any]) -> None:
-    expected = displaced(INVERT[entry](burnt.data, ~burnt.mask))
-
-    assert np.array_equal(displaced(INVERT[entry](burnt)), expected)
+    return [image, image]
 
 
 @pytest.mark.parametrize("entry", INVERT)
@@ -106,49 +89,6 @@ def test_labelled_array_is_taken_by_its_names(entry: str) -> None:
     expected = displaced(INVERT[entry](SHOT))
 
     assert np.array_equal(displaced(INVERT[entry](turned(SHOT))), expected)
-
-
-def test_mask_of_a_source_leaves_its_pixels_out(burnt: np.ma.MaskedArray[Any, Any]) -> None:
-    beam = np.ma.MaskedArray(np.where(burnt.mask, np.nan, 300.0), burnt.mask)
-
-    inversion = invert(SHOT, source=beam, options=OPTIONS)
-
-    assert np.array_equal(inversion.mask, ~burnt.mask)
-    assert np.array_equal(plan_sites(beam, OPTIONS).mask, ~burnt.mask)
-
-
-def test_mask_argument_and_array_mask_both_count(burnt: np.ma.MaskedArray[Any, Any]) -> None:
-    mask = np.ones(SHOT.shape, bool)
-    mask[20:24] = False
-
-    for inversion in (
-        invert(burnt, mask=mask, options=OPTIONS),
-        run(Recipe(options=OPTIONS), Shot(burnt, mask=mask)),
-    ):
-        assert np.array_equal(inversion.mask, mask & ~burnt.mask)
-
-
-def test_plan_without_the_mask_is_refused(burnt: np.ma.MaskedArray[Any, Any]) -> None:
-    plan = plan_sites(np.ones(SHOT.shape), OPTIONS)
-
-    with pytest.raises(InputError, match="16 masked pixels that the plan uses"):
-        invert(burnt, plan=plan)
-
-    masked = plan_sites(np.ones(SHOT.shape), OPTIONS, mask=~burnt.mask)
-    assert np.array_equal(invert(burnt, plan=masked, options=OPTIONS).mask, ~burnt.mask)
-
-
-def test_estimate_ignores_masked_pixels(burnt: np.ma.MaskedArray[Any, Any]) -> None:
-    assert UniformEstimate().source(burnt).mean() == pytest.approx(SHOT[~burnt.mask].mean())
-
-
-def test_stack_with_different_masks_is_refused(burnt: np.ma.MaskedArray[Any, Any]) -> None:
-    shots = np.ma.stack([burnt, np.ma.MaskedArray(SHOT)])
-
-    with pytest.raises(InputError, match="different masks"):
-        invert_stack(shots, Recipe(options=OPTIONS))
-    with pytest.raises(InputError, match="dask array of masked arrays"):
-        invert_stack(da.from_array(shots), Recipe(options=OPTIONS))
 
 
 @pytest.mark.parametrize(
@@ -159,14 +99,21 @@ def test_stack_with_different_masks_is_refused(burnt: np.ma.MaskedArray[Any, Any
         lambda array: predict_image(TRUTH, SETUP, SETUP, source=array),
         lambda array: synthetic_image(np.ma.stack([array, array])),
         lambda array: SETUP.potential(array),
+        *INVERT.values(),
+        lambda array: invert(SHOT, mask=array > 0, options=OPTIONS),
+        lambda array: plan_sites(array, OPTIONS),
+        lambda array: UniformEstimate().source(array),
     ],
-    ids=["source", "poisson_invert", "project", "displacement", "potential"],
+    ids=[
+        *("source", "poisson_invert", "project", "displacement", "potential"),
+        *(*INVERT, "mask", "plan_sites", "estimate"),
+    ],
 )
-def test_masked_values_without_meaning_are_refused(
-    use: Callable[..., Any], burnt: np.ma.MaskedArray[Any, Any]
-) -> None:
+def test_masked_values_are_refused(use: Callable[..., Any]) -> None:
+    image, mask = SHOT.copy(), np.zeros(SHOT.shape, bool)
+    mask[4:8, 5:9] = True
     with pytest.raises(InputError, match="masked values, expected none"):
-        use(burnt)
+        use(np.ma.MaskedArray(image, mask))
 
 
 def test_forward_models_take_axes_by_name() -> None:

@@ -1,8 +1,7 @@
-"""Arrays as users hold them: numpy's masked arrays and xarray's labelled ones.
+"""Arrays as users hold them: numpy's, and xarray's labelled ones.
 
-- values in the order of the axes, and the mask: `unpack_array`
-- the same where a mask has no meaning: `plain_array`; in any order: `refuse_masked`
-- image, source and mask of one shot: `unpack_shot`
+- values in the order of the axes: `unpack_array`; real numbers: `plain_array`
+- values without numpy's masked ones: `refuse_masked`
 - numbers as floats: `as_numbers`; a plane of them: `check_plane`; a mask: `check_mask`
 - two masks together: `join_masks`; enough usable pixels: `check_usable`
 - size of a pixel by the coordinates: `coordinate_spacing`
@@ -38,13 +37,11 @@ METRES |= {"metre": 1.0, "meter": 1.0, "micrometer": 1e-6, "micron": 1e-6, "mill
 _UNITS = {PIXELS: ("px", "pixel"), SQUARE_PIXELS: ("px²", "pixel**2")}  # the last of datasets
 
 
-def unpack_array(
-    values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = ""
-) -> tuple[Any, BoolArray | None]:
-    """Return the values in the order of `dims`, and a mask of the usable ones (None: all).
+def unpack_array(values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = "") -> Any:
+    """Return the values in the order of `dims`.
 
-    `name` is for messages; values in another unit than `unit` are refused. Raises an `InputError`
-    if dimensions have other names, or pixels are not square.
+    `name` is for messages. Raises an `InputError` if values are masked or in another unit than
+    `unit`, dimensions have other names, or pixels are not square.
     """
     if isinstance(values, (str, PurePath)):
         raise InputError(
@@ -57,40 +54,32 @@ def unpack_array(
         values = _order_axes(values, name, dims, unit)
     if isinstance(values, (list, tuple)):
         try:
-            return np.asarray(values), None
+            return np.asarray(values)
         except ValueError:
             raise InputError(
                 f"{name} is a list whose parts have different lengths: expected an array"
             ) from None
-    if not isinstance(values, np.ma.MaskedArray):
-        return values, None
-    masked = np.ma.getmaskarray(values)
-    return values.data, ~masked if masked.any() else None
+    return refuse_masked(values, name)
 
 
 def plain_array(values: Any, name: str, dims: Sequence[str] = PLANE, *, unit: str = "") -> AnyArray:
-    """Return the values in the order of `dims`; refuse masked ones, which have no meaning here."""
-    refuse_masked(values, name)
-    plain: AnyArray = np.asarray(unpack_array(values, name, dims, unit=unit)[0])
+    """Return real numbers in the order of `dims`."""
+    plain: AnyArray = np.asarray(unpack_array(values, name, dims, unit=unit))
     if plain.dtype.kind not in "buif":
         raise InputError(f"{name} has values of type {plain.dtype}, expected real numbers")
     return plain
 
 
 def refuse_masked(values: Any, name: str) -> Any:
-    """Return the values unchanged, unless some are masked."""
-    if isinstance(values, np.ma.MaskedArray) and np.ma.getmaskarray(values).any():
+    """Return the values, unless some are masked."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    if count := int(np.ma.getmaskarray(values).sum()):
         raise InputError(
-            f"{name} has {int(np.ma.getmaskarray(values).sum())} masked values, expected none: "
-            f"replace them, as in {name}.filled(0)"
+            f"{name} has {count} masked values, expected none: give {name}.data, and of an image "
+            f"its mask as mask=~{name}.mask"
         )
-    return values
-
-
-def unpack_mask(mask: Any, name: str = "mask") -> Any:
-    """Return a mask as a plain plane, false where it is masked itself; None for None."""
-    array, usable = unpack_array(mask, name)
-    return array if usable is None else np.where(usable, array, False)
+    return values.data
 
 
 def join_masks(*masks: Any) -> Any:
@@ -104,15 +93,6 @@ def join_masks(*masks: Any) -> Any:
     if len(shapes) > 1 or any(array.dtype != np.bool_ for array in arrays):
         return present[0]
     return np.logical_and.reduce(arrays)
-
-
-def unpack_shot(image: Any, source: Any, mask: Any) -> tuple[Any, Any, Any]:
-    """Return image, source and mask as plain planes; the mask excludes pixels masked in either."""
-    image, usable = unpack_array(image, "image")
-    if source is not None:
-        source, lit = unpack_array(source, "source")
-        usable = join_masks(usable, lit)
-    return image, source, join_masks(unpack_mask(mask), usable)
 
 
 def check_plane(values: Any, name: str, least: int = 1) -> AnyArray:
@@ -181,9 +161,8 @@ def check_shape(
 
 def as_numbers(name: str, values: ArrayLike) -> FloatArray:
     """Return a copy of values as floats, or raise an `InputError` that shows the values."""
-    refuse_masked(values, name)
     try:
-        return np.array(values, dtype=np.float64)
+        return np.array(refuse_masked(values, name), dtype=np.float64)
     except (TypeError, ValueError) as error:
         text = " ".join(repr(values).split())
         raise InputError(f"{name} is {text:.60}: expected numbers, as many in each row") from error

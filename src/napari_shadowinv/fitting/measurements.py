@@ -21,10 +21,8 @@ from napari_shadowinv._system.arrays import (
     check_shape,
     check_usable,
     estimated_noise,
-    join_masks,
     plain_array,
     unpack_array,
-    unpack_mask,
 )
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
@@ -398,21 +396,17 @@ def _checked_planes(
     masks: list[BoolArray] = []
     needed = bytes_of[0] + len(shots) * bytes_of[1]
     for shot, name in zip(shots, names, strict=True):
-        image, exposed = unpack_array(shot.image, name)
-        images.append(check_plane(image, name, smallest))
+        images.append(check_plane(unpack_array(shot.image, name), name, smallest))
         check_memory(images[0].shape, needed, "a fit")
         check_shape(name, images[-1].shape, images[0].shape, names[0])
         try:
-            mask = check_mask(unpack_mask(shot.mask), images[0].shape)
+            masks.append(check_mask(unpack_array(shot.mask, "mask"), images[0].shape))
         except InputError as error:
             raise error.about(name) from error
-        masks.append(join_masks(mask, exposed))
     data = np.array(images, dtype=np.float64)
     beams = None
     if sources is not None:
-        unpacked = [unpack_array(source, "source") for source in sources]
-        masks = [join_masks(mask, lit) for mask, (_, lit) in zip(masks, unpacked, strict=True)]
-        checked = [check_source(source) for source, _ in unpacked]
+        checked = [check_source(unpack_array(source, "source")) for source in sources]
         for source in checked:
             check_shape("source", source.shape, data.shape[1:])
         beams = np.array(checked)

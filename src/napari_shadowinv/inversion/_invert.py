@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import unpack_array, unpack_shot
+from napari_shadowinv._system.arrays import unpack_array
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._system.progress import (
     OnProgress,
@@ -103,8 +103,7 @@ def plan_sites(
         If `should_stop` returned true.
     """
     options = as_model(InversionOptions, options, "options")
-    source, _, mask = unpack_shot(source, None, mask)
-    plan = plan_over(source, options, mask, measured)
+    plan = plan_over(unpack_array(source, "source"), options, unpack_array(mask, "mask"), measured)
     plan = replace(plan, source=plan.source.copy())  # the caller's may change
     if options.is_adaptive:
         return plan
@@ -228,13 +227,13 @@ def _prepare(
     measured: bool,
 ) -> _Inputs:
     """Mask unlit pixels, check image and source, and bring a recorded source into register."""
+    image = unpack_array(image, "image")
     if plan is None:
-        image, source, mask = unpack_shot(image, source, mask)
+        source, mask = unpack_array(source, "source"), unpack_array(mask, "mask")
         measured = measured and source is not None
     else:
         _check_plan(plan, options, has_own=source is None and mask is None, measured=measured)
-        image, source, mask = _unmasked_values(image, plan.mask), plan.source, plan.mask
-        measured = plan.measured
+        source, mask, measured = plan.source, plan.mask, plan.measured
     recorded = source if measured else None
     mask, unlit = mask_unlit(image, recorded, mask)
     is_dark = _dark_in_source(recorded, mask)
@@ -497,22 +496,6 @@ def _sites_reason(problem: _Problem, solution: _Solution) -> str:
     if problem.levels.counts[-1] < MAX_DEFAULT_SITES:
         return "one for each pixel, the most that are placed unless more are asked for"
     return "the most that are placed unless more are asked for"
-
-
-def _unmasked_values(image: ArrayLike, usable: BoolArray | None) -> ArrayLike:
-    """Return the values of an image, refusing masked pixels that a plan uses."""
-    values: ArrayLike
-    values, unmasked = unpack_array(image, "image")
-    if unmasked is not None:
-        missing = ~unmasked
-        if usable is not None and usable.shape == unmasked.shape:
-            missing &= usable
-        if missing.any():
-            raise InputError(
-                f"image has {int(missing.sum())} masked pixels that the plan uses: make the plan "
-                "with the image's mask (mask=~image.mask)"
-            )
-    return values
 
 
 def _check_plan(

@@ -25,7 +25,6 @@ from napari_shadowinv._system.arrays import (
     check_usable,
     join_masks,
     unpack_array,
-    unpack_mask,
 )
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
@@ -396,9 +395,7 @@ def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:
     # A mask's file precedes the recipe's; of arrays, both hold.
     is_file = isinstance(loaded.mask, (str, Path))
     usable = _mask([loaded.mask, None if is_file else recipe.mask], "mask", loaded.shape)
-    is_array = entered.source is not None and not isinstance(entered.source, Shot | str | Path)
-    lit = beam.mask if is_array and beam is not None else None  # of a masked array
-    usable = _without_gaps(usable, lit, loaded, beam)
+    usable = _without_gaps(usable, loaded, beam)
     bare = _mask((loaded.source_mask, recipe.source_mask), "source mask", loaded.shape)
     kind = recipe.source
     if kind is None:
@@ -441,9 +438,7 @@ def load_shot(shot: AnyShot, name: str) -> Shot:
     entered = shot if isinstance(shot, Shot) else Shot(shot)
     if isinstance(entered.image, (str, Path)):
         return entered.completed_by(read_shot(Path(entered.image)))
-    values, usable = unpack_array(entered.image, name)
-    mask = entered.mask if usable is None else join_masks(_pixels(entered.mask, "mask"), usable)
-    return replace(entered, image=plane_of(values, name), mask=mask)
+    return replace(entered, image=plane_of(unpack_array(entered.image, name), name))
 
 
 def _beam_of(recipe: Recipe, shot: Shot) -> Shot | None:
@@ -503,11 +498,9 @@ def _mask(
 
 
 def _pixels(mask: Any, name: str) -> Any:
-    if mask is None:
-        return None
     if isinstance(mask, (str, Path)):
         return picture_mask(Path(mask), name)
-    pixels = np.asarray(unpack_mask(mask, name))
+    pixels = np.asarray(unpack_array(mask, name))
     if pixels.dtype != np.bool_:
         raise InputError(
             f"{name} has values of type {pixels.dtype}, expected booleans: compare it with "
@@ -517,13 +510,10 @@ def _pixels(mask: Any, name: str) -> Any:
     return pixels
 
 
-def _without_gaps(
-    mask: MaskOrigin | None, lit: BoolArray | None, *images: Shot | None
-) -> MaskOrigin | None:
-    """Remove pixels that a source's mask hides, or without a value in files, from a mask."""
-    masks = [] if lit is None else [lit]
+def _without_gaps(mask: MaskOrigin | None, *images: Shot | None) -> MaskOrigin | None:
+    """Remove pixels without a value in files from a mask."""
     masked = (image for image in images if image is not None and image.mask is not None)
-    masks += [~np.isnan(image.image) for image in masked]
+    masks = [~np.isnan(image.image) for image in masked]
     pixels = join_masks(mask and mask.pixels, *masks)
     if pixels is None or (mask is not None and np.array_equal(pixels, mask.pixels)):
         return mask

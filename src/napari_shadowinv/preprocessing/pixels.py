@@ -18,7 +18,7 @@ from napari_shadowinv._system.arrays import (
     check_mask,
     check_plane,
     complete_block_means,
-    unpack_shot,
+    unpack_array,
 )
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -97,9 +97,8 @@ def checked_pixels(image: ArrayLike, mask: ArrayLike | None = None) -> tuple[Flo
 
     Masked pixels, which may be NaN, are set to the mean of the usable ones.
     """
-    image, _, mask = unpack_shot(image, None, mask)
-    values = np.array(check_plane(image, "image"), dtype=np.float64)
-    usable = check_mask(mask, values.shape)
+    values = np.array(check_plane(unpack_array(image, "image"), "image"), dtype=np.float64)
+    usable = check_mask(unpack_array(mask, "mask"), values.shape)
     bad = int((~np.isfinite(values[usable])).sum())
     if bad:
         raise InputError(

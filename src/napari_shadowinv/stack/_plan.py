@@ -17,7 +17,6 @@ from napari_shadowinv._system.arrays import (
     checksum,
     join_masks,
     unpack_array,
-    unpack_mask,
 )
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import map_paths
@@ -205,18 +204,16 @@ def _describe_inputs(
     shots = common.image
     measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
     source = measured.file if common.source is None else common.source
-    lit = None
     if getattr(source, "ndim", None) == 2:
-        source, lit = unpack_array(source, "source")
+        source = unpack_array(source, "source")
     # The reader's array is that of the shots.
     sources = find_source(source, replace(reader, variable=measured.variable))
-    if isinstance(sources, Shots):
-        lit = sources.mask
+    lit = sources.mask if isinstance(sources, Shots) else None
     if sources is None and isinstance(recipe.source, MeasuredSource):
         raise InputError(
             "the recipe asks for a measured source, but names no file: name one, or give a source"
         )
-    mask = unpack_mask(common.mask)
+    mask = unpack_array(common.mask, "mask")
     # With a source, no shot needs to be read for its shape.
     shape = (() if mask is None else np.shape(mask)) if sources is None else sources.shape
     image_shape = (shape[0], shape[1]) if len(shape) == 2 else None

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.arrays import (
     PLANE,
     checksum,
-    join_masks,
+    refuse_masked,
     unpack_array,
 )
 from napari_shadowinv._system.validation import map_paths
@@ -148,8 +148,7 @@ class FileReader:
     def read(self, frame: FileFrame) -> Shot:
         if self.function is None:
             return read_frame(frame, channel=self.channel)
-        values, usable = unpack_array(self.function(frame.path), "the shot")
-        return Shot(values, mask=usable)
+        return Shot(unpack_array(self.function(frame.path), "the shot"))
 
     @property
     def name(self) -> str:
@@ -283,14 +282,8 @@ def stamp(path: Path) -> dict[str, int]:
 
 
 def _plain_image(image: Any) -> AnyArray:
-    """Return an image without labels; an `InputError` if it has its own mask."""
-    values, usable = unpack_array(image, "the shot")
-    if usable is not None:
-        raise InputError(
-            f"the shot has {int((~usable).sum())} masked pixels of its own: give one mask for the "
-            "whole stack, or describe the shots in a table with a mask each"
-        )
-    return np.asarray(values)
+    """Return an image without labels."""
+    return np.asarray(unpack_array(image, "the shot"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,10 +338,7 @@ def find_shots(
                 f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected the same "
                 "shape for all"
             )
-        planes = [unpack_array(item, f"shots[{k}]") for k, item in enumerate(shots)]
-        shots = np.ma.stack(
-            [np.ma.MaskedArray(values, usable is not None and ~usable) for values, usable in planes]
-        )
+        shots = np.stack([unpack_array(item, f"shots[{k}]") for k, item in enumerate(shots)])
     if not hasattr(shots, "ndim"):
         raise InputError(
             f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
@@ -440,7 +430,7 @@ def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
     coordinate, labels = shots.coords.get(name), shots.coords.get("name")
     if not shots.variable._in_memory and name in shots.dims:
         shots = shots.chunk({name: 1})  # otherwise the whole file would be read
-    values, _ = unpack_array(shots, "shots", ("shot", *PLANE))
+    values = unpack_array(shots, "shots", ("shot", *PLANE))
     found = _from_array(
         values,
         None if coordinate is None else coordinate.values,
@@ -448,7 +438,7 @@ def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
     )
     if usable is None or usable.dims != PLANE or usable.dtype != np.bool_:
         return found
-    return replace(found, mask=join_masks(found.mask, usable.values))
+    return replace(found, mask=usable.values)
 
 
 def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots:
@@ -462,9 +452,8 @@ def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots
         raise InputError(
             f"shots have the unknown shape {shots.shape}: call compute_chunk_sizes() first"
         )
-    mask = _common_mask(shots)
     if isinstance(shots, np.ndarray):
-        array = np.asarray(shots)
+        array = np.asarray(refuse_masked(shots, "shots"))
     elif isinstance(shots, da.Array):
         array = shots.rechunk((1, -1, -1))
     else:  # of h5py or zarr
@@ -472,26 +461,7 @@ def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots
     numbers = range(count) if coordinate is None else coordinate
     names = map(str, numbers if labels is None else labels)
     items = [ArrayExposure(name, array, index) for index, name in enumerate(names)]
-    return Shots(items, (shots.shape[1], shots.shape[2]), coordinate, mask)
-
-
-def _common_mask(shots: Any) -> BoolArray | None:
-    """Return the pixels that no shot of a masked array masks."""
-    if isinstance(getattr(shots, "_meta", None), np.ma.MaskedArray):
-        raise InputError(
-            "shots are a dask array of masked arrays: give the mask as mask=, and the values as "
-            "dask.array.ma.getdata(shots)"
-        )
-    if not isinstance(shots, np.ma.MaskedArray) or not np.ma.getmaskarray(shots).any():
-        return None
-    masked: BoolArray = np.ma.getmaskarray(shots)
-    if (masked != masked[0]).any():
-        raise InputError(
-            "shots have different masks, expected the same in all: mask pixels that are masked in "
-            "any (mask=~shots.mask.any(axis=0)), or describe them in a table with a mask each"
-        )
-    common: BoolArray = ~masked[0]
-    return common
+    return Shots(items, (shots.shape[1], shots.shape[2]), coordinate)
 
 
 def find_source(source: Any, reader: FileReader) -> AnyArray | Shots | None:
