@@ -261,24 +261,6 @@ def test_the_order_of_the_imperfections_is_that_of_light_and_detector(image, sou
     np.testing.assert_allclose(both.shot(np.ones(3)).image, expected)
 
 
-def test_beams_vary_in_the_shapes_of_their_references(image, source, blob):
-    rng = np.random.default_rng(0)
-    tilt = np.linspace(-1, 1, SHAPE[1]) * np.ones(SHAPE)
-    references = [source * (1 + 0.02 * z * tilt) for z in rng.normal(size=8)]
-    beam = BeamPrior.from_references(references)
-    mask = np.ones(SHAPE, bool)
-    shot = RecordedShot(image=image, source=source, displacement=blob.displacement, mask=mask)
-    draws = InstrumentDraws(shot, Instrument(), beam)
-    ratios = np.array(
-        [source / draws.shot(rng.normal(size=draws.count)).source - 1 for _ in range(200)]
-    )
-    of_tilt = (ratios * tilt).mean(axis=(1, 2)) / (tilt**2).mean()
-    # A new shot differs by (n + 1) / n of the references' variance.
-    scatter = np.std([(r / source - 1)[0, -1] for r in references], ddof=1) * np.sqrt(9 / 8)
-    assert of_tilt.std() == pytest.approx(scatter, rel=0.15)
-    assert np.std(ratios - of_tilt[:, None, None] * tilt) < 0.2 * scatter
-
-
 def test_a_source_that_nobody_measured_is_off_as_in_the_budget(blob):
     image = synthetic_image(blob.displacement)
     noise_alone = sampled(image, None, None, n=20).errors

@@ -128,8 +128,6 @@ class Budget:
         self._is_shift_assumed = is_shift_assumed
         self._noise, self.options = noise, options
         self.instrument = instrument if plan.measured else instrument.with_registration(0.0)
-        if self._beam.components is not None:
-            self._beam.components.check_shape(prepared.mask.shape)
         self._places = _places(prepared)
         self._moves: dict[LevelSolution, FloatArray] = {}
         self._responses: dict[LevelSolution, Callable[[], LinearResponse]] = {}
@@ -300,8 +298,7 @@ class Budget:
         observed = self.beam_difference
         if (components := self._beam.components) is not None:
             # Where their r.m.s. was measured, a larger difference may be chance.
-            is_measured = components.basis in ("references", "outside")
-            most = _MAX_BEAM_DEVIATIONS if is_measured else 1.0
+            most = _MAX_BEAM_DEVIATIONS if components.basis == "outside" else 1.0
             is_within = observed <= most * self._beam.rms
             return (self._beam.rms, components.basis) if is_within else (observed, "seen")
         if observed > self._beam.rms:

@@ -31,7 +31,6 @@ _BEAM_BASES = {  # name of the part, and its basis in a text
     "reference": ("beam of another exposure, assumed {}", "another exposure, assumed"),
     "stated": ("beam stated, {}", "stated"),
     "seen": ("image and source differ by {}", "seen outside the object"),
-    "references": ("beam by its references, {}", "by its references"),
     "filtered": ("filters, {} taken from the object", "taken from the object"),
     "outside": ("beam measured outside the object, {}", "measured outside the object"),
     "unknown": ("beam, unknown", "unknown"),

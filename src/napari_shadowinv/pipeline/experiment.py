@@ -167,11 +167,6 @@ def _refuse_unsuitable(inputs: ExperimentInputs) -> None:
             "received a noise correlation, but simulated pixels have independent noise: leave it "
             "out"
         )
-    if inputs.beam.components is not None:
-        raise InputError(
-            "received a beam with components of references, which is not simulated: state its "
-            "r.m.s. and its length"
-        )
 
 
 def _plan(inputs: ExperimentInputs, report: Reporter) -> ExperimentPlan:
