@@ -36,7 +36,7 @@ from napari_shadowinv import (
     synthetic_image,
     write,
 )
-from napari_shadowinv._system.safety import LIMIT_VARIABLE, check_regular, resolved_path
+from napari_shadowinv._system.safety import LIMIT_VARIABLE
 from napari_shadowinv.cli._export import _escape_cell
 from napari_shadowinv.film import Calibration, Pack
 from napari_shadowinv.film.scans import usable_pixels
@@ -204,15 +204,6 @@ def test_pipes_and_loops_of_links_are_refused_in_one_sentence(here: Path) -> Non
     refused("fit", "shot.npy", "--fiducials", "pipe.csv", names="pipe.csv is a pipe")
     for arguments in (["loop.npy"], ["shot.npy", "--source", "loop.npy"]):
         assert "Too many levels of symbolic links" in done("invert", *arguments, code=2)
-
-
-def test_name_too_long_or_with_a_null_character_is_refused() -> None:
-    with pytest.raises(FileFormatError, match="cannot be opened") as caught:
-        invert_stack("a" * 300)
-    assert "Errno" not in str(caught.value)
-    for check in (lambda path: check_regular(path, "a file"), resolved_path):
-        with pytest.raises(FileFormatError, match="null character"):
-            check(Path("a\0b.npy"))
 
 
 @pytest.mark.parametrize(

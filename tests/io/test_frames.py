@@ -213,8 +213,6 @@ def test_why_arrays_are_no_images(tmp_path):
 @pytest.mark.parametrize(
     ("path", "words"),
     [
-        ("https://example.org/shot.tif", "https://example.org/shot.tif is a location on"),
-        ("s3://bucket/run.h5::/entry", "is a location on the network"),
         ("::/entry/data", "names an array without its file"),
         ("", "an empty text"),
     ],

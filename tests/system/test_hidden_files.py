@@ -83,10 +83,8 @@ def test_ignored_signal_does_not_stop_writing(tmp_path: Path) -> None:
     assert (tmp_path / "a.tif").read_text() == "half"
 
 
-@pytest.mark.parametrize("name", ["a.tif", "n" * 226 + ".tif"])
-def test_who_writes_a_file_next_removes_what_a_killed_process_left(
-    tmp_path: Path, name: str
-) -> None:
+def test_who_writes_a_file_next_removes_what_a_killed_process_left(tmp_path: Path) -> None:
+    name = "a.tif"
     process = start(WRITE, tmp_path / name)
     with (
         pytest.raises(FileFormatError, match="is being written by another process"),

@@ -20,8 +20,6 @@ from napari_shadowinv.errors import FileFormatError
 if TYPE_CHECKING:
     from filelock import BaseFileLock
 
-MAX_NAME_BYTES = 230  # almost all file systems take 255, with what hidden names add
-
 
 def hidden_name(path: Path, ending: str) -> Path:
     """Return the hidden name of a path with another ending."""

@@ -98,7 +98,7 @@ def as_input_errors(name: str) -> Iterator[None]:
         ) from error
 
 
-def check_regular(path: Path, expected: str, *, longest_shown: int = 300) -> None:
+def check_regular(path: Path, expected: str) -> None:
     """Refuse anything but a regular file before it is opened: a pipe would block for ever."""
     try:
         mode = path.stat().st_mode
@@ -107,30 +107,20 @@ def check_regular(path: Path, expected: str, *, longest_shown: int = 300) -> Non
             f"{path} does not exist: expected {expected}; check the path"
         ) from None
     except OSError as error:
-        text = str(path)
-        shown = text if len(text) <= longest_shown else f"{text[:longest_shown]}…"
         raise FileFormatError(
-            f"{shown} cannot be opened ({error.strerror}): check its permissions and the path"
-        ) from None
-    except ValueError:
-        raise FileFormatError(
-            f"{str(path)!r} has a null character, which no path has: expected {expected}"
+            f"{path} cannot be opened ({error.strerror}): check its permissions and the path"
         ) from None
     if stat.S_ISDIR(mode):
         raise FileFormatError(f"{path} is a folder: expected {expected}")
     if not stat.S_ISREG(mode):
-        kind = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
-        raise FileFormatError(f"{path} is a {kind}: expected {expected}; save it as a file first")
+        raise FileFormatError(
+            f"{path} is a pipe, socket or device: expected {expected}; save it as a file first"
+        )
 
 
 def resolved_path(path: str | Path) -> Path:
     """Return an absolute path without links; one that cannot be followed as far as it can be."""
-    try:
-        return Path(os.path.realpath(path))
-    except ValueError:
-        raise FileFormatError(
-            f"{str(path)!r} has a null character, which no path has: correct it"
-        ) from None
+    return Path(os.path.realpath(path))
 
 
 def size_limit(*, share: float = 1 / 8, memory_if_unknown: int = 8_000_000_000) -> int:

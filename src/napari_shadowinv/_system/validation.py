@@ -93,15 +93,6 @@ class CheckedModel(BaseModel):
             if field.description and field.title is None:
                 field.title = name.replace("_", " ").capitalize()
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        try:
-            super().__setattr__(name, value)
-        except ValidationError as error:
-            raise InputError(
-                f"{type(self).__name__}: '{name}' cannot be changed, make a changed copy with "
-                "model_copy(update=…)"
-            ) from error
-
 
 # Fields that several models have.
 Seed = Annotated[

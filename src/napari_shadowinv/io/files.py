@@ -18,15 +18,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from napari_shadowinv._system.hidden_files import MAX_NAME_BYTES, hidden_name, locked
+from napari_shadowinv._system.hidden_files import hidden_name, locked
 from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.safety import check_regular
 from napari_shadowinv.errors import FileFormatError, InputError
 
 DEFLATE_RATIO = 1040  # the most that zlib can pack into one byte, a little rounded up
 _ADDRESS = "::"  # between a file and the name of an array in it
-# A path joins its slashes; a scheme of one letter is a drive.
-_LOCATION = re.compile(r"(?P<scheme>[A-Za-z][A-Za-z0-9+-]+):/+(?P<place>.+)")
 _LOCAL = re.compile(r"file:/+(?:localhost(?=/))?", re.IGNORECASE)
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -45,11 +43,6 @@ def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, 
         from urllib.request import url2pathname
 
         return split_address(url2pathname("/" + text[local.end() :].lstrip("/")), variable)
-    if location := _LOCATION.match(text):
-        raise InputError(
-            f"{location['scheme']}://{location['place']} is a location on the network: expected a "
-            "file on this machine; download it first"
-        )
     file, separator, name = text.partition(_ADDRESS)
     if not separator:
         return Path(path), variable
@@ -140,12 +133,6 @@ def check_output(
 
 def check_folder_of(path: Path) -> None:
     """Refuse a path whose folder does not exist or is read-only."""
-    length = len(os.fsencode(path.name))
-    if length > MAX_NAME_BYTES:
-        raise FileFormatError(
-            f"{path} cannot be written: its name has {length} bytes, expected at most "
-            f"{MAX_NAME_BYTES}; shorten it"
-        )
     if not path.parent.is_dir():
         raise FileFormatError(
             f"{path} cannot be written: the folder {path.parent} does not exist; create it first"
