@@ -95,11 +95,7 @@ def read_field_grid(path: Path, *, iteration: str | int | None = None) -> FieldG
 def _read_openpmd(path: Path, content: Any, iteration: str | int | None) -> FieldGrid:
     group = _choose_iteration(path, content, iteration)
     meshes = member(path, group, plain_value(content.attrs.get("meshesPath", "fields/")))
-    records = {
-        symbol: record
-        for symbol in ("B", "E")
-        if meshes is not None and (record := member(path, meshes, symbol)) is not None
-    }
+    records = {symbol: meshes[symbol] for symbol in ("B", "E") if symbol in (meshes or ())}
     if not records:
         raise InputError(f"{path} has no mesh E or B: expected fields on a grid")
     fields, geometries = {}, []
@@ -122,13 +118,10 @@ def _choose_iteration(path: Path, content: Any, iteration: str | int | None, mos
     names = [] if parent is None else [name for name in parent if name.isdecimal()]
     if not names:
         raise InputError(f"{path} has no iteration in {base!r}: expected an openPMD file with data")
-    listed = ", ".join(sorted(names, key=int)[:most])
-    if iteration is None and len(names) > 1:
-        more = ", …" if len(names) > most else ""
-        raise InputError(f"{path} has the iterations {listed}{more}: choose one of them")
     number = names[0] if iteration is None else str(iteration)
-    if number not in names:
-        raise InputError(f"{path} has no iteration {number}: expected one of {listed}")
+    if number not in names or (iteration is None and len(names) > 1):
+        listed = ", ".join(sorted(names, key=int)[:most]) + ", …" * (len(names) > most)
+        raise InputError(f"{path} has the iterations {listed}: choose one of them")
     return member(path, parent, number)
 
 
@@ -141,12 +134,6 @@ def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatA
             f"{path} has {symbol} on a {geometry} mesh with the axes "
             f"{', '.join(labels) or 'none'}: expected a cartesian one with x, y and z; resample it"
         )
-    for name in ("gridSpacing", "gridGlobalOffset", "gridUnitSI"):
-        if name not in record.attrs:
-            raise InputError(
-                f"{path} has no {name} for {symbol}: expected a grid with its unit, as openPMD "
-                "requires"
-            )
     # One number before version 2, then one for each axis.
     unit = np.broadcast_to(np.ravel(record.attrs["gridUnitSI"]).astype(float), len(AXES))
     spacing = np.ravel(record.attrs["gridSpacing"]).astype(float) * unit
@@ -158,19 +145,8 @@ def _read_mesh(path: Path, record: Any, symbol: str) -> tuple[FloatArray, FloatA
     order = [labels.index(axis) for axis in AXES]
     parts, places = [], []
     for axis in AXES:
-        item = member(path, record, axis)
-        if item is None:
-            raise InputError(f"{path} has no component {symbol}/{axis}: expected x, y and z")
-        if "unitSI" not in item.attrs:
-            raise InputError(
-                f"{path} has no unitSI for {symbol}/{axis}: expected the unit of the field, as "
-                "openPMD requires"
-            )
+        item = record[axis]
         values = _component(path, item) * float(np.ravel(item.attrs["unitSI"])[0])
-        if values.ndim != len(AXES):
-            raise InputError(
-                f"{path} has {symbol}/{axis} with shape {values.shape}: expected three dimensions"
-            )
         # Six components, twice in double precision.
         check_memory(values.shape, 100, "a field")
         place = np.ravel(item.attrs.get("position", [0.0] * 3)).astype(float)[::step]
