@@ -95,7 +95,8 @@ def read_field_grid(path: Path, *, iteration: str | int | None = None) -> FieldG
 def _read_openpmd(path: Path, content: Any, iteration: str | int | None) -> FieldGrid:
     group = _choose_iteration(path, content, iteration)
     meshes = member(path, group, plain_value(content.attrs.get("meshesPath", "fields/")))
-    records = {symbol: meshes[symbol] for symbol in ("B", "E") if symbol in (meshes or ())}
+    meshes = {} if meshes is None else meshes
+    records = {symbol: meshes[symbol] for symbol in ("B", "E") if symbol in meshes}
     if not records:
         raise InputError(f"{path} has no mesh E or B: expected fields on a grid")
     fields, geometries = {}, []
