@@ -157,7 +157,7 @@ def test_the_mean_of_an_inexact_beam_is_not_known(instrument: dict[str, float]) 
 
 
 def test_errors_have_a_part_for_all_that_is_stated() -> None:
-    instrument = Instrument(beam=BeamPrior(rms=0.02, length=0.5, between=0.01), background=0.02)
+    instrument = Instrument(beam_rms=0.02, beam_length=0.5, beam_between=0.01, background=0.02)
     result = fitted(shots(), instrument, options=HASTY)
     parts = result.errors.shares
     assert parts.keys() - {"edge"} == {"noise", "beam", "background"}

@@ -28,7 +28,7 @@ from napari_shadowinv.inversion.error_budget import ErrorBudget, ErrorEstimate
 from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import prepare
 from napari_shadowinv.inversion.readout import LinearResponse
-from napari_shadowinv.options import ASSUMED_BEAM, BeamPrior
+from napari_shadowinv.options import ASSUMED_BEAM
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.pipeline import run
 from napari_shadowinv.preprocessing import (
@@ -215,8 +215,8 @@ def test_the_solvers_part_is_the_change_by_a_better_solution(each_image):
 def test_the_error_by_an_unmeasured_beam_is_that_by_other_beams(each_image):
     """Beams that are drawn here, in another way, with the same spectrum."""
     options = InversionOptions(n_sites=900)
-    prior = BeamPrior(rms=0.02, length=0.2)
-    unchanged = invert(each_image, options=options, instrument=Instrument(beam=prior))
+    instrument = Instrument(beam_rms=0.02, beam_length=0.2)
+    unchanged = invert(each_image, options=options, instrument=instrument)
     moved = []
     for seed in range(12):
         beam = smooth_beam(each_image.shape, 0.02, seed, length=0.2)

@@ -19,7 +19,7 @@ def test_a_source_of_the_beam_fills_in_the_beam():
     laser = Instrument(beam_source="laser")
     usual = BeamPrior(rms=BEAM_SOURCES["laser"]["beam_rms"], length=0.1, between=0.05)
     assert laser.beam_of(measured=True) == laser.beam_of(measured=False) == usual
-    stated = Instrument(beam_source="laser", beam=BeamPrior(rms=0.01))
+    stated = Instrument(beam_source="laser", beam_rms=0.01)
     assert (stated.beam_rms, stated.beam_length) == (0.01, 0.1)
 
 

@@ -15,14 +15,13 @@ from typing import Any, Literal, Self, get_args
 import numpy as np
 from pydantic import (
     Field,
-    ModelWrapValidatorHandler,
     PrivateAttr,
     ValidationInfo,
     field_validator,
     model_validator,
 )
 
-from napari_shadowinv._system.validation import CheckedModel, CombinationError
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.options.beam_prior import (
     ASSUMED_BEAM,
@@ -62,8 +61,7 @@ class Instrument(CheckedModel, allow_inf_nan=False):
 
     What is not stated has the default of the detector or of the beam source. Without these it
     counts as exact, except for a beam that nobody measured (`ASSUMED_BEAM`) or that was recorded in
-    another exposure (`REFERENCE_BEAM`). The beam may be given as `beam`, a `BeamPrior`, in place of
-    its numbers; only so it has components.
+    another exposure (`REFERENCE_BEAM`).
 
     Raises
     ------
@@ -72,7 +70,7 @@ class Instrument(CheckedModel, allow_inf_nan=False):
 
     Examples
     --------
-    >>> instrument = Instrument(beam=BeamPrior(rms=0.02), background=0.05)
+    >>> instrument = Instrument(beam_rms=0.02, background=0.05)
     >>> instrument.beam_rms, instrument.beam_length
     (0.02, 0.25)
     >>> film = Instrument(detector="film", beam_source="TNSA", background=0.1)
@@ -80,7 +78,6 @@ class Instrument(CheckedModel, allow_inf_nan=False):
     (0.1, 0.03, 0.1)
     """
 
-    # Arrays are no text: a recipe names the files of the references.
     _components: BeamComponents | None = PrivateAttr(default=None)
 
     detector: Detector | None = Field(
@@ -162,23 +159,6 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         "neighbouring pixels, in px; 0 for white noise. Default: measured in the image.",
     )
 
-    @model_validator(mode="wrap")
-    @classmethod
-    def _expand_beam(cls, values: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        if not isinstance(values, dict) or "beam" not in values:
-            return handler(values)
-        numbers = {name: value for name, value in values.items() if name != "beam"}
-        if twice := {f"beam_{name}" for name in BeamPrior.model_fields} & numbers.keys():
-            raise CombinationError(f"received {{beam}} and {{{min(twice)}}}, expected one of them")
-        beam = values["beam"]
-        if not isinstance(beam, BeamPrior | dict):
-            raise ValueError(f"beam is {beam!r}, expected a BeamPrior")
-        stated = beam.model_dump(exclude_unset=True) if isinstance(beam, BeamPrior) else beam
-        instrument = handler(numbers | {f"beam_{name}": value for name, value in stated.items()})
-        if isinstance(beam, BeamPrior):
-            instrument._components = beam.components
-        return instrument
-
     @field_validator("detector", "beam_source", mode="before")
     @classmethod
     def _spell(cls, value: Any, info: ValidationInfo) -> Any:
@@ -221,15 +201,11 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         """Return the instrument for a source in register to within an error, px; 0 if estimated."""
         return self.model_copy(update={"registration": error})
 
-    def with_beam(self, beam: BeamPrior) -> Instrument:
+    def with_beam(self, beam: BeamPrior) -> Self:
         """Return the instrument with another beam, of the same difference between energies."""
-        numbers = {
-            name: value
-            for name, value in self.stated.items()
-            if not name.startswith("beam_") or name == "beam_source"
-        }
-        beam = beam.model_copy(update={"between": self.beam_between})
-        return Instrument(**{**numbers, "beam": beam})
+        changed = self.model_copy(update={"beam_rms": beam.rms, "beam_length": beam.length})
+        changed._components = beam.components
+        return changed
 
     def beam_of(self, *, measured: bool, source: FloatArray | None = None) -> BeamPrior:
         """Return the prior of the beam, assumed unless stated.
