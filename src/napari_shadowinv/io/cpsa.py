@@ -1,7 +1,7 @@
 """Scans of etched CR-39, ``.cpsa``: tracks found frame by frame by a microscope.
 
 - all tracks of a scan: `read_tracks`
-- an image of the tracks within ranges, written as text: `read_image`
+- an image of them: `read_image`
 
 All numbers are little-endian. A header of 48 bytes holds 4 int32, 2 float32, 6 int32: the
 version (negative), the numbers of frames along x and y, a number of bins (unused), the width of
@@ -26,7 +26,6 @@ Lahmann, B. CR39_Reader, https://github.com/PSFC-HEDP/CR39_Reader (``ScanData.ja
 
 from __future__ import annotations
 
-import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -36,13 +35,10 @@ import numpy as np
 from napari_shadowinv._system.safety import as_file_errors, check_regular, check_size
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.cautions import Caution
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.tracks import Tracks
 from napari_shadowinv.io.files import check_promise
 
 _HEADER, _FRAME, _TRACK = struct.Struct("<4i2f6i"), struct.Struct("<10i"), 9
-_RANGES = ("diameter", "contrast", "eccentricity")
-_WORD = re.compile(r"(\w+)\s*=\s*([^\s,]+)[\s,]*")
 
 
 @as_file_errors
@@ -67,51 +63,21 @@ def read_tracks(path: Path) -> Tracks:
     return _read_scan(path)[0]
 
 
-def read_image(path: Path, variable: str | None = None) -> tuple[AnyArray, dict[str, Any]]:
-    """Count the tracks of a scan in bins, uint32, shape (H, W), with its ``geometry``.
-
-    `variable` is the ranges and the bin: ``"diameter=4:12 contrast=:40 bin=300"``.
-    """
-    chosen = {} if variable is None else _parse_ranges(variable)
+def read_image(path: Path) -> tuple[AnyArray, dict[str, Any]]:
+    """Count all tracks of a scan in bins, uint32, shape (H, W), with its ``geometry``."""
     tracks, cautions = _read_scan(path)
-    bin_ = chosen.pop("bin", None)
-    counts, _, bin_ = tracks.select(**chosen).image(bin_)
-    if not chosen:
-        text = (
-            f"all {counts.sum()} tracks are counted, whatever their diameter, contrast and "
-            "eccentricity, and not all need be of the beam: choose ranges as its variable, such "
-            "as 'diameter=4:12 contrast=:40'"
-        )
-        cautions = (*cautions, Caution("tracks", text))
-    metadata: dict[str, Any] = {
+    counts, _, bin_ = tracks.image()
+    text = (
+        f"all {len(tracks)} tracks are counted, whatever their diameter, contrast and "
+        "eccentricity, and not all need be of the beam: choose some in Python, as by "
+        "read_tracks(path).select(diameter=(4, 12)).image(300)"
+    )
+    return counts, {
         "bits": 32,
         "geometry": {"detector_pixel_size": bin_ * 1e-6},
-        "tracks": int(counts.sum()),
-        "notes": (f"{counts.sum()} of {len(tracks)} tracks counted in bins of {bin_:.5g} µm",),
-        "cautions": cautions,
+        "notes": (f"{len(tracks)} tracks counted in bins of {bin_:.5g} µm",),
+        "cautions": (*cautions, Caution("tracks", text)),
     }
-    return counts, metadata if variable is None else {**metadata, "variable": variable}
-
-
-def _parse_ranges(text: str) -> dict[str, Any]:
-    chosen: dict[str, Any] = {}
-    try:
-        if not text.strip() or _WORD.sub("", text).strip():
-            raise ValueError
-        for name, value in _WORD.findall(text):
-            if name in chosen or name not in (*_RANGES, "bin"):
-                raise ValueError
-            if name == "bin":
-                chosen[name] = float(value)
-            else:
-                low, high = value.split(":")
-                chosen[name] = tuple(float(end) if end else None for end in (low, high))
-    except ValueError:
-        raise InputError(
-            f"the tracks to count are {text!r}: expected ranges of diameter (µm), contrast (%) and "
-            "eccentricity (%) and a bin (µm), such as 'diameter=4:12 contrast=:40 bin=300'"
-        ) from None
-    return chosen
 
 
 def _read_scan(path: Path) -> tuple[Tracks, tuple[Caution, ...]]:

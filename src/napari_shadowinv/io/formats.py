@@ -37,7 +37,7 @@ class Format:
     unmarked: Literal["text", "binary", ""] = ""  # its appearance without a mark
     holds: tuple[Literal["image", "result"], ...] = ("image",)
     reader: str = ""  # of a path: image and metadata, which replace those of `read`, or a dataset
-    named_reader: str = ""  # the same, of a path and the name of an array, or the tracks to count
+    named_reader: str = ""  # the same, of a path and the name of an array
     # Of a path, and the name of an array if it is known: the lengths of the axes that count frames.
     # The readers then take the number of a frame, by default that of the first.
     counter: str = ""
@@ -155,7 +155,7 @@ HDF5 = Format(
 )
 CPSA = Format(
     "cpsa", (".cpsa",), "CR-39 .cpsa", unmarked="binary",
-    reader="cpsa:read_image", named_reader="cpsa:read_image",
+    reader="cpsa:read_image",
 )
 # The oldest programs left the marks out.
 SPE = Format(

@@ -62,9 +62,7 @@ def read(
         Channel to take from a colour image whose channels differ.
     variable : str, optional
         Name of the array to take from a MATLAB file that holds several, or from any HDF5 file,
-        with its groups: ``"shots/3/image"``; ``"entry/data/data[3]"`` is one frame of many. For
-        CR-39 the tracks to count: ``"diameter=4:12 contrast=:40 eccentricity=:15 bin=300"``, in µm
-        and %; without a bin about 50 tracks are in each.
+        with its groups: ``"shots/3/image"``; ``"entry/data/data[3]"`` is one frame of many.
 
     Returns
     -------
@@ -109,8 +107,8 @@ def _read_file(
     file_format = format_of(path)
     if variable is not None and not file_format.named_reader:
         raise InputError(
-            f"{path} is neither a MATLAB nor an HDF5 file nor a CR-39 scan (its kind is "
-            f"{file_format.name!r}): variable {variable!r} does not apply; leave it out"
+            f"{path} is neither a MATLAB nor an HDF5 file (its kind is {file_format.name!r}): "
+            f"variable {variable!r} does not apply; leave it out"
         )
     content: xarray.Dataset | tuple[AnyArray, dict[str, Any]] = file_format.read(
         path, variable, number
