@@ -23,11 +23,6 @@ def test_a_source_of_the_beam_fills_in_the_beam():
     assert (stated.beam_rms, stated.beam_length) == (0.01, 0.1)
 
 
-@pytest.mark.parametrize("name", ["image-plate", "Image Plate", "image_plate"])
-def test_names_are_read_in_other_spellings(name):
-    assert Instrument(detector=name).detector == "image plate"
-
-
 def test_an_unknown_detector_is_refused_with_those_known():
     with pytest.raises(InputError, match=r"'paper'.*'film', 'image plate', 'CR-39'.*'camera'"):
         Instrument(detector="paper")

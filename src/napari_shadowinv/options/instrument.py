@@ -10,14 +10,12 @@ inversion and a fit propagate them into the error of the field.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, Self, get_args
+from typing import Any, Literal, Self
 
 import numpy as np
 from pydantic import (
     Field,
     PrivateAttr,
-    ValidationInfo,
-    field_validator,
     model_validator,
 )
 
@@ -159,14 +157,6 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         "neighbouring pixels, in px; 0 for white noise. Default: measured in the image.",
     )
 
-    @field_validator("detector", "beam_source", mode="before")
-    @classmethod
-    def _spell(cls, value: Any, info: ValidationInfo) -> Any:
-        """Find a name in other capitals, or with hyphens for spaces."""
-        names = get_args(Detector if info.field_name == "detector" else BeamSource)
-        spellings = {_simplify(name): name for name in names}
-        return spellings.get(_simplify(value), value) if isinstance(value, str) else value
-
     @model_validator(mode="after")
     def _fill_in(self) -> Self:
         """Take numbers that are not stated from the detector and the source of the beam."""
@@ -219,7 +209,3 @@ class Instrument(CheckedModel, allow_inf_nan=False):
         rms = default if self.beam_rms is None else self.beam_rms
         beam = BeamPrior(rms=rms, length=self.beam_length, between=self.beam_between)
         return beam if self._components is None else beam.with_components(self._components)
-
-
-def _simplify(name: str) -> str:
-    return name.lower().replace("-", " ").replace("_", " ").strip()
