@@ -114,11 +114,11 @@ def test_a_stack_of_any_kind_runs_with_default_options(kind, images, reference, 
 
 
 def test_a_shot_has_the_mask_of_its_own_file_and_that_of_all(images, tmp_path):
-    shots, common = images.copy(), np.random.default_rng(4).random(SHAPE) > 0.02
+    shots, common = images.astype(np.float64), np.random.default_rng(4).random(SHAPE) > 0.02
     tifffile.imwrite(tmp_path / "mask.tif", common.astype(np.uint8))
     for index, path in enumerate(write_files(shots, tmp_path)):
-        shots[index, : index + 1] = -9999  # no light: the file says that it is no value
-        tifffile.imwrite(path, shots[index], extratags=[(42113, "s", 0, "-9999", True)])
+        shots[index, : index + 1] = np.nan
+        tifffile.imwrite(path, shots[index])
     recipe = Recipe(mask=tmp_path / "mask.tif", options=InversionOptions(n_sites=150))
     chosen = RunOptions(variables=("potential", "mask"), dtype="float64")
     out = tmp_path / "a.shadowinv.zarr"
