@@ -3,6 +3,7 @@
 - `open_hdf5`; an item, `member`, or all of a file, `items_of`; its values, `load_dataset`, and an
   attribute, `plain_value`
 - refuse a file whose arrays are elsewhere or too large: `check_arrays`
+- add a checksum, `seal_hdf5`, and compare it, `check_hdf5_seal`
 
 An HDF5 file can point to others: by external links, external storage and virtual arrays. No
 reader takes their values, because the content of another file would pass for the file's own pixels.
@@ -10,9 +11,12 @@ reader takes their values, because the content of another file would pass for th
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import os
 from contextlib import suppress
 from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +25,8 @@ import numpy as np
 from napari_shadowinv._system.safety import check_size
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError
+
+_SEAL = b"\nshadowinv sha256 "
 
 
 def open_hdf5(path: Path) -> Any:
@@ -158,3 +164,26 @@ def check_arrays(path: Path) -> None:
                 _refuse_other_file(path, name, [item])
             if isinstance(item, h5py.Dataset):
                 total = check_array(path, item, before=total)
+
+
+def seal_hdf5(content: BytesIO) -> None:
+    """Add the checksum of all bytes of a file behind its end, where the HDF5 library never looks.
+
+    The checksums of the format leave out texts of variable length, such as attributes, and the
+    library may read damaged ones for ever.
+    """
+    checksum = hashlib.sha256(content.getvalue()).hexdigest()
+    content.seek(0, os.SEEK_END)
+    content.write(_SEAL + checksum.encode())
+
+
+def check_hdf5_seal(path: Path) -> None:
+    """Refuse a file that has changed since `seal_hdf5`; others pass.
+
+    A program that changes the file by the HDF5 library removes the seal.
+    """
+    content, seal, checksum = path.read_bytes().rpartition(_SEAL)
+    if seal and hashlib.sha256(content).hexdigest().encode() != checksum:
+        raise FileFormatError(
+            f"{path} is damaged: its content does not match its checksum; copy it again"
+        )

@@ -31,7 +31,7 @@ from napari_shadowinv.io.formats import (
     suffixes_for,
 )
 from napari_shadowinv.io.frames import FileFrame, find_frames, lazy_frames
-from napari_shadowinv.io.hdf5 import check_arrays
+from napari_shadowinv.io.hdf5 import check_arrays, check_hdf5_seal, seal_hdf5
 from napari_shadowinv.io.images import film_cautions, to_grey
 from napari_shadowinv.io.store import is_stack, read_stack
 from napari_shadowinv.shot import Shot
@@ -226,12 +226,14 @@ def write_result(content: BytesIO, dataset: xarray.Dataset) -> None:
     # From this version of the format on, the file's own structures have checksums.
     with h5netcdf.File(content, "w", libver=("v110", "v110")) as file:
         marked.dump_to_store(H5NetCDFStore(file), encoding=encoding)
+    seal_hdf5(content)
 
 
 def read_result(path: Path) -> xarray.Dataset:
     """Read a dataset that `write_result` wrote, all of it into memory."""
     import xarray as xr
 
+    check_hdf5_seal(path)
     check_arrays(path)
     # Nothing in it is a time, whatever its units look like.
     return xr.load_dataset(path, engine="h5netcdf", decode_times=False)
