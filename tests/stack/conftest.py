@@ -15,7 +15,7 @@ from helpers.night import OPTIONS, grouped, make_shots
 from helpers.store_content import content
 from napari_shadowinv import invert, invert_stack, run_stack
 from napari_shadowinv.inversion import plan_sites
-from napari_shadowinv.stack import _arrivals
+from napari_shadowinv.stack import watch
 
 
 @dataclass(frozen=True)
@@ -113,4 +113,4 @@ def folder(tmp_path: Path, compiled: None) -> Path:
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Look often into watched folders, and end at once when asked to."""
-    monkeypatch.setattr(_arrivals.Arrivals, "poll_s", 0.02)
+    monkeypatch.setattr(watch, "POLL_S", 0.02)

@@ -42,6 +42,7 @@ from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
     FAILED,
+    PENDING,
     STATUS_NAMES,
     StackStore,
     check_store_path,
@@ -76,13 +77,12 @@ class _Printer:
 
     def update(self, status: RunStatus) -> None:
         is_first = self.status is None
-        if not (status.note or status.stage):
+        if not status.stage:
             self.status = status
         if self.show is not None:
             self.show(self._progress(status))
         if status.outcome is not None and status.outcome.reason:
-            name = f"{status.name}{' (again)' * status.again}"
-            say_on_stderr(f"failed: {name}: {status.outcome.reason}", "red")
+            say_on_stderr(f"failed: {status.name}: {status.outcome.reason}", "red")
         elif not self.watched:
             return
         elif status.outcome is not None:
@@ -111,15 +111,13 @@ class _Printer:
         assert status.outcome is not None
         report, level = status.outcome.report, Level(status.outcome.report["level"])
         cautions = list(map(Caution.from_json, report["warnings"]))
-        name = f"{status.name} (again, as the file has changed)" if status.again else status.name
         texts = [report["headline"], f"{status.outcome.seconds:.2f} s"]
         texts += [f"{status.waiting} waiting"] if status.waiting else []
-        texts += [f"{status.skipped} skipped"] if status.skipped else []
         # A verdict that is no success implies its warnings.
         if level.is_success and cautions:
             texts.append(f"{len(cautions)} warning{'s' if len(cautions) > 1 else ''}")
         if not self.quiet:
-            say("  ".join([name, *texts]), "" if level.is_success else "yellow")
+            say("  ".join([status.name, *texts]), "" if level.is_success else "yellow")
         for warning in cautions:
             if warning.code not in self.warned:
                 self.warned.add(warning.code)
@@ -368,7 +366,7 @@ def run_watch(
     quiet: bool,
 ) -> None:
     """Watch a folder; print a line for each shot and a summary."""
-    from napari_shadowinv.stack import FileReader, RunStatus, watch_stack
+    from napari_shadowinv.stack import FileReader, watch_stack
 
     names = "images" if watch.pattern == "*" else watch.pattern
     printer = _Printer(quiet, watched=f"{folder} for {names}")
@@ -382,18 +380,14 @@ def run_watch(
             on_progress=printer.update,
             should_stop=is_interrupted,
         )
-    status = printer.status or RunStatus()
-    if status.done:
-        text = f"Stopped: {status.text}; repeat the command to continue {out}."
-    else:
-        counts = status.text if status.failed else "no shots"
-        text = f"Stopped: {counts}; repeat the command to watch again."
-    if is_interrupted() and status.waiting:
+    if not out.exists():  # no shot could be read
+        say("Stopped: no shots; repeat the command to watch again.")
+        raise typer.Exit(EXIT_FAILED_SHOTS if printer.status and printer.status.waiting else 0)
+    store = StackStore(out)
+    text = f"Stopped: {_counts_text(store)}; repeat the command to go on."
+    if is_interrupted() and np.any(store.statuses() == PENDING):
         say_on_stderr(text)
         raise typer.Exit(cancel_exit_code())
     if not quiet:
         say(text)
-    if status.done:
-        exit_unless_reliable(StackStore(out))
-    elif status.failed or status.waiting:
-        raise typer.Exit(EXIT_FAILED_SHOTS)
+    exit_unless_reliable(store)

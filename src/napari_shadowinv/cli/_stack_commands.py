@@ -31,7 +31,7 @@ HELP = {
     "shots": "A quoted glob, a folder, files, a file of frames, an array of frames in HDF5, or a "
     "table (.csv) with a row per shot.",
     "workers": "Shots at once. Default: one per core.",
-    "latest": "Invert the newest file first, skip older ones.",
+    "latest": "Invert the newest file next.",
     "idle": "Stop after SECONDS without a new file.",
     "variables": "For tiff: variables to export, separated by commas.",
     "variable": "Variable to show; for vectors, the magnitude. Default: the potential.",

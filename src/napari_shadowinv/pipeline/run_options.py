@@ -74,18 +74,12 @@ class WatchOptions(_StoreOptions):
     )
     latest: bool = Field(
         default=False,
-        description="Invert the newest file first and pass over those that came while others "
-        "were inverted. A watch without this choice inverts them later.",
+        description="Invert the newest file next, and older ones when no newer one waits.",
     )
     status_file: Path | None = Field(
         default=None,
-        description="JSON file with the newest shot, its peak and warnings, the numbers of shots "
-        "and the rate, replaced after each shot, for another program to show.",
-    )
-    skip_existing: bool = Field(
-        default=False,
-        title="Skip existing files",
-        description="Skip files that are in the folder at the start.",
+        description="JSON file with the report of the newest shot, the numbers of shots and the "
+        "rate, replaced after each shot, for another program to show.",
     )
     settle: float = Field(
         default=0.5,
@@ -99,10 +93,4 @@ class WatchOptions(_StoreOptions):
         gt=0,
         title="Idle time (s)",
         description="Stop after this many seconds without a new file.",
-    )
-    max_shots: int | None = Field(
-        default=None,
-        ge=1,
-        title="Maximum number of shots",
-        description="Stop after N shots, done or failed.",
     )

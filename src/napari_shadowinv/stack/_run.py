@@ -62,7 +62,6 @@ from napari_shadowinv.stack._worker import AnyTask, ShotOutcome, TaskContext
 if TYPE_CHECKING:
     import xarray
 
-WATCHING = "watching"  # in place of the scheduler's name
 _ALTERNATIVES = "use the same, overwrite the store, or choose another name"
 
 
@@ -74,15 +73,13 @@ class RunStatus:
     done: int = 0
     failed: int = 0
     doubtful: int = 0  # done, with cautions
-    skipped: int = 0  # files that came while newer ones were inverted, and are in no store
-    waiting: int = 0  # shots that have not ended; of a watched folder, files that have arrived
+    waiting: int = 0  # shots that have not ended
     ended: int = 0  # shots, in this run
     seconds: float = 0.0  # of this run; of a watched folder, while shots were inverted
     scheduler: str = ""  # its name
     stage: str = ""  # of the preparation, before all shots
     name: str = ""  # of the shot that has just ended, if any
     outcome: ShotOutcome | None = None  # of this shot
-    again: bool = False  # whether it was inverted before, and its file has changed since
     failures: tuple[tuple[str, str], ...] = ()  # names of the failed shots, with the reasons
     note: str = ""  # a sentence for the user
 
@@ -99,13 +96,10 @@ class RunStatus:
     @property
     def text(self) -> str:
         """The numbers of shots."""
-        is_watch = self.scheduler == WATCHING
         numbers = [
-            f"{self.done} done" if is_watch else f"{self.done} of {self.total} done",
+            f"{self.done} of {self.total} done",
             f"{self.failed} failed" if self.failed else "",
             f"{self.doubtful} with warnings" if self.doubtful else "",
-            f"{self.skipped} skipped" if self.skipped else "",
-            f"{self.waiting} waiting" if is_watch and self.waiting else "",
         ]
         return ", ".join(filter(None, numbers))
 
@@ -248,10 +242,6 @@ class StoreRun:
         self._doubtful: set[int] = set()
         self._ended = 0
         self._seconds = 0.0
-        self.refresh(store, again)
-
-    def refresh(self, store: StackStore, again: Collection[int] = ()) -> None:
-        """Note the status of each shot in the store."""
         self.statuses = bytearray(len(self.names))
         for index, (status, report) in enumerate(
             zip(store.statuses(), store.reports(), strict=True)
@@ -290,16 +280,6 @@ class StoreRun:
     def report(self, index: int) -> dict[str, Any]:
         """Return the report of a shot that has ended."""
         return dict(json.loads(str(self.writer.arrays()["report"][index]) or "{}"))
-
-    def status_of(self, name: str) -> int | None:
-        """Return the status of a shot by its name; None if it is not there."""
-        return self.statuses[self.numbers[name]] if name in self.numbers else None
-
-    def names_of(self, status: int) -> Iterator[str]:
-        """Return the names of the shots of a status."""
-        return (
-            name for name, each in zip(self.names, self.statuses, strict=True) if each == status
-        )
 
     def append(self, shots: Mapping[str, AnyArray], **attributes: str) -> None:
         """Append pending shots, described by their coordinates in a store."""

@@ -285,7 +285,7 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
         put(index)
         wait(lambda: shown(index + 1))  # noqa: B023
     field = layer_of(window, "field")
-    wait(lambda: "Waiting for shots: 2 done" in status.text())
+    wait(lambda: "Waiting for shots: 2 of 2 done" in status.text())
     assert window.dims.current_step[0] == 1
     limits = field.contrast_limits[1]
     assert limits == pytest.approx(float(np.asarray(field.data[1]).max()))
@@ -299,10 +299,10 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     assert np.isfinite(np.asarray(field.data[3])).all()
     assert list(texts_of(tool.stack_view.failures)) == ["shot_2.npy"]
     assert metadata_of(field)["shots"] == [f"shot_{index}.npy" for index in range(4)]
-    wait(lambda: "3 done, 1 failed" in status.text())
+    wait(lambda: "3 of 4 done, 1 failed" in status.text())
     tool.panel.button.click()
     rest(tool)
-    assert status.text() == f"3 done, 1 failed, in {out.name}"
+    assert status.text() == f"3 of 4 done, 1 failed, in {out.name}"
     assert messages == []
     # Run again: it goes on in the same layers.
     tool.panel.button.click()
