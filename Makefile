@@ -20,7 +20,7 @@ CORE_PYTHON ?= $(BIN)/python
 CORE_TOOLS := "pytest>=8.2" "pytest-xdist>=3.6" "hypothesis>=6.100" "shapely>=2.0" "pyamg>=5.1" \
 	"pyyaml>=6.0" "pooch>=1.8"
 CORE_TESTS := tests/geometry tests/transport tests/fitting tests/physics tests/io tests/inversion tests/preprocessing \
-	tests/cli/test_shot_commands.py tests/plotting tests/stack/test_lazy.py tests/stack/test_run.py \
+	tests/cli/test_shot_commands.py tests/plotting tests/stack/test_sites.py tests/stack/test_run.py \
 	tests/cli/test_mistakes.py tests/stack/test_alone.py tests/test_faces.py
 
 # Two tests run at a time: threads of linear algebra beside them would wait for each other.

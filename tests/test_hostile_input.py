@@ -28,7 +28,6 @@ from napari_shadowinv import (
     Recipe,
     fit,
     invert,
-    invert_stack,
     poisson_invert,
     read,
     run,
@@ -118,7 +117,7 @@ def test_model_inside_another_is_named_with_its_place() -> None:
         (lambda: invert(SHOT, plan="x"), "plan is 'x', expected SitePlan"),
         (lambda: plan_sites(SHOT, options=5), "options is 5"),
         (lambda: run("x", SHOT), "recipe is 'x', expected Recipe"),
-        (lambda: invert_stack([SHOT], "x"), "recipe is 'x'"),
+        (lambda: run_stack([SHOT], "a.shadowinv.zarr", "x"), "recipe is 'x'"),
         (
             lambda: run_stack([SHOT], "a.shadowinv.zarr", run=[1]),
             r"run is \[1\], expected RunOptions",
@@ -172,7 +171,7 @@ def test_limit_of_memory_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(InputError, match=r"expected at most 1e-05 GB: .*SHADOWINV_MAX_GB"):
         invert(SHOT)
     with pytest.raises(InputError, match=r"an inversion of .* pixels needs about"):
-        invert_stack(SHOT[None])
+        run_stack(SHOT[None], "a.shadowinv.zarr")
 
 
 # Files

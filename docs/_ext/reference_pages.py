@@ -38,7 +38,7 @@ TASKS: dict[str, tuple[str, ...]] = {
     ),
     "Measure currents, profiles and maps of a result": ("analyse",),
     "Fit one or several images, also where rays cross": ("fit", "FitOptions", "Fit"),
-    "Invert many shots": ("run_stack", "invert_stack"),
+    "Invert many shots": ("run_stack",),
     "Predict an image, or compare with linear theory": (
         "synthetic_image",
         "predict_image",

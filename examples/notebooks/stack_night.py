@@ -1,10 +1,10 @@
-"""A night of shots: lazily, safely, and across the shots."""
+"""A night of shots: a first look, all of them, and across the shots."""
 
 # %% [markdown]
 # # A night of shots
 #
 # A burner's plume wanders in front of a camera: sixteen shots and one reference beam. They are
-# inverted with dask, first lazily, then into a store that survives a crash. Open this file as a
+# inverted with dask into a store that survives a crash. Open this file as a
 # notebook (Jupyter, VS Code and others read `# %%`), or run it: it writes into the folder `night`.
 
 # %%
@@ -20,8 +20,8 @@ from napari_shadowinv import (
     OpticalSetup,
     Recipe,
     Shot,
-    invert_stack,
     read,
+    run,
     run_stack,
     synthetic_image,
 )
@@ -62,20 +62,18 @@ port = client.scheduler_info()["services"]["dashboard"]
 print(f"Dashboard: http://127.0.0.1:{port}/status")
 
 # %% [markdown]
-# ## A first look, lazily
+# ## A first look
 #
-# Nothing is read or computed until a value is needed; then only the shots that matter are.
+# One shot alone, by the recipe that all of them will have.
 
 # %%
 setup = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=20e-6)
-good = sorted(path for path in night.glob("shot_*.tif") if path.stat().st_size)
 recipe = Recipe(options=InversionOptions(n_sites=2000), setup=setup)
-stack = invert_stack(Shot(good, source=night / "reference.tif"), recipe)
-one = stack.potential.isel(shot=2).compute()
-print(f"{stack.sizes['shot']} shots; the third has a peak of {float(one.max()):.1f} px²")
+one = run(recipe, Shot(night / "shot_2.tif", source=night / "reference.tif"))
+print(one.headline)
 
 # %% [markdown]
-# ## All of it, safely
+# ## All of them, safely
 #
 # `run_stack` writes shot by shot. Interrupt it, kill it, pull the plug: run it again and it goes
 # on. The shot that was lost fails alone, and says why.

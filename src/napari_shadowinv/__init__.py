@@ -8,7 +8,7 @@
   `Fit` with a verdict
 - deflections in SI units: `ProtonSetup`, `OpticalSetup`
 - all steps from an image to its field, as one model: `Recipe`; apply it: `run`; to many shots, with
-  dask: `run_stack`, `invert_stack`
+  dask: `run_stack`
 - repeat a result from its provenance: `rerun`
 - predict an image: `synthetic_image`; in another experiment: `predict_image`; invert it linearly:
   `poisson_invert`; trace particles through a 3-D field: `trace`

@@ -16,7 +16,7 @@ from .physics import (
 from .pipeline import plan_experiment, rerun, run
 from .preprocessing import Recipe
 from .shot import Shot
-from .stack import invert_stack, run_stack
+from .stack import run_stack
 
 __version__: str
 
@@ -37,7 +37,6 @@ __all__ = [
     "analyse",
     "fit",
     "invert",
-    "invert_stack",
     "plan_experiment",
     "poisson_invert",
     "predict_image",

@@ -27,7 +27,7 @@ def make_shots(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def grouped(
-    images: Any, choices: dict[str, Any], model: type[BaseModel] | None = RunOptions
+    images: Any, choices: dict[str, Any], model: type[BaseModel] = RunOptions
 ) -> tuple[Shot, dict[str, Any]]:
     """Group choices: shots with their source and masks, and arguments of `run_stack` and others."""
     fields = {name: name for name in ("options", "setup", "instrument")} | {"filters": "steps"}
@@ -37,10 +37,8 @@ def grouped(
     filled = {name: value for name, value in parts.items() if value is not None}
     of_all = ("source", "mask", "source_mask")
     shots = Shot(images, **{k: choices[k] for k in of_all if k in choices and k not in fields})
-    names = set() if model is None else set(model.model_fields)
+    names = set(model.model_fields)
     callbacks = {k: v for k, v in choices.items() if k not in {*names, *fields, *of_all}}
-    arguments = {"recipe": Recipe(**filled), **callbacks}
-    if model is not None:
-        options = model(**{name: choices[name] for name in names & choices.keys()})
-        arguments["run" if model is RunOptions else "watch"] = options
-    return shots, arguments
+    options = model(**{name: choices[name] for name in names & choices.keys()})
+    argument = "run" if model is RunOptions else "watch"
+    return shots, {"recipe": Recipe(**filled), **callbacks, argument: options}

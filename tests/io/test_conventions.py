@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from napari_shadowinv import FileFormatError, InversionOptions, Recipe, invert_stack, read
+from helpers.stacks import inverted_stack
+from napari_shadowinv import FileFormatError, InversionOptions, Recipe, read
 from napari_shadowinv.io import read_shot
 
 COUNTS = np.arange(15, dtype=np.int16).reshape(3, 5)
@@ -96,6 +97,6 @@ def test_a_stack_leaves_out_the_pixels_of_the_file(tmp_path: Path, as_dataset: b
     with h5py.File(path, "w") as content:
         nexus(content, frames)["pixel_mask"] = (~usable).astype(np.uint32)
     shots = read(path) if as_dataset else path
-    results = invert_stack(shots, Recipe(options=InversionOptions(n_sites=100))).compute()
+    results = inverted_stack(shots, tmp_path, Recipe(options=InversionOptions(n_sites=100)))
     np.testing.assert_array_equal(results["mask"], [usable, usable])
     assert float(np.abs(results["displacement"]).max()) < 0.5

@@ -5,8 +5,9 @@ import pint
 import pytest
 from napari.components import ViewerModel
 
+from helpers.stacks import inverted_stack
 from napari import __version__ as napari_version
-from napari_shadowinv import Recipe, invert_stack, read, write
+from napari_shadowinv import Recipe, read, write
 from napari_shadowinv.physics.setup import OpticalSetup
 
 PIXEL_M = 2e-6
@@ -28,7 +29,7 @@ def test_field_in_metres_lies_over_a_layer_of_its_pixels(origin, inversion, tmp_
         write(path, dataset)
         dataset = read(path)
     if origin == "stack":
-        dataset = invert_stack(inversion.image[np.newaxis], Recipe(setup=SETUP)).isel(shot=0)
+        dataset = inverted_stack(inversion.image[None], tmp_path, Recipe(setup=SETUP)).isel(shot=0)
     viewer = ViewerModel()
     size_um = PIXEL_M * 1e6
     image = viewer.add_image(inversion.image, scale=(size_um, size_um), units=("um", "um"))

@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from helpers.stacks import inverted_stack
 from napari_shadowinv import (
     InputError,
     Instrument,
     InversionOptions,
     OpticalSetup,
     invert,
-    invert_stack,
 )
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
@@ -351,8 +351,8 @@ def test_a_source_beside_the_shot_in_its_file_is_found(tmp_path: Path, image: Fl
     recipe = Recipe(source=MeasuredSource(variable="beam"), options=OPTIONS)
     assert_same(run(recipe, shot), invert(image, source=beam, options=OPTIONS))
     with pytest.raises(InputError, match="but names no file"):
-        invert_stack(np.stack([image, image]), recipe)
-    stack = invert_stack(Shot(np.stack([image, image]), source=beam), recipe)
+        inverted_stack(np.stack([image, image]), tmp_path, recipe)
+    stack = inverted_stack(Shot(np.stack([image, image]), source=beam), tmp_path, recipe)
     np.testing.assert_array_equal(stack.displacement[1], run(recipe, shot).displacement)
 
 

@@ -13,7 +13,7 @@ import pytest
 from helpers.forked import forking
 from helpers.night import OPTIONS, grouped, make_shots
 from helpers.store_content import content
-from napari_shadowinv import invert, invert_stack, run_stack
+from napari_shadowinv import invert, run_stack
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.stack import watch
 
@@ -35,12 +35,6 @@ class Night:
         choices = {"shots": self.glob, "source": self.source, "options": OPTIONS, **changes}
         shots, arguments = grouped(choices.pop("shots"), choices)
         return run_stack(shots, out, **arguments)
-
-    def lazy(self, **changes):
-        """Describe the inversion of its images; choices of `invert_stack` may differ."""
-        choices = {"shots": self.images, "source": self.source, "options": OPTIONS, **changes}
-        shots, arguments = grouped(choices.pop("shots"), choices, None)
-        return invert_stack(shots, **arguments)
 
     def path(self, index: int) -> Path:
         return self.folder / f"shot_{index}.npy"

@@ -19,7 +19,7 @@ from distributed import Client, LocalCluster
 from helpers.forked import run_files, serve
 from helpers.slow_reading import die, hang_once
 from helpers.store_content import content, whole_content
-from napari_shadowinv import FileFormatError, InversionOptions, Recipe, Shot, invert_stack, read
+from napari_shadowinv import FileFormatError, InversionOptions, read
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv.errors import RunInterruptedError
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore
@@ -144,40 +144,6 @@ def test_a_dask_array_on_the_cluster_is_inverted_there(night, out, expected, clu
         shots = client.persist(da.from_array(night.images, chunks=(2, 24, 28)))
         night.run(out, shots=shots)  # dask's current client
     assert content(out) == expected
-
-
-def count_plans() -> None:
-    """Make this process count the plans that it makes."""
-    from napari_shadowinv.stack import _worker
-
-    original = _worker.plan_sites
-
-    def plan_sites(source, options, **more):
-        plan_sites.made += 1
-        return original(source, options, **more)
-
-    plan_sites.made = 0
-    _worker._entries.clear()
-    _worker.plan_sites = plan_sites
-
-
-def plans_made() -> int:
-    from napari_shadowinv.stack import _worker
-
-    return _worker.plan_sites.made
-
-
-def test_lazy_stack_plans_sites_once_in_each_worker(make_night, cluster):
-    night = make_night(12)
-    stack = invert_stack(Shot(night.images, source=night.source), Recipe(options=OPTIONS))
-    expected = stack.potential.compute(scheduler="synchronous")
-    with Client(cluster, set_as_default=False) as client:
-        client.run(count_plans)
-        potential = client.compute(stack.potential).result(timeout=PATIENCE)
-        plans = client.run(plans_made)
-    np.testing.assert_array_equal(potential, expected)
-    assert 1 <= sum(plans.values()) <= 2
-    assert max(plans.values()) == 1
 
 
 def test_shots_on_a_cluster_share_the_cores_of_its_machine(cluster):

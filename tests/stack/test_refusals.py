@@ -17,9 +17,8 @@ from napari_shadowinv import (
     Instrument,
     InversionOptions,
     Shot,
-    invert_stack,
+    run_stack,
 )
-from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.preprocessing import (
     HighPassFilter,
@@ -28,7 +27,6 @@ from napari_shadowinv.preprocessing import (
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
-    Recipe,
     UniformEstimate,
 )
 from napari_shadowinv.stack import FileReader
@@ -76,15 +74,12 @@ OF_STORES: dict[str, tuple[dict[str, Any], str]] = {
 @pytest.mark.parametrize("name", [*NONSENSE, *OF_STORES])
 def test_nonsense_is_refused_before_anything_is_computed(any_night, out, name):
     changes, words = {**NONSENSE, **OF_STORES}[name]
-    if name in NONSENSE:
-        with pytest.raises(InputError, match=words):
-            any_night.lazy(**changes)
     with pytest.raises(InputError, match=words):
         any_night.run(out, **{"shots": any_night.images, **changes})
     assert not out.exists()
 
 
-def test_a_lazy_stack_refuses_shots_that_it_cannot_invert(any_night, tmp_path):
+def test_shots_that_cannot_be_inverted_are_refused(any_night, tmp_path, out):
     (tmp_path / "a.tif").write_bytes(b"")
     (tmp_path / "empty").mkdir()
     for shots, words in (
@@ -94,9 +89,7 @@ def test_a_lazy_stack_refuses_shots_that_it_cannot_invert(any_night, tmp_path):
         (str(tmp_path / "*.tif"), "none of 1 shots can be read"),
     ):
         with pytest.raises((InputError, FileFormatError), match=words):
-            invert_stack(shots)
-    with pytest.raises(InputError, match="invert_stack inverts: use run_stack"):
-        invert_stack(any_night.images, Recipe(fit=FitChoices()))
+            run_stack(shots, out)
 
 
 # How a store was begun, what differs now, and words of the sentence.

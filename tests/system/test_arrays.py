@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 
+from helpers.stacks import inverted_stack
 from napari_shadowinv import (
     FitOptions,
     InputError,
@@ -17,7 +20,6 @@ from napari_shadowinv import (
     ProtonSetup,
     Recipe,
     invert,
-    invert_stack,
     poisson_invert,
     predict_image,
     run,
@@ -54,11 +56,7 @@ def displaced(result: Any) -> Any:
 INVERT: dict[str, Callable[..., Any]] = {
     "invert": lambda image, mask=None: invert(image, mask=mask, options=OPTIONS),
     "run": lambda image, mask=None: run(Recipe(options=OPTIONS), Shot(image, mask=mask)),
-    "invert_stack": lambda image, mask=None: (
-        invert_stack(Shot(_stack_of(image), mask=mask), Recipe(options=OPTIONS))
-        .isel(shot=1)
-        .compute()
-    ),
+    "run_stack": lambda image, mask=None: _stored(Shot(_stack_of(image), mask=mask)).isel(shot=1),
     "fit": lambda image, mask=None: _measured(image, mask),
     "fit a list": lambda image, mask=None: _measured([image], mask),
     "run_fit": lambda image, mask=None: _seen(
@@ -76,6 +74,11 @@ def _seen(shots: Sequence[Shot]) -> np.ndarray[Any, Any]:
     """Images and weights that a fit sees."""
     scene = collect_data(shots, options=FitOptions()).scene
     return np.stack([scene.images, scene.weights])
+
+
+def _stored(shots: Any, recipe: Recipe | None = None) -> Any:
+    with TemporaryDirectory() as folder:
+        return inverted_stack(shots, Path(folder), recipe or Recipe(options=OPTIONS)).load()
 
 
 def _stack_of(image: Any) -> Any:
@@ -188,12 +191,12 @@ def test_coordinates_must_agree_with_the_setup(
     stack = xr.concat([image, image], "shot")
     if passes:
         assert run(recipe, image).setup == SETUP
-        assert invert_stack(stack, recipe).sizes["shot"] == 2
+        assert _stored(stack, recipe).sizes["shot"] == 2
         return
     with pytest.raises(InputError, match=r"pixels of .* m"):
         run(recipe, image)
     with pytest.raises(InputError, match=r"pixels of .* m"):
-        invert_stack(stack, recipe)
+        _stored(stack, recipe)
 
 
 def test_uneven_coordinates_are_refused() -> None:

@@ -33,11 +33,10 @@ def stack_frames(
 ) -> Iterator[NDArray[np.uint8]]:
     """Yield one variable of every shot as a picture, (rows, columns, 3), all on one colour scale.
 
-    The stack is that of `napari_shadowinv.invert_stack` or of a store; the variable, by default the
-    potential, has an image for each shot, or vectors, whose magnitude is shown. The limits of the
-    scale are in the variable's own units; by default the smallest and largest value of all shots,
-    but for a few shots that stick out. Rows and columns are even numbers. An `InputError` if there
-    is no such variable.
+    The stack is that of a store; the variable, by default the potential, has an image for each
+    shot, or vectors, whose magnitude is shown. The limits of the scale are in the variable's own
+    units; by default the smallest and largest value of all shots, but for a few shots that stick
+    out. Rows and columns are even numbers. An `InputError` if there is no such variable.
     """
     setup = setup_from_dataset(stack)
     if variable is None:

@@ -1,13 +1,11 @@
-"""Many shots: lazily with dask, or into one store that survives a crash.
+"""Many shots with dask, into one store that survives a crash.
 
-- describe the inversion of many shots for dask: `invert_stack`
 - invert or fit shots one by one into ``name.shadowinv.zarr``, and resume after a crash: `run_stack`
 - watch a folder and invert each shot as soon as it arrives: `watch_stack`
 - read one channel of colour images: `FileReader`
 - what a run reports: `RunStatus`
 """
 
-from napari_shadowinv.stack._lazy import invert_stack
 from napari_shadowinv.stack._plan import STORED
 from napari_shadowinv.stack._run import RunStatus, run_stack
 from napari_shadowinv.stack._shots import FileReader
@@ -19,7 +17,6 @@ __all__ = [
     "FileReader",
     "RunStatus",
     "ShotOutcome",
-    "invert_stack",
     "run_stack",
     "watch_stack",
 ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from napari_shadowinv._system.arrays import (
     unpack_array,
 )
 from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._system.validation import map_paths
+from napari_shadowinv._system.validation import check_instance, map_paths
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
@@ -28,6 +28,7 @@ from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.inversion_run import Inputs, collect_inputs
+from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
 from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, UniformEstimate
 from napari_shadowinv.provenance import index_masks
@@ -64,8 +65,8 @@ class Stack:
 
     shots: Shots
     task: AnyTask
-    reader: str = ""  # name of the reader of the files
-    dtype: str = "float64"  # of fields in a store
+    reader: str  # name of the reader of the files
+    dtype: str  # of fields in the store
 
     @cached_property
     def sizes(self) -> dict[str, int]:
@@ -75,16 +76,6 @@ class Stack:
             sizes |= zip(dims[-2:], self.task.inputs.shot.shape, strict=True)
         options = self.task.recipe.options
         return sizes if options.n_sites is None else {**sizes, "site": options.n_sites}
-
-    @property
-    def setups(self) -> list[str] | None:
-        """The setup of each shot after the steps, as JSON; None unless they have their own."""
-        if not self.task.by_row or self.task.setup is None:
-            return None
-        bare = Shot(self.task.inputs.shot.image)
-        recorded = (replace(bare, setup=_row_of(shot).setup) for shot in self.shots.items)
-        moved = (self.task.recipe.move(shot).setup for shot in recorded)
-        return ["" if setup is None else setup.model_dump_json() for setup in moved]
 
     def source_text(self, shots: int | None) -> str:
         """Describe the source of the first shots."""
@@ -117,9 +108,10 @@ def _row_of(shot: Exposure) -> RowsExposure:
 
 
 def describe_stack(
-    shots: Any, recipe: Recipe | None, reader: Reader, variables: Collection[str] | None
+    shots: Any, recipe: Recipe | None, reader: Reader, options: RunOptions | WatchOptions
 ) -> Stack:
     """Describe a stack, and check everything that can be checked before a shot is read."""
+    check_instance(recipe, Recipe, "recipe")
     common = shots if isinstance(shots, Shot) else Shot(shots)
     of_one = ("dark", "strength", "brightness", "psf", "noise", "fiducials", "start")
     if needless := [name for name in of_one if getattr(common, name) is not None]:
@@ -153,14 +145,14 @@ def describe_stack(
         stack_shots = replace(stack_shots, items=items)
     task: AnyTask
     if resolved.fit is None:
-        task = _plan_inversion(stack_shots, inputs, resolved, variables)
+        task = _plan_inversion(stack_shots, inputs, resolved, options.variables or STORED)
     else:
-        task = _plan_fit(inputs, resolved, variables)
-    return Stack(stack_shots, task, files.name)
+        task = _plan_fit(inputs, resolved, options.variables or ())
+    return Stack(stack_shots, task, files.name, options.dtype)
 
 
 def _plan_inversion(
-    shots: Shots, inputs: Inputs, recipe: Recipe, variables: Collection[str] | None
+    shots: Shots, inputs: Inputs, recipe: Recipe, variables: Collection[str]
 ) -> InvertTask:
     if inputs.shot.source is not None:
         ready = inputs.recipe.prepare(replace(inputs.shot, image=inputs.shot.source))
@@ -168,14 +160,16 @@ def _plan_inversion(
         check_source(ready.source, ready.mask)
     rows = [row for shot in shots.items for row in shot.rows]
     own_masks = any(row.mask is not None for row in rows)
-    chosen = _checked_variables(variables, inputs.recipe, own_masks=own_masks)
+    _check_variables(variables, inputs.recipe, own_masks=own_masks)
     if rows:  # each shot has the common masks, too
         unmasked = index_masks(inputs.provenance.images, [(None, None)])
         inputs = replace(inputs, provenance=inputs.provenance.model_copy(update=unmasked))
-    return InvertTask(inputs=inputs, variables=chosen, requested=recipe, by_row=bool(rows))
+    return InvertTask(
+        inputs=inputs, variables=tuple(variables), requested=recipe, by_row=bool(rows)
+    )
 
 
-def _plan_fit(inputs: Inputs, recipe: Recipe, variables: Collection[str] | None) -> FitTask:
+def _plan_fit(inputs: Inputs, recipe: Recipe, variables: Collection[str]) -> FitTask:
     check_fit(recipe)
     task = FitTask(inputs=inputs, variables=(), requested=recipe)
     fields = task.choices.fields
@@ -187,7 +181,7 @@ def _plan_fit(inputs: Inputs, recipe: Recipe, variables: Collection[str] | None)
     labels = task.labels
     if task.choices.options.samples < 2:
         labels.pop("displacement_uncertainty")
-    for name in variables or ():
+    for name in variables:
         if name not in labels:
             raise InputError(
                 f"there is no variable {name!r} of a fit: expected one or more of "
@@ -279,15 +273,13 @@ def _describe_table(
     return Shots(items, shape or usual_shape(items)), _row_of(items[0]).setup
 
 
-def _checked_variables(
-    names: Collection[str] | None, recipe: Recipe, *, own_masks: bool
-) -> tuple[str, ...]:
-    """Return the variables of a stack; shots may differ in their number of sites."""
+def _check_variables(names: Collection[str], recipe: Recipe, *, own_masks: bool) -> None:
+    """Refuse variables that no stack has; shots may differ in their number of sites."""
     labels, options = variable_labels(recipe.setup), recipe.options
     # The number depends on the masked area, or on the flux of the source in the margin.
     ragged = own_masks or options.n_sites is None or options.boundary == "free"
     available = tuple(name for name, (dims, _) in labels.items() if not (ragged and "site" in dims))
-    for name in names or ():
+    for name in names:
         if name in available:
             continue
         hint = " (it needs a setup)" if recipe.setup is None else ""
@@ -299,7 +291,6 @@ def _checked_variables(
         raise InputError(
             f"there is no variable {name!r}{hint}: expected one or more of {', '.join(available)}"
         )
-    return available if names is None else tuple(names)
 
 
 def coordinates_of(stack: Stack) -> dict[str, Any]:
@@ -314,21 +305,21 @@ def coordinates_of(stack: Stack) -> dict[str, Any]:
     return coords
 
 
-def describe_results(stack: Stack, values: Callable[[str, tuple[int, ...]], Any]) -> xarray.Dataset:
-    """Return the dataset of a stack; `values` makes a variable from its name and shape."""
+def empty_results(stack: Stack) -> xarray.Dataset:
+    """Return the dataset of a stack as its store has it, without a shot."""
     import xarray as xr
 
+    stack = replace(stack, shots=stack.shots.reordered([]))
     variables = {}
     for name, (of_one, labels) in stack.task.labels.items():
         if name in stack.task.variables:
             dims = ("shot", *of_one)
-            shape = tuple(stack.sizes[dim] for dim in dims)
-            variables[name] = dims, values(name, shape), labels
+            fields = np.float64 if "site" in of_one else stack.dtype
+            dtype = bool if name in ("caustic", "mask") else fields
+            variables[name] = dims, np.empty([stack.sizes[dim] for dim in dims], dtype), labels
+    for name, (dims, pixels, labels) in stack.task.masks.items():
+        none = np.empty([stack.sizes[dim] for dim in dims], bool)
+        variables[name] = dims, none if pixels is None else pixels, labels
     attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.task.setup).attrs
     attributes = {"format": FORMAT, **attributes, **stack.task.attributes}
     return xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes)
-
-
-def dtype_of(name: str) -> Any:
-    """Return the type of a variable in an inversion."""
-    return np.dtype(bool) if name in ("caustic", "mask") else np.dtype(np.float64)

@@ -24,7 +24,7 @@ from napari_shadowinv._system.arrays import checksum
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
-from napari_shadowinv._system.validation import as_model, check_instance
+from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.errors import InputError, RunInterruptedError
 from napari_shadowinv.inversion.compilation import ensure_compiled
@@ -47,14 +47,7 @@ from napari_shadowinv.io.store_writing import (
 )
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack._plan import (
-    STORED,
-    Stack,
-    coordinates_of,
-    describe_results,
-    describe_stack,
-    dtype_of,
-)
+from napari_shadowinv.stack._plan import Stack, coordinates_of, describe_stack, empty_results
 from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import FILES, Exposure, Reader, differences
 from napari_shadowinv.stack._worker import AnyTask, ShotOutcome, TaskContext
@@ -127,11 +120,23 @@ def run_stack(
 
     Parameters
     ----------
-    shots, recipe, reader
-        As for `invert_stack`. To resume a store, they and earlier shots must be the same. In
-        a table of shots to fit, rows with the same ``shot`` are images of one object.
+    shots : array (shot, y, x), xarray.DataArray or Dataset, path or paths, or Shot
+        A dask or numpy array; an xarray object with one such variable; paths of one image each;
+        a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; a TIFF with a page for
+        each shot; or a table (CSV) with a row for each shot, which may have its own energy, setup,
+        brightness, mask and source. In a table of shots to fit, rows with the same ``shot`` are
+        images of one object. A `Shot` with one of these as its image has the setup, the mask and
+        the source mask of all shots, and their source: one for all, or as many as shots. To resume
+        a store, earlier shots must be the same, and so must recipe and reader.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
+    recipe : Recipe, optional
+        Steps of each shot and of a measured source, setup and options. Without a source,
+        intensities in the result are relative to each shot's mean. Without `threads` in the
+        options, shots that are inverted simultaneously share the cores.
+    reader : callable, optional
+        Returns the image of a path. Default: files are read by their format;
+        `napari_shadowinv.stack.FileReader` with ``channel="red"`` reads one of their colours.
     run : RunOptions, optional
         Choices of the run: stored variables and their type, workers, whether to overwrite the
         store or to repeat failed shots. A mapping is converted.
@@ -164,9 +169,7 @@ def run_stack(
     """
     path = check_store_path(out)
     run = as_model(RunOptions, run, "run")
-    variables = stored_variables(run.variables, recipe)
-    stack = describe_stack(shots, recipe, reader, variables)
-    stack = replace(stack, dtype=run.dtype)
+    stack = describe_stack(shots, recipe, reader, run)
     again = [FAILED] if run.redo_failed else []
     on_progress = on_progress or (lambda _: None)
     with clear_up_when_terminated(), locked(path):
@@ -217,15 +220,6 @@ def _resumable() -> Iterator[None]:
     except RunInterruptedError as error:
         error.option = "resume"
         raise
-
-
-def stored_variables(
-    variables: Collection[str] | None, recipe: Recipe | None
-) -> Collection[str] | None:
-    """Return the variables to store; None for the defaults of a fit."""
-    check_instance(recipe, Recipe, "recipe")
-    is_fit = recipe is not None and recipe.fit is not None
-    return STORED if variables is None and not is_fit else variables
 
 
 class StoreRun:
@@ -321,16 +315,7 @@ class StoreRun:
 
 def create(path: Path, stack: Stack, *, overwrite: bool) -> StackStore:
     """Create the store of a stack, with all shots pending."""
-    empty = replace(stack, shots=stack.shots.reordered([]))
-
-    def values(name: str, shape: tuple[int, ...]) -> AnyArray:
-        is_rounded = dtype_of(name).kind == "f" and "site" not in stack.task.labels[name][0]
-        return np.empty(shape, stack.dtype if is_rounded else dtype_of(name))
-
-    dataset = describe_results(empty, values)
-    for name, (dims, pixels, labels) in stack.task.masks.items():
-        none = np.empty([empty.sizes[dim] for dim in dims], bool)
-        dataset[name] = dims, none if pixels is None else pixels, labels
+    dataset = empty_results(stack)
     coordinates = {name: _as_stored(each.variable) for name, each in dataset.coords.items()}
     identity = {name: value for name, value in _identity(stack).items() if value}
     dataset = dataset.assign_coords(coordinates).assign_attrs(identity)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import multiprocessing
 import threading
 import time
 from collections import OrderedDict
@@ -172,10 +171,9 @@ class InvertTask(Task):
     def run(
         self,
         images: Sequence[Shot],
-        source: AnyArray | None = None,
-        *,
-        workers: int | None = None,
-        should_stop: ShouldStop | None = None,
+        source: AnyArray | None,
+        workers: int | None,
+        should_stop: ShouldStop | None,
     ) -> Inversion:
         """Apply the recipe to a shot as recorded, with its own source or else `source`."""
         (image,) = images
@@ -258,10 +256,9 @@ class FitTask(Task):
     def run(
         self,
         images: Sequence[Shot],
-        source: AnyArray | None = None,
-        *,
-        workers: int | None = None,
-        should_stop: ShouldStop | None = None,
+        source: AnyArray | None,
+        workers: int | None,
+        should_stop: ShouldStop | None,
     ) -> Fit:
         """Fit a shot."""
         completed = [self.completed(shot, source) for shot in images]
@@ -337,19 +334,9 @@ def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:
     return values / mean if mean > 0 else values
 
 
-def threads_here(workers: int | None = None) -> int:
-    """Return the number of threads of a shot beside others that are in work on this machine.
-
-    By default there is one for each thread of dask's pool, and one alone in the main thread.
-    """
-    cores = available_threads(None)
-    if workers is None:
-        import dask
-
-        alone = threading.current_thread() is threading.main_thread()
-        alone = alone and multiprocessing.parent_process() is None
-        workers = 1 if alone else int(dask.config.get("num_workers", None) or cores)
-    return max(1, cores // workers)
+def threads_here(workers: int | None) -> int:
+    """Return the number of threads of a shot; `workers` are at work on its machine, if known."""
+    return max(1, available_threads(None) // workers) if workers else 1
 
 
 @dataclass(frozen=True)
@@ -400,7 +387,7 @@ def run_shot(
         source = None
         if shot.source is not None:
             source, origin["source"] = shot.source.read()
-        result = task.run(images, source, workers=context.workers, should_stop=should_stop)
+        result = task.run(images, source, context.workers, should_stop)
         entries = task.report(result)
     except InversionCancelled:
         raise

@@ -35,7 +35,6 @@ from napari_shadowinv.stack._run import (
     StoreRun,
     create,
     match_store,
-    stored_variables,
 )
 from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import (
@@ -212,11 +211,10 @@ def watch_stack(
     path = check_store_path(out)
     if watch.status_file is not None:
         check_output(watch.status_file, overwrite=True)
-    variables, dtype = stored_variables(watch.variables, recipe), watch.dtype
 
     def describe(shots: Collection[Exposure]) -> Stack:
         arrived = replace(common, image=Shots(list(shots), (0, 0)))
-        return replace(describe_stack(arrived, recipe, files, variables), dtype=dtype)
+        return describe_stack(arrived, recipe, files, watch)
 
     def shots_of(names: Iterable[str]) -> dict[str, Exposure]:
         paths = {text_of(name): arrivals.folder / name for name in names}
