@@ -17,8 +17,8 @@ STORE = ("--out", "out.shadowinv.zarr")
 COMMANDS: dict[str, tuple[tuple[str, ...], Sections]] = {
     "invert": (("shot.npy",), INVERSION_SECTIONS),
     "fit": (("shot.npy",), {**FIT_SECTIONS, "fit.options": FitOptions}),
-    "batch": (("shot.npy", *STORE), {**BATCH_SECTIONS, "fit.options": FitOptions}),
-    "watch": ((".", *STORE), {**WATCH_SECTIONS, "fit.options": FitOptions}),
+    "batch": (("shot.npy", *STORE), BATCH_SECTIONS),
+    "watch": ((".", *STORE), WATCH_SECTIONS),
 }
 CANDIDATES = ("-1", "1e9", "inf", "nonsense")
 

@@ -138,11 +138,6 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
         "'fading' or 'free'",
     ),
     "fit a.tif --set options.samples=2": "options.samples: did you mean fit.options.samples?",
-    f"batch a.tif {STORE} --set fit.fields=B --set options.tolerance=1e-3": (
-        "options.tolerance",
-        "fit.options",
-    ),
-    f"batch a.tif {STORE} --set fit.fields=B --accuracy 0.1": ("--accuracy", "fit.options"),
     f"batch shot.npy {STORE} --workers 0": "--workers is 0",
     f"watch shots {STORE} --pattern inner/*.tif": "the pattern is 'inner/*.tif'",
     f"watch shots {STORE} --idle 0": "--idle is 0.0: it must be greater than 0",
@@ -207,16 +202,12 @@ WRONG_FILES: dict[str, dict[str, str | tuple[str, ...]]] = {
         "file,strength\na.tif,1\nb.tif,two\n": ("line 3", "'strength' is 'two'"),
         "file,strength\na.tif,1\nsmall.npy,2\n": "small.npy has shape (20, 20), a.tif (48, 56)",
         "file,strength,brightness\na.tif,1,1\nb.tif,2,0\n": ("line 3", "'brightness' is '0'"),
-        "shot,file\n1,a.tif\n1,b.tif\n2,a.tif\n": "several shots, expected one object: fit them",
     },
     "fit --energies 3 a.csv": {
         "file\na.tif\n": "column 'energy'",
     },
-    f"batch {STORE} --set fit.fields=B a.csv": {
-        "file,psf\na.tif,1\n": ("line 2 does not say which shot", "column 'shot'"),
-        "shot,file\n1,gone.tif\n": ("none of 1 shots can be read", "gone.tif"),
-    },
     f"batch {STORE} a.csv": {
+        "file\ngone.tif\n": ("none of 1 shots can be read", "gone.tif"),
         "energy\n5\n": "has no column 'file'",
         "file,enrgy\na.tif,5\n": "did you mean 'energy'?",
         "file,exclude\na.tif,maybe\n": ("line 2", "'exclude' is 'maybe'"),

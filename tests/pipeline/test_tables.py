@@ -14,7 +14,7 @@ from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.film import Calibration, read_corners
 from napari_shadowinv.pipeline import read_pack
 from napari_shadowinv.pipeline._film import read_fiducials
-from napari_shadowinv.pipeline.shot_table import fiducials_from, rows_by_shot, table_rows
+from napari_shadowinv.pipeline.shot_table import fiducials_from, table_rows
 
 
 class Kind(NamedTuple):
@@ -170,9 +170,6 @@ def test_cell_that_cannot_be_read_is_refused(
     refuses(kind, path, reason)
 
 
-def test_lines_of_later_checks_and_a_column_of_film_numbers(path: Path) -> None:
-    write(path, ["file,shot", "", "a.tif,1", "# tilted", "b.tif,"])
-    with pytest.raises(InputError, match="line 5 does not say which shot"):
-        rows_by_shot(path)
+def test_a_calibration_may_have_a_column_of_film_numbers(path: Path) -> None:
     write(path, ["#,Dose,Red,Green,Blue", ",Gy,,,", "1,1,5,5,5", "2,3,4,4,4"])
     np.testing.assert_array_equal(Calibration.from_csv(path).doses, [1, 3])

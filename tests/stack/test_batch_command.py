@@ -267,10 +267,6 @@ def test_masked_pixels_leave_a_film_as_it_is(store):
     frames = list(stack_frames(wild, "potential"))
     for frame, expected in zip(frames, stack_frames(clean, "potential"), strict=True):
         np.testing.assert_array_equal(frame, expected)
-    # The mask of a fit's images: a pixel counts that one of them shows.
-    both = np.stack([mask, np.ones_like(mask)])
-    fit_frames = stack_frames(wild.assign(mask=(("image", "y", "x"), both)), "potential")
-    assert not np.array_equal(next(fit_frames), frames[0])
 
 
 def test_ctrl_c_leaves_a_store_that_is_resumed(folder, monkeypatch):

@@ -13,9 +13,6 @@ from napari_shadowinv.io import store_columns
 from napari_shadowinv.io.store import StackStore
 from napari_shadowinv.io.store_columns import (
     COLUMNS,
-    FITS,
-    INVERSIONS,
-    ROWS,
     ShotColumn,
     columns_of,
 )
@@ -28,7 +25,6 @@ def site_column(monkeypatch) -> ShotColumn:
         "Number of sites",
         title="places",
         kind=int,
-        stores=(INVERSIONS,),
         value=lambda inversion: len(inversion.cells.sites),
         show="{:04d}".format,
     )
@@ -61,9 +57,9 @@ def test_added_column_is_read_and_listed_everywhere(
     assert "Places" not in dict(shot_rows(out, 1))
 
 
-@pytest.mark.parametrize("store", [INVERSIONS, ROWS, FITS])
-def test_keys_and_titles_of_a_store_are_unique(store):
-    columns = columns_of(store)
+@pytest.mark.parametrize("own_setups", [None, "proton", "optical"])
+def test_keys_and_titles_of_a_store_are_unique(own_setups):
+    columns = columns_of(own_setups)
     assert len({column.key for column in columns}) == len(columns)
     assert len({column.title for column in columns}) == len(columns)
 

@@ -62,7 +62,7 @@ def test_python_blocks_of_the_page_keep_their_promise(folder, night):
 def test_page_lists_the_columns_of_the_model():
     (section,) = re.findall(r"^## Each shot with .*?(?=^## )", PAGE, re.DOTALL | re.MULTILINE)
     listed = re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)
-    only_fits = {"strength", "psf", "noise", "shot"}
+    only_fits = {"strength", "psf", "noise"}
     assert {*listed} == {*ShotRow.columns()} - only_fits
     assert all(f"`{name}`" in section for name in only_fits)
 

@@ -16,7 +16,6 @@ from napari_shadowinv.stack import RunStatus
         (RunStatus(total=4, done=4), "4 of 4 done"),
         (RunStatus(total=4, done=2, failed=1, waiting=1), "2 of 4 done, 1 failed"),
         (RunStatus(total=4, done=4, doubtful=3), "4 of 4 done, 3 with warnings"),
-        (RunStatus(done=2, waiting=5, scheduler="watching"), "2 done, 5 waiting"),
     ],
 )
 def test_text_names_numbers_above_zero_and_the_rest_follows_from_them(status, text):

@@ -29,13 +29,12 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, StackStore, read_stack
-from napari_shadowinv.options import FitChoices
 from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
 from napari_shadowinv.pipeline import RunOptions
 from napari_shadowinv.pipeline.rerun import rerun
-from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, shot_rows
+from napari_shadowinv.pipeline.shot_table import ShotRow, shot_rows
 from napari_shadowinv.preprocessing import Bin, PolynomialEstimate
 from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.shot import Shot
@@ -205,10 +204,9 @@ def test_excluded_rows_are_left_out_by_stacks_and_fits(pack: Path, out: Path) ->
     store = inverted(table(*rows, header="file,energy,exclude"), out)
     assert store["name"].values.tolist() == ["film0.npy", "film1.npy"]
     assert store["energy"].values.tolist() == [5.0, 14.7]
-    rows = ("a,film1.npy,14.7,", "a,gone.npy,9,true", "a,film2.npy,30,", "b,film0.npy,5,yes")
-    pack = table(*rows, header="shot,file,energy,exclude")
+    rows = ("film1.npy,14.7,", "gone.npy,9,true", "film2.npy,30,", "film0.npy,5,yes")
+    pack = table(*rows, header="file,energy,exclude")
     assert [row.file.name for row in shot_rows([pack])] == ["film1.npy", "film2.npy"]
-    assert rows_by_shot(pack) == {"a": tuple(shot_rows([pack]))}
 
 
 def test_columns_for_fits_give_a_warning(pack: Path, out: Path) -> None:
@@ -308,14 +306,11 @@ def test_worker_processes_receive_all_of_a_row(pack: Path, out: Path) -> None:
         np.testing.assert_array_equal(there[name], here[name])
 
 
-@pytest.mark.parametrize("fits", [False, True])
-def test_masks_of_a_shot_and_of_all_hold_both_but_for_a_file(fits: bool) -> None:
+def test_masks_of_a_shot_and_of_all_hold_both_but_for_a_file() -> None:
     """The rule of a shot and its recipe."""
     common, own = np.ones((2, *SHAPE), bool), np.ones((2, *SHAPE), bool)
     common[0, :3], common[1, 20:40, 20:40], own[:, :, :5] = False, False, False
-    recipe = Recipe(
-        options=OPTIONS, source=PolynomialEstimate(), fit=FitChoices() if fits else None
-    )
+    recipe = Recipe(options=OPTIONS, source=PolynomialEstimate())
     images = np.ones((3, *SHAPE))
     shots = Shot(images, mask=common[0], source_mask=common[1])
     task = describe_stack(shots, recipe, FILES, RunOptions()).task

@@ -201,9 +201,7 @@ def exit_unless_reliable(store: StackStore) -> None:
         if status != DONE:
             continue
         codes = {caution["code"] for caution in report.get("warnings", ())}
-        is_inversion = store.field is None
-        converged = not is_inversion or report["converged"]
-        if flaw_of(converged, None if is_inversion else report["verdict"], codes):
+        if flaw_of(report["converged"], None, codes):
             raise typer.Exit(EXIT_NOT_CONVERGED)
 
 

@@ -40,10 +40,6 @@ def export_shots(
     protect_store(store, out)
     if form == "csv":
         return [_write_table(store, out, shots, overwrite)]
-    if form == "pradformat" and StackStore(store).field is not None:
-        raise InputError(
-            f"{store} holds fits, expected inversions for pradformat: use --format tiff or csv"
-        )
     dataset = open_shots(store, shots)
     if form == "tiff":
         _check_images(dataset, variables)

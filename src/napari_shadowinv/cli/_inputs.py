@@ -46,7 +46,7 @@ def recipe_from(flags: InversionFlags | FitFlags, settings: Settings) -> Recipe:
         changes[section] = settings.change(section, getattr(recipe, section))
     if "options.margin" in settings.values and changes["options"].boundary != "free":
         raise InputError("received options.margin: it needs --boundary free")
-    if isinstance(flags, FitFlags) or any(key.startswith("fit.") for key in settings.values):
+    if isinstance(flags, FitFlags):
         changes["fit"] = settings.change("fit", recipe.fit or FitChoices())
     return recipe.model_copy(update=changes)
 

@@ -14,7 +14,6 @@ from napari_shadowinv.cli._inputs import read_setup, recipe_from
 from napari_shadowinv.cli._outputs import Outputs
 from napari_shadowinv.cli._settings import (
     FILE_KEYS,
-    FIT_SECTIONS,
     INVERSION_SECTIONS,
     Sections,
     Settings,
@@ -38,9 +37,8 @@ HELP = {
     "limits": "Limits of the colour scale. Default: the range over all shots.",
     "out": "Output folder, or file for csv. Default: the store's name, in the current folder.",
 }
-_SHOTS: Sections = {**INVERSION_SECTIONS, **FIT_SECTIONS}
-BATCH_SECTIONS: Sections = {**_SHOTS, "run": RunOptions}
-WATCH_SECTIONS: Sections = {**_SHOTS, "run": WatchOptions}
+BATCH_SECTIONS: Sections = {**INVERSION_SECTIONS, "run": RunOptions}
+WATCH_SECTIONS: Sections = {**INVERSION_SECTIONS, "run": WatchOptions}
 _EXAMPLE = "run.variables=weights"
 Store = Annotated[Path, Option(help="Store: name.shadowinv.zarr.")]
 BATCH_EPILOG = """
@@ -74,14 +72,8 @@ class WatchFlags:
 
 
 def _stack_inputs(flags: _flags.InversionFlags, settings: Settings, quiet: bool) -> dict[str, Any]:
-    """Return the inputs of `batch` and `watch`; shots are fitted by choices of a fit."""
+    """Return the inputs of `batch` and `watch`."""
     recipe = recipe_from(flags, settings)
-    refused = [key for key in settings.values if key.startswith("options.")]
-    if recipe.fit is not None and refused:
-        raise InputError(
-            f"received {settings.flags.get(refused[0], refused[0])}, an option of inversions, for "
-            "a fit: set its own options, such as fit.options.samples"
-        )
     if flags.setup is not None:
         recipe = recipe.model_copy(update={"setup": read_setup(flags.setup)})
     Outputs(overwrite=False, quiet=quiet).warn_of_setups([(recipe.setup, None)])
@@ -101,7 +93,7 @@ def batch(
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
-    """Invert or fit many shots into one store; an interrupted run can be resumed."""
+    """Invert many shots into one store; an interrupted run can be resumed."""
     from napari_shadowinv.cli._batch import run_batch
 
     run_keys = {"run.workers": ("--workers", run_flags.workers)}
@@ -125,7 +117,7 @@ def watch(
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
-    """Invert or fit each new shot in a folder, and append it to a store."""
+    """Invert each new shot in a folder, and append it to a store."""
     from napari_shadowinv.cli._batch import run_watch
 
     run_keys = {

@@ -3,7 +3,6 @@
 - label a field, with units: `dataset_from_field`
 - the names, dimensions and units alone: `variable_labels`
 - the setup that a dataset was made with: `setup_from_dataset`
-- variables of a fit of one field: `fit_labels`
 """
 
 from __future__ import annotations
@@ -113,16 +112,6 @@ def variable_labels(setup: Setup | None = None) -> Labels:
         dims = VECTOR if field.is_vector else PLANE
         labels[field.name] = dims, label(field.unit, field.long_name)
     return labels
-
-
-def fit_labels(field: str, setup: Setup | None = None) -> Labels:
-    """Return dimensions, ``units`` and ``long_name`` of every variable of a fitted field."""
-    result_labels = variable_labels(setup)
-    labels = {name: result_labels[name] for name in ("potential", "displacement")}
-    dims, *unit_and_name = FIT_VARIABLES["displacement_uncertainty"]
-    labels["displacement_uncertainty"] = dims, label(*unit_and_name)
-    in_si = [name for name in result_labels if name not in VARIABLES]
-    return labels | {name: result_labels[name] for name in in_si if belongs(name, field)}
 
 
 def belongs(variable: object, field: str) -> bool:

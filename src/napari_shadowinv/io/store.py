@@ -25,13 +25,12 @@ from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.inversion.variables import (
     SETUPS_LABEL,
-    fit_labels,
     setup_from_dataset,
     variable_labels,
 )
 from napari_shadowinv.io.files import check_folder_of
 from napari_shadowinv.io.formats import STORE
-from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, ShotColumn, columns_of
+from napari_shadowinv.io.store_columns import ShotColumn, columns_of
 from napari_shadowinv.io.store_damage import (
     Damage,
     Status,
@@ -76,20 +75,11 @@ def is_stack(path: str | Path) -> bool:
     return read_attributes(Path(path)).get("format") == FORMAT
 
 
-def fitted_field(attributes: Mapping[Any, Any]) -> str | None:
-    """Return the field that was fitted to each shot of a store; None if shots were inverted."""
-    names = json.loads(attributes.get("fields", "[]"))
-    return str(names[0]) if names else None
-
-
 def columns_of_store(attributes: Mapping[Any, Any]) -> tuple[ShotColumn, ...]:
     """Return the columns of a store, by its attributes."""
-    if fitted_field(attributes) is not None:
-        return columns_of(FITS)
     if OWN_SETUPS not in attributes:
-        return columns_of(INVERSIONS)
-    kind = json.loads(attributes.get("setup", "{}")).get("kind", "proton")
-    return columns_of(ROWS, kind)
+        return columns_of(None)
+    return columns_of(json.loads(attributes.get("setup", "{}")).get("kind", "proton"))
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
@@ -105,8 +95,7 @@ class StackStore:
     """Store of a run: the status and the report of each shot, and damage to files.
 
     With `every_byte`, all files are read to find damage; otherwise damage within a field is noticed
-    when the field is read. `field` is the fitted field, None where shots were inverted, and
-    `columns` are the quantities that it lists of each shot.
+    when the field is read. `columns` are the quantities that it lists of each shot.
     """
 
     def __init__(self, path: Path, *, every_byte: bool = False) -> None:
@@ -120,7 +109,7 @@ class StackStore:
         self.attributes = read_attributes(path)
         if self.attributes.get("format") != FORMAT:
             raise FileFormatError(f"{path} is not a stack of shots: expected name{STORE_SUFFIX}")
-        self.field, self.columns = _contents(path, self.attributes)
+        self.columns = _columns(path, self.attributes)
         self._arrays = _open_readable(path)
         names = read_values(path / "name", self._arrays["name"])
         self.names = tuple(map(str, names.tolist()))
@@ -156,8 +145,8 @@ def check_files(store: StackStore) -> None:
 
 
 @as_file_errors
-def _contents(_: Path, attributes: Mapping[Any, Any]) -> tuple[str | None, tuple[ShotColumn, ...]]:
-    return fitted_field(attributes), columns_of_store(attributes)
+def _columns(_: Path, attributes: Mapping[Any, Any]) -> tuple[ShotColumn, ...]:
+    return columns_of_store(attributes)
 
 
 @as_file_errors
@@ -240,16 +229,10 @@ def read_stack(path: Path) -> xarray.Dataset:
     }
     complete = complete.assign(columns)
     # The folder's own order is arbitrary.
-    order = [*_labels(dataset, setup), "status", *columns, "setup", "report"]
+    order = [*variable_labels(setup), "status", *columns, "setup", "report"]
     order += sorted(map(str, complete.data_vars.keys() - {*order}))
     ordered = complete[[name for name in order if name in complete]]
     return ordered.assign(status=ordered["status"].copy(data=store.statuses()))
-
-
-def _labels(dataset: xarray.Dataset, setup: Any) -> dict[str, Any]:
-    """Return dimensions and labels of the variables that a store's dataset may have, by name."""
-    field = fitted_field(dataset.attrs)
-    return variable_labels(setup) if field is None else fit_labels(field, setup)
 
 
 def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
@@ -258,7 +241,7 @@ def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
         return dataset
     fields = {}
     in_si = {field.name for field in setup.si_fields}
-    for name, (dims, labels) in _labels(dataset, setup).items():
+    for name, (dims, labels) in variable_labels(setup).items():
         origin = "displacement" if "component" in dims else "potential"
         if name in dataset or name not in in_si or origin not in dataset:
             continue

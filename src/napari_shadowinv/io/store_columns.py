@@ -5,7 +5,7 @@ export --format csv`` writes them all, ``shadowinv info --all`` and the window o
 that have a function to `show` them. A store itself holds them in the reports of its shots.
 
 - add a column: one entry of `COLUMNS`
-- the columns of a kind of stores: `columns_of`; their values from a result: `column_values`
+- the columns of a store: `columns_of`; their values from a result: `column_values`
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from operator import attrgetter
 from typing import Any
 
@@ -23,11 +22,6 @@ from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.facts import percent
 from napari_shadowinv.physics.units import PIXEL, display_unit
 
-# Kinds of stores
-INVERSIONS = "inversions"
-ROWS = "rows of a table"
-FITS = "fits"
-
 
 @dataclass(frozen=True)
 class ShotColumn:
@@ -36,11 +30,10 @@ class ShotColumn:
     key: str  # name of its array and of its entry in a shot's report
     long_name: str  # label of the array
     title: str = ""  # heading of tables for people, if it is not the key
-    stores: tuple[str, ...] = (INVERSIONS, ROWS, FITS)  # kinds of stores that have the column
     unit: str = "1"  # of the array
     kind: type = float  # or bool, int or str
-    # Returns the value of an `Inversion` or a `Fit`, None if this result has none. Without it, the
-    # value comes from the run.
+    # Returns the value of an `Inversion`, None if this one has none. Without it, the value comes
+    # from the run.
     value: Callable[[Any], Any] | None = None
     show: Callable[[Any], str] | None = None  # in tables for people, which omit columns without it
     width: int = 0  # least number of characters of a table's column
@@ -67,10 +60,6 @@ class ShotColumn:
     def text(self, report: Mapping[str, Any]) -> str:
         """Return the value from a shot's report as text, empty without a value."""
         return self.show(report[self.key]) if self.show and self.key in report else ""
-
-
-_of_inversions = partial(ShotColumn, stores=(INVERSIONS, ROWS))
-_of_fits = partial(ShotColumn, stores=(FITS,))
 
 
 def _error(part: str) -> Callable[[Any], float]:
@@ -100,20 +89,6 @@ COLUMNS: tuple[ShotColumn, ...] = (
         kind=str,
         value=lambda result: " ".join(dict.fromkeys(each.code for each in result.cautions)),
     ),
-    _of_fits(
-        "chi2",
-        "Largest χ² of the shot's images",
-        title="χ²",
-        value=lambda fit: float(fit.chi2.max()),
-        show="{:.3g}".format,
-    ),
-    _of_fits(
-        "folded",
-        "Share of the pixels whose rays have crossed",
-        title="crossed",
-        value=attrgetter("folded"),
-        show=percent,
-    ),
     ShotColumn(
         "total_error",
         "Error of the displacement, r.m.s., as a share of it",
@@ -131,30 +106,30 @@ COLUMNS: tuple[ShotColumn, ...] = (
     ShotColumn(
         "converged", "Whether the solver converged", kind=bool, value=attrgetter("report.converged")
     ),
-    _of_inversions(
+    ShotColumn(
         "flux_residual",
         "Largest relative flux error of a cell",
         value=attrgetter("report.residual"),
     ),
     ShotColumn(
         "iterations",
-        "Iterations of the solver, on all levels; of a fit at full size",
+        "Iterations of the solver, on all levels",
         kind=int,
         value=attrgetter("report.iterations"),
     ),
-    _of_inversions(
+    ShotColumn(
         "image_residual",
         "Image minus re-projection, r.m.s. relative to the mean",
         value=attrgetter("report.image_residual"),
         show=percent,
     ),
-    _of_inversions(
+    ShotColumn(
         "noise_error",
         "Standard error of the displacement by noise, r.m.s.",
         unit=PIXEL,
         value=_error("noise"),
     ),
-    _of_inversions(
+    ShotColumn(
         "discretisation_error",
         "Error of the displacement by too few sites, r.m.s.",
         unit=PIXEL,
@@ -163,10 +138,13 @@ COLUMNS: tuple[ShotColumn, ...] = (
 )
 
 
-def columns_of(store: str, setup_kind: str = "proton") -> tuple[ShotColumn, ...]:
-    """Return the columns of a kind of stores, with the energy or wavelength of a table's shots."""
-    first, *others = (column for column in COLUMNS if store in column.stores)
-    beam = (_beam_column(setup_kind),) if store == ROWS else ()
+def columns_of(own_setups: str | None) -> tuple[ShotColumn, ...]:
+    """Return the columns of a store, with energies or wavelengths if each shot has its own setup.
+
+    `own_setups` is the kind of these setups, None where all shots share one.
+    """
+    first, *others = COLUMNS
+    beam = () if own_setups is None else (_beam_column(own_setups),)
     return (first, *beam, *others)
 
 
@@ -179,15 +157,13 @@ def _beam_column(setup_kind: str) -> ShotColumn:
         quantity.long_name,
         title=quantity.noun if quantity.unit == "m" else quantity.unit,
         unit=quantity.unit,
-        stores=(ROWS,),
         value=lambda inversion: inversion.setup and inversion.setup.beam_value,
         show="{:g}".format,
     )
 
 
-def column_values(store: str, result: Any) -> dict[str, Any]:
-    """Return the values of a result by the columns' keys, for the shot's report."""
-    setup = getattr(result, "setup", None)
-    available = columns_of(store) if setup is None else columns_of(store, setup.kind)
-    values = {column.key: column.value(result) for column in available if column.value}
+def column_values(inversion: Any, *, own_setup: bool = False) -> dict[str, Any]:
+    """Return the values of an inversion by the columns' keys, for the shot's report."""
+    columns = columns_of(inversion.setup.kind if own_setup and inversion.setup else None)
+    values = {column.key: column.value(inversion) for column in columns if column.value}
     return {key: value for key, value in values.items() if value is not None}

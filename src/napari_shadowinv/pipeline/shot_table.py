@@ -1,6 +1,6 @@
 """Descriptions of images and fiducials, from rows of a table or from flags.
 
-- one image: `ShotRow`; all of a fit: `shot_rows`, or `rows_by_shot` for a table of many shots
+- one image: `ShotRow`; all of a fit: `shot_rows`
 - the images of a table that are inverted one by one: `rows_to_invert`
 - whether a file is such a table: `is_table`; all its rows: `table_rows`
 - known displacements: `fiducials_from`
@@ -72,10 +72,6 @@ class ShotRow(CheckedModel, extra="allow"):
         description="poisson for counts, proportional for a share of each pixel, or the standard "
         "deviation in a pixel, after the step 'bin'.",
     )
-    shot: str | None = Field(
-        default=None,
-        description="In a table of many shots that are fitted: which of them the image belongs to.",
-    )
     exclude: bool = Field(default=False, description="true, yes or 1 to leave the image out.")
 
     @model_validator(mode="before")
@@ -141,13 +137,7 @@ def shot_rows(
                 f"received {name} {energies} and the table {images[0]}: write it into the column "
                 "'energy'"
             )
-        rows = list(_used_rows(images[0], setup).values())
-        if len({row.shot for row in rows}) > 1:
-            raise InputError(
-                f"{images[0]} has the images of several shots, expected one object: fit them as a "
-                "stack"
-            )
-        return rows
+        return list(_used_rows(images[0], setup).values())
     values = [None] * len(images) if energies is None else energies.split(",")
     if len(values) != len(images):
         raise InputError(
@@ -163,19 +153,6 @@ def shot_rows(
         )
         for image, value in zip(images, values, strict=True)
     ]
-
-
-def rows_by_shot(table: Path) -> dict[str, tuple[ShotRow, ...]]:
-    """Return the rows of a table with the images of many shots, by shot, in their order."""
-    by_shot: dict[str, tuple[ShotRow, ...]] = {}
-    for line, row in _used_rows(table).items():
-        if row.shot is None:
-            raise InputError(
-                f"{table}, line {line} does not say which shot its image belongs to: give the "
-                "column 'shot', the same for all images of one object"
-            )
-        by_shot[row.shot] = (*by_shot.get(row.shot, ()), row)
-    return by_shot
 
 
 def rows_to_invert(table: Path | Sequence[ShotRow]) -> list[ShotRow]:

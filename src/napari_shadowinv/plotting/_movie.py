@@ -78,8 +78,7 @@ def _plane(field: xarray.DataArray, index: int, used: xarray.DataArray | None) -
     if used is None:
         return plane
     mask = np.asarray(used.isel(shot=index) if "shot" in used.dims else used, dtype=bool)
-    # A fit uses a pixel that one of its images shows.
-    return np.where(mask.reshape(-1, *plane.shape).any(axis=0), plane, np.nan)
+    return np.where(mask, plane, np.nan)
 
 
 def _limits(

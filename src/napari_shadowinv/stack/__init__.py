@@ -1,6 +1,6 @@
 """Many shots with dask, into one store that survives a crash.
 
-- invert or fit shots one by one into ``name.shadowinv.zarr``, and resume after a crash: `run_stack`
+- invert shots one by one into ``name.shadowinv.zarr``, and resume after a crash: `run_stack`
 - watch a folder and invert each shot as soon as it arrives: `watch_stack`
 - read one channel of colour images: `FileReader`
 - what a run reports: `RunStatus`

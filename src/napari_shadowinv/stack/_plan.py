@@ -26,7 +26,6 @@ from napari_shadowinv.inversion.variables import dataset_from_field, variable_la
 from napari_shadowinv.io.files import sha256, split_address
 from napari_shadowinv.io.store import FORMAT
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.pipeline.fit_run import check_fit
 from napari_shadowinv.pipeline.inversion_run import Inputs, collect_inputs
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table
@@ -34,29 +33,24 @@ from napari_shadowinv.preprocessing import Estimate, MeasuredSource, Recipe, Uni
 from napari_shadowinv.provenance import index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack._shots import (
-    Exposure,
     FileReader,
     Reader,
-    RowsExposure,
+    RowExposure,
     Shots,
     find_shots,
     find_source,
-    first_image,
     table_shots,
     usual_shape,
 )
 from napari_shadowinv.stack._worker import (
-    AnyTask,
-    FitTask,
-    InvertTask,
+    Task,
 )
 
 if TYPE_CHECKING:
     import xarray
 
-# Variables that are stored of an inversion, and of a fit, by default.
+# Variables that are stored by default.
 STORED = ("potential", "displacement", "caustic", "mask")
-FITTED = ("potential", "displacement", "displacement_uncertainty")
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +58,7 @@ class Stack:
     """Plan of a stack: its shots, and the task of each with everything that they share."""
 
     shots: Shots
-    task: AnyTask
+    task: Task
     reader: str  # name of the reader of the files
     dtype: str  # of fields in the store
 
@@ -92,7 +86,7 @@ class Stack:
     def changed(self, index: int, origin: dict[str, Any]) -> str:
         """Name the part of a shot that differs from its report; empty if none does."""
         shot, label = self.shots.items[index], self.shots.label(index)
-        if self.task.by_row and (difference := _row_of(shot).difference(origin)):
+        if isinstance(shot, RowExposure) and (difference := shot.difference(origin)):
             return f"the row of {label} ({difference})"
         if not shot.unchanged(origin):
             return label
@@ -100,11 +94,6 @@ class Stack:
         if shot.source is None or shot.source.unchanged(origin["source"]):
             return ""
         return f"the source of {label}"
-
-
-def _row_of(shot: Exposure) -> RowsExposure:
-    assert isinstance(shot, RowsExposure)
-    return shot
 
 
 def describe_stack(
@@ -143,52 +132,24 @@ def describe_stack(
         pairs = zip(stack_shots.items, sources.items, strict=True)
         items = [replace(shot, source=source) for shot, source in pairs]
         stack_shots = replace(stack_shots, items=items)
-    task: AnyTask
-    if resolved.fit is None:
-        task = _plan_inversion(stack_shots, inputs, resolved, options.variables or STORED)
-    else:
-        task = _plan_fit(inputs, resolved, options.variables or ())
+    task = _plan_inversion(stack_shots, inputs, resolved, options.variables or STORED)
     return Stack(stack_shots, task, files.name, options.dtype)
 
 
 def _plan_inversion(
     shots: Shots, inputs: Inputs, recipe: Recipe, variables: Collection[str]
-) -> InvertTask:
+) -> Task:
     if inputs.shot.source is not None:
         ready = inputs.recipe.prepare(replace(inputs.shot, image=inputs.shot.source))
         assert ready.source is not None
         check_source(ready.source, ready.mask)
-    rows = [row for shot in shots.items for row in shot.rows]
+    rows = [shot.row for shot in shots.items if isinstance(shot, RowExposure)]
     own_masks = any(row.mask is not None for row in rows)
     _check_variables(variables, inputs.recipe, own_masks=own_masks)
     if rows:  # each shot has the common masks, too
         unmasked = index_masks(inputs.provenance.images, [(None, None)])
         inputs = replace(inputs, provenance=inputs.provenance.model_copy(update=unmasked))
-    return InvertTask(
-        inputs=inputs, variables=tuple(variables), requested=recipe, by_row=bool(rows)
-    )
-
-
-def _plan_fit(inputs: Inputs, recipe: Recipe, variables: Collection[str]) -> FitTask:
-    check_fit(recipe)
-    task = FitTask(inputs=inputs, variables=(), requested=recipe)
-    fields = task.choices.fields
-    if fields is not None and len(fields) > 1:
-        raise InputError(
-            f"the recipe fits the fields {', '.join(fields)}, and a store holds one: fit "
-            "one field, or each shot alone with shadowinv fit"
-        )
-    labels = task.labels
-    if task.choices.options.samples < 2:
-        labels.pop("displacement_uncertainty")
-    for name in variables:
-        if name not in labels:
-            raise InputError(
-                f"there is no variable {name!r} of a fit: expected one or more of "
-                f"{', '.join(labels)}"
-            )
-    defaults = tuple(name for name in FITTED if name in labels)
-    return replace(task, variables=tuple(variables or defaults))
+    return Task(inputs=inputs, variables=tuple(variables), requested=recipe, by_row=bool(rows))
 
 
 def _describe_inputs(
@@ -222,7 +183,7 @@ def _describe_inputs(
     mask = join_masks(mask, stack_shots.mask, lit)
     if recipe.setup is not None:
         check_spacing(shots, "shots", recipe.setup.pixel_sizes)
-    if recipe.fit is None and not recipe.steps:
+    if not recipe.steps:
         check_memory(stack_shots.shape, bytes_per_pixel(recipe.options), "an inversion")
     blank = np.ones(stack_shots.shape)
     beam = None
@@ -267,10 +228,7 @@ def _describe_table(
             "the reader out"
         )
     items = table_shots(table, recipe, reader.channel)
-    if recipe.fit is not None:
-        image = first_image(items)
-        return Shots(items, image.shape), image.setup
-    return Shots(items, shape or usual_shape(items)), _row_of(items[0]).setup
+    return Shots(items, shape or usual_shape(items)), items[0].setup
 
 
 def _check_variables(names: Collection[str], recipe: Recipe, *, own_masks: bool) -> None:

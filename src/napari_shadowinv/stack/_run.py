@@ -50,7 +50,7 @@ from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._plan import Stack, coordinates_of, describe_stack, empty_results
 from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import FILES, Exposure, Reader, differences
-from napari_shadowinv.stack._worker import AnyTask, ShotOutcome, TaskContext
+from napari_shadowinv.stack._worker import ShotOutcome, Task, TaskContext
 
 if TYPE_CHECKING:
     import xarray
@@ -111,12 +111,11 @@ def run_stack(
     on_progress: OnStatus | None = None,
     should_stop: ShouldStop | None = None,
 ) -> xarray.Dataset:
-    """Invert, or fit, every shot into one store; another call resumes it.
+    """Invert every shot into one store; another call resumes it.
 
-    With a recipe that has a section `fit`, the forward model is fitted to each shot. A shot that
-    cannot be inverted fails alone, with its reason. A shot counts only once it is written
-    completely, so a run may be interrupted or killed at any time. Shots that have arrived since the
-    store was created are appended, whatever their names: a shot keeps its number.
+    A shot that cannot be inverted fails alone, with its reason. A shot counts only once it is
+    written completely, so a run may be interrupted or killed at any time. Shots that have arrived
+    since the store was created are appended, whatever their names: a shot keeps its number.
 
     Parameters
     ----------
@@ -124,10 +123,9 @@ def run_stack(
         A dask or numpy array; an xarray object with one such variable; paths of one image each;
         a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; a TIFF with a page for
         each shot; or a table (CSV) with a row for each shot, which may have its own energy, setup,
-        brightness, mask and source. In a table of shots to fit, rows with the same ``shot`` are
-        images of one object. A `Shot` with one of these as its image has the setup, the mask and
-        the source mask of all shots, and their source: one for all, or as many as shots. To resume
-        a store, earlier shots must be the same, and so must recipe and reader.
+        brightness, mask and source. A `Shot` with one of these as its image has the setup, the
+        mask and the source mask of all shots, and their source: one for all, or as many as shots.
+        To resume a store, earlier shots must be the same, and so must recipe and reader.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
     recipe : Recipe, optional
@@ -294,7 +292,7 @@ class StoreRun:
     def run(
         self,
         shots: Mapping[int, Exposure],
-        task: AnyTask,
+        task: Task,
         scheduler: Scheduler,
         on_end: Callable[[ShotOutcome], None],
         should_stop: ShouldStop | None = None,
@@ -347,15 +345,13 @@ def _identity(stack: Stack, shots: int | None = None) -> dict[str, str]:
     height, width = task.shape
     steps = [step.model_dump(mode="json") for step in task.recipe.steps]
     setup = "" if task.setup is None else task.setup.model_dump_json()
-    fit, options = recipe.fit, recipe.options if recipe.fit is None else recipe.fit.options
     instrument = recipe.instrument.stated
     setups = (
         {OWN_SETUPS: "a row for each shot"} if task.by_row else {OWN_SETUPS: "", "setup": setup}
     )
     return {
         **setups,
-        "fit": "" if fit is None else fit.model_dump_json(exclude={"options"}, exclude_none=True),
-        "options": options.model_dump_json(exclude={"threads"}),
+        "options": recipe.options.model_dump_json(exclude={"threads"}),
         "instrument": json.dumps(instrument) if instrument else "",
         "source_image": stack.source_text(shots),
         "mask_image": _mask_text(common.mask) or "none",

@@ -1,6 +1,6 @@
 """Shots of a stack, each read on demand: `Exposure`, and where they come from.
 
-- in an array, in a file, in rows of a table: `ArrayExposure`, `FileExposure`, `RowsExposure`
+- in an array, in a file, in a row of a table: `ArrayExposure`, `FileExposure`, `RowExposure`
 - all shots of an array, of files or of a list: `find_shots`; of a table: `table_shots`
 - their sources: `find_source`
 """
@@ -35,7 +35,7 @@ from napari_shadowinv.io.frames import FileFrame, find_frames
 from napari_shadowinv.io.read_write import read_frame, read_shot
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline.fit_run import read_row_images, row_setup
-from napari_shadowinv.pipeline.shot_table import ShotRow, rows_by_shot, rows_to_invert
+from napari_shadowinv.pipeline.shot_table import ShotRow, rows_to_invert
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot
 
@@ -58,18 +58,17 @@ class Exposure:
 
     name: str  # for messages and tables
     source: Exposure | None = field(default=None, kw_only=True)  # unless shared or estimated
-    rows: tuple[ShotRow, ...] = field(default=(), kw_only=True)  # of a table, one for each image
 
-    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
-        """Return the images with all that is known of each, and metadata for the shot's report.
+    def load(self) -> tuple[Shot, dict[str, Any]]:
+        """Return the image with all that is known of it, and metadata for the shot's report.
 
-        Of a single image these are ``sha256``, and ``cautions`` if there are any.
+        These are ``sha256``, and ``cautions`` if there are any.
         """
         raise NotImplementedError
 
     def read(self) -> tuple[AnyArray, dict[str, Any]]:
-        """Return its only image, such as a source, and the metadata."""
-        (shot,), metadata = self.load()
+        """Return the image alone, such as a source, and the metadata."""
+        shot, metadata = self.load()
         return shot.image, metadata
 
     def stamp(self) -> dict[str, Any]:
@@ -104,11 +103,11 @@ class ArrayExposure(Exposure):
         dask: Any = import_module("dask")
         return dask.optimize(self.array.blocks[self.index])[0]
 
-    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
+    def load(self) -> tuple[Shot, dict[str, Any]]:
         plane = _plain_image(self.block.compute()[0]) if self.is_lazy else self.array[self.index]
         # Sums depend on the order in memory.
         plane = np.ascontiguousarray(plane)
-        return (Shot(plane),), {"sha256": checksum(plane)}
+        return Shot(plane), {"sha256": checksum(plane)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Otherwise all images, or their tasks, would be sent with it.
@@ -178,7 +177,7 @@ class FileExposure(Exposure):
         frame = self.frame
         return {"variable": frame.variable, **stamp(frame.path)} if frame.number is None else {}
 
-    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
+    def load(self) -> tuple[Shot, dict[str, Any]]:
         digest = sha256(self.frame.path) if self.frame.number is None else ""
         shot = self.reader.read(self.frame)
         cautions = list(shot.cautions)
@@ -187,7 +186,7 @@ class FileExposure(Exposure):
             **({"cautions": cautions} if cautions else {}),
         }
         mask = None if shot.mask is None or np.all(shot.mask) else shot.mask
-        return (Shot(shot.image, mask=mask),), metadata
+        return Shot(shot.image, mask=mask), metadata
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Compare a file as in a table's rows, and a page by its checksum."""
@@ -197,66 +196,55 @@ class FileExposure(Exposure):
 
 
 @dataclass(frozen=True, eq=False)
-class RowsExposure(Exposure):
-    """Several images of one object to fit, or one image to invert, from rows of a table."""
+class RowExposure(Exposure):
+    """An image to invert as recorded, from a row of a table."""
 
+    row: ShotRow
     recipe: Recipe
     channel: str | int | None = None
-    setup: Setup | None = None  # of the image to invert as recorded
+    setup: Setup | None = None
 
-    def load(self) -> tuple[tuple[Shot, ...], dict[str, Any]]:
-        """Return the images, and the files of their rows."""
-        images = read_row_images(self.rows, self.recipe, channel=self.channel)
+    def load(self) -> tuple[Shot, dict[str, Any]]:
+        """Return the image, and the files of its row."""
+        (image,) = read_row_images([self.row], self.recipe, channel=self.channel)
         files = {
             name: {**stamp(path), "sha256": sha256(path)} for name, path in self._files().items()
         }
-        origin: dict[str, Any] = {"files": files, "rows": self._summaries()}
-        if self.recipe.fit is not None:
-            return images, origin
-        (image,) = images
         cautions = list(image.cautions)
         if unused := [name for name in _OF_FITS if getattr(image, name) is not None]:
             text = f"the row has {', '.join(unused)}, which only fits use: fit the image to use it"
             cautions.append(Caution("file", text))
-        metadata = {**files["file 1"], **origin, "cautions": cautions}
-        return (replace(image, setup=self.setup),), metadata
+        origin = {"files": files, "row": self.row.summary, "cautions": cautions}
+        return replace(image, setup=self.setup), {**files["file"], **origin}
 
     def shape(self) -> tuple[int, ...]:
-        return read_shot(self.rows[0].file, channel=self.channel).shape
+        return read_shot(self.row.file, channel=self.channel).shape
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compare the rows, and existing files by size and time or checksum."""
+        """Compare the row, and existing files by size and time or checksum."""
         before = origin.get("files", {})
-        return self._summaries() == origin.get("rows") and all(
+        return self.row.summary == origin.get("row") and all(
             _agrees(path, before.get(name, {})) for name, path in self._files().items()
         )
 
     def difference(self, origin: dict[str, Any]) -> str:
-        """Describe the difference from the row to invert, or its setup, in a report."""
-        (row,) = self.rows
-        (before,) = origin.get("rows") or ({},)
-        if before != row.summary:
-            return differences(before, row.summary)
+        """Describe the difference from the row, or its setup, in a report."""
+        before = origin.get("row", {})
+        if before != self.row.summary:
+            return differences(before, self.row.summary)
         entries = origin.get("provenance", {}).get("recipe", {}).get("setup")
         setup_before = None if entries is None else setup_from_dict(entries)
         # The setup of a row may have been in an image that was removed.
         if setup_before == self.setup or (
-            self.setup is None and not split_address(row.file)[0].exists()
+            self.setup is None and not split_address(self.row.file)[0].exists()
         ):
             return ""
         setups = (setup_before, self.setup)
         return differences(*({} if setup is None else setup.model_dump() for setup in setups))
 
     def _files(self) -> dict[str, Path]:
-        """Return the files by the names of their columns and the numbers of their rows."""
-        return {
-            f"{name} {number}": split_address(path)[0]
-            for number, row in enumerate(self.rows, 1)
-            for name, path in row.files.items()
-        }
-
-    def _summaries(self) -> list[dict[str, Any]]:
-        return [row.summary for row in self.rows]
+        """Return the files by the names of their columns."""
+        return {name: split_address(path)[0] for name, path in self.row.files.items()}
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any], missing: Any = None) -> str:
@@ -480,27 +468,17 @@ def find_source(source: Any, reader: FileReader) -> AnyArray | Shots | None:
 
 def table_shots(
     table: Path | Sequence[ShotRow], recipe: Recipe, channel: str | int | None
-) -> list[Exposure]:
-    """Return the shots of a table, or of its rows: to fit if the recipe says so, or to invert."""
-    if recipe.fit is not None:
-        if not isinstance(table, Path):
-            raise InputError("received rows of a table to fit, expected its file: write it first")
-        return [
-            RowsExposure(name, recipe, channel, rows=_with_absolute_paths(rows))
-            for name, rows in rows_by_shot(table).items()
-        ]
-    rows = rows_to_invert(table)
-    shots = list[Exposure]()
-    files = [FileFrame(row.file, name_of(row.file)) for row in rows]
-    for name, row in zip(_distinct_names(files), _with_absolute_paths(rows), strict=True):
-        setup = row_setup(row, _read_geometry(row, channel), recipe)
-        shots.append(RowsExposure(name, recipe, channel, setup, rows=(row,)))
-    return shots
-
-
-def _with_absolute_paths(rows: Sequence[ShotRow]) -> tuple[ShotRow, ...]:
-    """Return rows with absolute paths, for workers elsewhere."""
-    return tuple(map_paths(row, Path.absolute) for row in rows)
+) -> list[RowExposure]:
+    """Return the shots of a table, or of its rows."""
+    # For workers elsewhere, paths are absolute.
+    rows = [map_paths(row, Path.absolute) for row in rows_to_invert(table)]
+    names = _distinct_names([FileFrame(row.file, name_of(row.file)) for row in rows])
+    return [
+        RowExposure(
+            name, row, recipe, channel, row_setup(row, _read_geometry(row, channel), recipe)
+        )
+        for name, row in zip(names, rows, strict=True)
+    ]
 
 
 def _read_geometry(row: ShotRow, channel: str | int | None) -> Shot:
@@ -511,8 +489,3 @@ def _read_geometry(row: ShotRow, channel: str | int | None) -> Shot:
     except (OSError, ValueError):
         pass  # its shot fails, by name
     return Shot(np.zeros((1, 1)))
-
-
-def first_image(shots: Sequence[Exposure]) -> Shot:
-    """Return the first image of the first shot of a table that can be read, to fit."""
-    return _read_first(shots, lambda shot: replace(shot, rows=shot.rows[:1]).load()[0][0], 1)[0]

@@ -1,4 +1,4 @@
-"""Tasks of a worker: `InvertTask` inverts one shot, `FitTask` fits one.
+"""Work on one shot: `Task`.
 
 - a shot inverted and written to the store: `run_shot`
 """
@@ -10,11 +10,10 @@ import json
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -23,16 +22,13 @@ from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion, plan_sites
-from napari_shadowinv.inversion.variables import fit_labels, variable_labels
+from napari_shadowinv.inversion.variables import variable_labels
 from napari_shadowinv.io.store import DONE, FAILED
-from napari_shadowinv.io.store_columns import FITS, INVERSIONS, ROWS, column_values
+from napari_shadowinv.io.store_columns import column_values
 from napari_shadowinv.io.store_writing import ShotWriter
-from napari_shadowinv.options import FitChoices, InversionOptions
+from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.setup import Setup
-from napari_shadowinv.physics.units import ShownField
-from napari_shadowinv.pipeline.fit_run import run_fit, usual_fields
 from napari_shadowinv.pipeline.inversion_run import Cache, Inputs, collect_inputs, run_prepared
 from napari_shadowinv.preprocessing import Recipe, UniformEstimate
 from napari_shadowinv.provenance import MaskVariable, mask_variables
@@ -85,9 +81,7 @@ class SharedSites(Cache):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Task:
-    """Work on each shot of a stack, and the description of its results."""
-
-    kind: ClassVar[str]  # of the results, for their provenance
+    """Inversion of each shot of a stack, and the description of its results."""
 
     inputs: Inputs  # recipe, source and masks of all shots; the image only has their shape
     variables: tuple[str, ...]  # of a result
@@ -97,11 +91,6 @@ class Task:
     @property
     def recipe(self) -> Recipe:
         return self.inputs.recipe
-
-    def of_shot(self, **changes: Any) -> Recipe:
-        """Return the recipe of each shot, to which the masks of all are given."""
-        cleared = {"source": self.requested.estimate, "mask": None, "source_mask": None}
-        return self.requested.model_copy(update={**cleared, **changes})
 
     @cached_property
     def moved(self) -> Shot:
@@ -117,15 +106,22 @@ class Task:
         return self.moved.setup
 
     @property
+    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
+        """Dimensions and labels of all variables that the results can have."""
+        return variable_labels(self.setup)
+
+    @property
     def masks(self) -> dict[str, MaskVariable]:
-        """The masks of the images as variables of all shots."""
+        """The masks of the images as variables of all shots; each row of a table has its own."""
+        if self.by_row:
+            return mask_variables([None, None], "shot")
         return self.inputs.provenance.mask_variables
 
     @property
     def attributes(self) -> dict[str, str]:
         """Attributes of a dataset of the results."""
         provenance = self.inputs.provenance
-        provenance = provenance.model_copy(update={"setup": self.setup, "kind": self.kind})
+        provenance = provenance.model_copy(update={"setup": self.setup})
         options = self.recipe.options.model_dump_json()
         return {"options": options, "provenance": provenance.to_json()}
 
@@ -145,38 +141,20 @@ class Task:
             source_mask=join_masks(common.source_mask, shot.source_mask),
         )
 
-    def arrays(self, result: Any) -> dict[str, AnyArray]:
+    def arrays(self, result: Inversion) -> dict[str, AnyArray]:
         """Return the variables by name, and the masks."""
         dataset = result.to_dataset()
         names = (*self.variables, *self.masks)
         return {name: dataset[name].values for name in names if name in dataset}
 
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class InvertTask(Task):
-    """Inversion of each shot."""
-
-    kind = "inversion"
-
-    @property
-    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-        """Dimensions and labels of all variables that the results can have."""
-        return variable_labels(self.setup)
-
-    @property
-    def masks(self) -> dict[str, MaskVariable]:
-        """As of all tasks; each row of a table may have its own, of image and source."""
-        return mask_variables([None, None], "shot") if self.by_row else super().masks
-
     def run(
         self,
-        images: Sequence[Shot],
+        image: Shot,
         source: AnyArray | None,
         workers: int | None,
         should_stop: ShouldStop | None,
     ) -> Inversion:
         """Apply the recipe to a shot as recorded, with its own source or else `source`."""
-        (image,) = images
         common = self.inputs.shot
         if np.shape(image.image) != common.shape:
             reference = "the others" if common.source is None else "the source"
@@ -188,7 +166,10 @@ class InvertTask(Task):
         # Doubts about the file are in the report of the shot.
         shot = self.completed(replace(image, cautions=()), source)
         setup = image.setup if self.by_row else self.requested.setup
-        inputs = collect_inputs(self.of_shot(setup=setup), shot)
+        # Without masks: the shot has those of all.
+        cleared = {"source": self.requested.estimate, "mask": None, "source_mask": None}
+        recipe = self.requested.model_copy(update={**cleared, "setup": setup})
+        inputs = collect_inputs(recipe, shot)
         if shot.source is common.source:
             origin = self.inputs.provenance.image.source
             inputs = replace(inputs, provenance=inputs.provenance.with_image(source=origin))
@@ -215,112 +196,20 @@ class InvertTask(Task):
 
     def report(self, result: Inversion) -> dict[str, Any]:
         """Return the report of a shot, with its own provenance if it is a row of a table."""
+        headline, field = result.headline, result.main_field
         entries = {
             **dataclasses.asdict(result.report),
             "errors": None if result.errors is None else result.errors.to_dict(),
             "stages": result.report.seconds,
-            **_headline_of(result, result.main_field),
-            **column_values(ROWS if self.by_row else INVERSIONS, result),
+            "headline": str(headline),
+            "level": headline.level.value,
+            "peak": {"symbol": field.symbol, "value": field.largest, "unit": field.unit},
+            **column_values(result, own_setup=self.by_row),
         }
         if self.by_row:
             assert result.provenance is not None
             entries["provenance"] = json.loads(result.provenance.to_json())
         return entries
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FitTask(Task):
-    """Fit of the forward model to each shot, from its images as recorded."""
-
-    kind = "fit"
-
-    @property
-    def choices(self) -> FitChoices:
-        return self.requested.fit or FitChoices()
-
-    @property
-    def field(self) -> str:
-        """Name of the field that is fitted to each shot."""
-        setups = None if self.setup is None else [self.setup]
-        (name,) = self.choices.fields or usual_fields(setups)
-        return name
-
-    @property
-    def labels(self) -> dict[str, tuple[tuple[str, ...], dict[str, str]]]:
-        return fit_labels(self.field, self.setup)
-
-    @property
-    def attributes(self) -> dict[str, str]:
-        return {**super().attributes, "fields": json.dumps([self.field])}
-
-    def run(
-        self,
-        images: Sequence[Shot],
-        source: AnyArray | None,
-        workers: int | None,
-        should_stop: ShouldStop | None,
-    ) -> Fit:
-        """Fit a shot."""
-        completed = [self.completed(shot, source) for shot in images]
-        fit = run_fit(self._recipe, completed, should_stop=should_stop)
-        shape = fit.fields[0].potential.shape
-        if shape != self.shape:
-            raise InputError(f"the field has shape {shape}, expected {self.shape} as the others")
-        if fit.setup != self.setup:
-            raise InputError(
-                "the setup of its first image differs from that of the other shots' first images, "
-                "and a store has one: write these shots into another store"
-            )
-        return fit
-
-    @property
-    def _recipe(self) -> Recipe:
-        """The recipe for a worker; simultaneous fits share the cores."""
-        options = self.choices.options
-        if options.threads is None:
-            options = options.model_copy(update={"threads": 1})
-        choices = self.choices.model_copy(update={"fields": (self.field,), "options": options})
-        return self.of_shot(setup=None, fit=choices)
-
-    def completed(self, shot: Shot, source: AnyArray | None) -> Shot:
-        complete = super().completed(shot, source)
-        return replace(
-            complete,
-            setup=self.requested.setup if shot.setup is None else shot.setup,
-            source=shot.source if complete.source is None else complete.source,
-        )
-
-    def report(self, result: Fit) -> dict[str, Any]:
-        entries = {
-            **_headline_of(result, result.shown(result.fields[0])),
-            **column_values(FITS, result),
-            "explanation": result.explanation,
-            "chi2_images": result.chi2.tolist(),
-            "brightness": result.brightness.tolist(),
-            "strengths": result.strengths.tolist(),
-            "objective": result.report.objective,
-            "stages": result.report.seconds,
-        }
-        provenance = result.provenance
-        if provenance is not None and any(image.file for image in provenance.images):
-            entries["images"] = [
-                image.model_dump(mode="json", exclude_none=True, exclude={"mask", "source_mask"})
-                for image in provenance.images
-            ]
-        return entries
-
-
-AnyTask = InvertTask | FitTask
-
-
-def _headline_of(result: Inversion | Fit, field: ShownField) -> dict[str, Any]:
-    """Return the headline of a result, and the peak of its field, for the report of a shot."""
-    headline = result.headline
-    return {
-        "headline": str(headline),
-        "level": headline.level.value,
-        "peak": {"symbol": field.symbol, "value": field.largest, "unit": field.unit},
-    }
 
 
 def _divide_by_mean(image: AnyArray, mask: BoolArray | None) -> AnyArray:
@@ -359,7 +248,7 @@ class TaskContext:
     """Context that the tasks of all shots share."""
 
     writer: ShotWriter
-    task: AnyTask
+    task: Task
     workers: int | None
 
 
@@ -370,24 +259,24 @@ def run_shot(
     context: TaskContext,
     block: AnyArray | None = None,
 ) -> ShotOutcome:
-    """Task: load a shot, invert or fit it, and write it; what goes wrong with it is its outcome.
+    """Task: load a shot, invert it, and write it; what goes wrong with it is its outcome.
 
     A shot is replaced by its block of a dask array if a cluster has computed that already.
     """
     if block is not None:
         shot = ArrayExposure(shot.name, block, source=shot.source)
     task, began = context.task, time.perf_counter()
-    result: Any = None
+    result: Inversion | None = None
     origin: dict[str, Any] = {}
     entries: dict[str, Any] = {}
     try:
         origin = shot.stamp()
-        images, loaded = shot.load()
+        image, loaded = shot.load()
         origin |= loaded
         source = None
         if shot.source is not None:
             source, origin["source"] = shot.source.read()
-        result = task.run(images, source, context.workers, should_stop)
+        result = task.run(image, source, context.workers, should_stop)
         entries = task.report(result)
     except InversionCancelled:
         raise

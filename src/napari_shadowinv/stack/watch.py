@@ -163,7 +163,7 @@ def watch_stack(
     on_progress: OnStatus | None = None,
     should_stop: ShouldStop | None = None,
 ) -> xarray.Dataset | None:
-    """Invert, or fit, each file that arrives in a folder as soon as it is completely written.
+    """Invert each file that arrives in a folder as soon as it is completely written.
 
     It is a run of `run_stack` whose shots arrive while it goes on. Existing files come first, in
     counting order of their names, then new ones in the order in which they were completed; each
