@@ -230,7 +230,7 @@ def damage(path: Path, rng: random.Random) -> None:
 
 def read_whole(path: Path) -> None:
     """Read all that the package reads of a file."""
-    from napari_shadowinv.cli._batch import status_tables
+    from napari_shadowinv.cli._batch import status_table
     from napari_shadowinv.cli._info import file_table
     from napari_shadowinv.film import Calibration
     from napari_shadowinv.io import read, read_toml
@@ -244,7 +244,7 @@ def read_whole(path: Path) -> None:
         return
     content = read(path)
     if path.is_dir():
-        status_tables(path, every=True)
+        status_table(path)
         _load_shots(path, content)
     else:
         file_table(path)

@@ -67,10 +67,8 @@ COMMANDS = {
     "--out run.shadowinv.zarr",
     "table": "batch shots.csv --setup low.toml --set options.n_sites=1500 "
     "--out table.shadowinv.zarr",
-    "fits": "batch pairs.csv --set fit.beam=known --setup low.toml --out fits.shadowinv.zarr",
-    "status": "info run.shadowinv.zarr --all",
+    "status": "info run.shadowinv.zarr",
     "verify": "info table.shadowinv.zarr --verify",
-    "fit status": "info fits.shadowinv.zarr --all",
     "export": "export run.shadowinv.zarr --format csv --out run.csv",
     "plan": "plan toroid:peak=60,radius=20e-6 --setup low.toml --size 64x64 --set plan.draws=2 "
     "--out plan.csv",
@@ -102,12 +100,6 @@ def write_inputs(folder: Path) -> None:
     for name, energy in (("low", 14.7), ("high", 30.0)):
         (folder / f"{name}.toml").write_text(SETUP.format(energy=energy))
     (folder / "shots.csv").write_text("file,source,energy\nlow.npy,beam.npy,14.7\nhigh.npy,,30\n")
-    rows = "".join(
-        f"{name}.npy,beam.npy,{energy},{shot}\n"
-        for shot in "ab"
-        for name, energy in (("low", 14.7), ("high", 30))
-    )
-    (folder / "pairs.csv").write_text(f"file,source,energy,shot\n{rows}")
     (folder / "wrong.toml").write_text("[options]\nn_site = 3\n")
     data = Path(os.environ.get("SHADOWINV_DATA", "../shared/data"))
     if (data / "toroid/dm097_noise.npy").exists():

@@ -75,7 +75,7 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     "info shots.h5::shop": ("shots.h5", "'shop'", "day/beam"),
     "info shots.h5::day": ("no array 'day'", "day/beam"),
     "info missing.tif": "missing.tif",
-    "info shots --all": "is not a stack of shots",
+    "info shots --verify": "is not a stack of shots",
     "info none.shadowinv.zarr": "none.shadowinv.zarr does not exist",
     "export shots --format csv": "is not a stack of shots",
     "forward missing.tif": "missing.tif",

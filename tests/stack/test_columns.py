@@ -43,10 +43,6 @@ def test_added_column_is_read_and_listed_everywhere(
     assert written.site_count.attrs["long_name"] == "Number of sites"
     assert StackStore(out).columns[-1] is site_column
 
-    listed = done("info", out, "--all")
-    assert "places" in listed
-    assert "0100" in listed
-
     table = tmp_path / "t.csv"
     done("export", out, "--format", "csv", "--out", table)
     with table.open(newline="", encoding="utf-8") as f:

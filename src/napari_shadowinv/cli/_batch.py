@@ -2,7 +2,7 @@
 
 - progress and summary of `shadowinv batch`: `run_batch`
 - a line for each shot of `shadowinv watch`, and a summary: `run_watch`
-- the tables of `shadowinv info`: `status_tables`
+- the table of `shadowinv info`: `status_table`
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import typer
-from rich import box
 from rich.table import Table
 
 from napari_shadowinv._system.progress import Progress
@@ -31,7 +30,6 @@ from napari_shadowinv.cli._terminal import (
     EXIT_NOT_CONVERGED,
     cancel_exit_code,
     is_interrupted,
-    plain,
     say,
     say_on_stderr,
     work_callbacks,
@@ -52,7 +50,6 @@ from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
     from napari_shadowinv._system.progress import OnProgress
-    from napari_shadowinv.io.store_columns import ShotColumn
     from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
     from napari_shadowinv.preprocessing import Recipe
     from napari_shadowinv.stack import RunStatus
@@ -243,25 +240,24 @@ def _site_rows(store: StackStore) -> Rows:
     return rows
 
 
-def _troubles(store: StackStore) -> Iterator[tuple[int, str, str, str]]:
-    """Yield number, label, code and text of each reason to look at a shot."""
-    for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
+def _troubles(store: StackStore) -> Iterator[tuple[str, str, str, str]]:
+    """Yield name, label, code and text of each reason to look at a shot."""
+    for name, status, report in zip(store.names, store.statuses(), store.reports(), strict=True):
         if status in (FAILED, DAMAGED):
             reason = report.get("reason", "its report is missing")
-            yield index, STATUS_NAMES[status], reason, reason
+            yield name, STATUS_NAMES[status], reason, reason
         for caution in map(Caution.from_json, report.get("warnings", ())):
             code = caution.text if caution.code == "other" else caution.code
-            yield index, "warning", code, caution.text
+            yield name, "warning", code, caution.text
         if status == DONE and not report.get("converged"):
-            yield index, "warning", "not-converged", "the solver did not converge"
+            yield name, "warning", "not-converged", "the solver did not converge"
 
 
 def _trouble_rows(store: StackStore) -> Rows:
     """Count the verdicts, and list the shots that failed, are damaged or doubtful, by reason."""
     troubles: dict[tuple[str, str], tuple[str, dict[str, None]]] = {}
-    for index, label, code, text in _troubles(store):
-        if code != "verdict":  # it is counted below
-            troubles.setdefault((label, code), (text, {}))[1][store.names[index]] = None
+    for name, label, code, text in _troubles(store):
+        troubles.setdefault((label, code), (text, {}))[1][name] = None
     verdicts: dict[str, list[str]] = {Verdict.DETERMINED.value: []}
     for name, report in zip(store.names, store.reports(), strict=True):
         if "verdict" in report:
@@ -279,7 +275,8 @@ def _trouble_rows(store: StackStore) -> Rows:
         ]
         rows += [(label, text) for text in listed[:_MAX_LISTED]]
         if len(listed) > _MAX_LISTED:
-            more = f"and {len(listed) - _MAX_LISTED} more: shadowinv info {store.path} --all"
+            command = f"shadowinv export {store.path} --format csv"
+            more = f"and {len(listed) - _MAX_LISTED} more: {command}"
             rows.append((label, more))
     rows += [(STATUS_NAMES[DAMAGED], problem) for problem in store.damage.files[:_MAX_LISTED]]
     if store.damage.shots:
@@ -292,47 +289,18 @@ def _list_text(names: Sequence[str]) -> str:
 
 
 @as_file_errors
-def status_tables(path: Path, every: bool, verify: bool = False) -> tuple[list[Table], bool]:
-    """Describe a store and each shot, and return whether anything is damaged.
+def status_table(path: Path, verify: bool = False) -> tuple[Table, bool]:
+    """Describe a store, and return whether anything is damaged.
 
     With `verify`, read all files and compare them with their checksums.
     """
     store = StackStore(path, every_byte=verify)
-    rows = [*_store_rows(store), *([] if every else _trouble_rows(store))]
+    rows = [*_store_rows(store), *_trouble_rows(store)]
     if verify:
         count = len(store.damage.shots) + len(store.damage.files)
         text = f"{count} do not match" if count else "all files match"
         rows.append(("checksums", text))
-    tables = [two_columns(str(path), rows)]
-    is_damaged = bool(store.damage.shots or store.damage.files)
-    if not every:
-        return tables, is_damaged
-    listed = _column_table(store, [column for column in store.columns if column.show])
-    # A column of the table above would leave them a few letters a line.
-    notes: Rows = [(f"shot {index}", text) for index, _, _, text in _troubles(store)]
-    tables += [listed, *([two_columns("Reasons and warnings", notes)] if notes else [])]
-    return tables, is_damaged
-
-
-def _column_table(store: StackStore, columns: Sequence[ShotColumn]) -> Table:
-    shots = Table(box=box.SIMPLE, pad_edge=False)
-    for heading in ("shot", "name"):
-        shots.add_column(heading, overflow="fold")
-    for column in columns:
-        shots.add_column(column.title, overflow="fold", min_width=column.width or None)
-    for index, (status, report) in enumerate(zip(store.statuses(), store.reports(), strict=True)):
-        shots.add_row(
-            str(index),
-            plain(store.names[index]),
-            *(
-                STATUS_NAMES[status]
-                if column.key == "verdict" and status != DONE
-                else plain(column.text(report))
-                for column in columns
-            ),
-            style="red" if status in (FAILED, DAMAGED) else "",
-        )
-    return shots
+    return two_columns(str(path), rows), bool(store.damage.shots or store.damage.files)
 
 
 def _store_rows(store: StackStore) -> Rows:

@@ -6,11 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv._system.tables import write_cells
-from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
@@ -18,10 +15,8 @@ from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.files import make_folder
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
-from napari_shadowinv.io.store import STATUS_NAMES, StackStore, read_stack
+from napari_shadowinv.io.store import STATUS_NAMES, StackStore
 from napari_shadowinv.io.store_shots import open_shots, parse_shots
-from napari_shadowinv.physics.setup import SETUPS
-from napari_shadowinv.physics.units import display_unit
 from napari_shadowinv.pipeline.rerun import provenance_of
 
 if TYPE_CHECKING:
@@ -94,37 +89,23 @@ def _planes(shot: xarray.Dataset, variables: list[str]) -> Iterator[tuple[str, x
             yield variable, shot[variable]
 
 
-def _write_table(store: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
-    """Write one row per shot, done or not, with the peak magnitude of each field."""
-    content, dataset = StackStore(store), read_stack(store)
-    in_si = [field.name for kind in SETUPS.values() for field in kind.si_fields]
-    peaks = {
-        f"{name}_peak ({display_unit(dataset[name].attrs['units'])})": _peaks(dataset, name)
-        for name in dict.fromkeys(["potential", "displacement", *in_si])
-        if name in dataset
-    }
-    headings = {column.key: column.heading for column in content.columns} | {"reason": "reason"}
-    statuses, reports, count = content.statuses(), content.reports(), len(content.names)
-    rows = [
-        {"shot": index, "name": content.names[index], "status": STATUS_NAMES[statuses[index]]}
-        | {heading: reports[index].get(key, "") for key, heading in headings.items()}
-        | {heading: f"{values[index]:.9g}" for heading, values in peaks.items()}
-        for index in (range(count) if shots is None else parse_shots(shots, count))
-    ]
-    cells = [{heading: _escape_cell(value) for heading, value in row.items()} for row in rows]
+def _write_table(path: Path, out: Path, shots: str | None, overwrite: bool) -> Path:
+    """Write one row per shot, done or not, with the peak of its main field."""
+    store = StackStore(path)
+    statuses, reports, count = store.statuses(), store.reports(), len(store.names)
+    headings = {column.key: column.heading for column in store.columns} | {"reason": "reason"}
+    rows = []
+    for index in range(count) if shots is None else parse_shots(shots, count):
+        report = reports[index]
+        peak = report.get("peak", {})
+        row = {"shot": index, "name": store.names[index], "status": STATUS_NAMES[statuses[index]]}
+        row |= {"peak": peak.get("value", ""), "peak_unit": peak.get("unit", "")}
+        row |= {heading: report.get(key, "") for key, heading in headings.items()}
+        rows.append({heading: _escape_cell(value) for heading, value in row.items()})
+    columns = ["shot", "name", "status", "peak", "peak_unit", *headings.values()]
     with replacing(out, overwrite) as temporary:
-        write_cells(temporary, ["shot", "name", "status", *headings.values(), *peaks], cells)
+        write_cells(temporary, columns, rows)
     return out
-
-
-def _peaks(dataset: xarray.Dataset, name: str) -> FloatArray:
-    """Return the largest magnitude of a field in each shot; NaN until a shot is done."""
-    squared = dataset[name].astype(np.float64) ** 2
-    if "component" in squared.dims:
-        squared = squared.sum("component", skipna=False)
-    if "mask" in dataset:
-        squared = squared.where(dataset["mask"] | squared.isnull(), 0.0)
-    return np.asarray(squared.max(("y", "x"), skipna=False) ** 0.5)
 
 
 def protect_store(store: Path, output: Path) -> None:

@@ -138,7 +138,6 @@ def rerun(
 @notify_errors
 def info(
     file: Annotated[Path, _flags.argument(help="An image, a result or a store.")],
-    every: Annotated[bool, Option("--all", help="List each shot of a store.")] = False,
     verify: Annotated[bool, Option("--verify", help=HELP["verify"])] = False,
 ) -> None:
     """Describe a file and its contents, or the shots of a store and why some failed."""
@@ -146,16 +145,15 @@ def info(
     from napari_shadowinv.io import is_stack
 
     if is_stack(file):
-        from napari_shadowinv.cli._batch import status_tables
+        from napari_shadowinv.cli._batch import status_table
 
-        tables, is_damaged = status_tables(file, every, verify)
-        for table in tables:
-            say(table)
+        table, is_damaged = status_table(file, verify)
+        say(table)
         if verify and is_damaged:
             raise Exit(EXIT_FAILED_SHOTS)
         return
-    if every or verify:
-        raise InputError(f"{file} is not a stack of shots: --all and --verify describe a store")
+    if verify:
+        raise InputError(f"{file} is not a stack of shots: --verify describes a store")
     say(_info.file_table(file))
 
 

@@ -1,8 +1,8 @@
 """Numbers and words of each shot, as stores, tables and windows list them: `COLUMNS`.
 
 A column is described once. Who reads a store gets an array of each of its columns, ``shadowinv
-export --format csv`` writes them all, ``shadowinv info --all`` and the window of a stack list those
-that have a function to `show` them. A store itself holds them in the reports of its shots.
+export --format csv`` writes them all, the window of a stack lists those that have a function to
+`show` them. A store itself holds them in the reports of its shots.
 
 - add a column: one entry of `COLUMNS`
 - the columns of a store: `columns_of`; their values from a result: `column_values`
@@ -36,7 +36,6 @@ class ShotColumn:
     # from the run.
     value: Callable[[Any], Any] | None = None
     show: Callable[[Any], str] | None = None  # in tables for people, which omit columns without it
-    width: int = 0  # least number of characters of a table's column
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "title", self.title or self.key.replace("_", " "))
@@ -81,7 +80,6 @@ COLUMNS: tuple[ShotColumn, ...] = (
         kind=str,
         value=lambda result: str(result.verdict),
         show=str,
-        width=len("determined"),  # not broken into letters
     ),
     ShotColumn(
         "cautions",
@@ -101,7 +99,6 @@ COLUMNS: tuple[ShotColumn, ...] = (
         kind=str,
         value=attrgetter("limited_by"),
         show=str,
-        width=len("beam 12 %"),
     ),
     ShotColumn(
         "converged", "Whether the solver converged", kind=bool, value=attrgetter("report.converged")

@@ -15,7 +15,7 @@ class _StoreOptions(CheckedModel, allow_inf_nan=False):
         default=None,
         description="Variables to store; on the command line, separated by commas. Default: "
         "potential, displacement, caustic and mask, at a million pixels 14 MB per shot before "
-        "compression; of a fit, potential, displacement and its error bars.",
+        "compression.",
     )
     dtype: Literal["float32", "float64"] = Field(
         default="float32",
