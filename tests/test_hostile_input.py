@@ -117,9 +117,9 @@ def test_model_inside_another_is_named_with_its_place() -> None:
         (lambda: invert(SHOT, plan="x"), "plan is 'x', expected SitePlan"),
         (lambda: plan_sites(SHOT, options=5), "options is 5"),
         (lambda: run("x", SHOT), "recipe is 'x', expected Recipe"),
-        (lambda: run_stack([SHOT], "a.shadowinv.zarr", "x"), "recipe is 'x'"),
+        (lambda: run_stack(SHOT[None], "a.shadowinv.zarr", "x"), "recipe is 'x'"),
         (
-            lambda: run_stack([SHOT], "a.shadowinv.zarr", run=[1]),
+            lambda: run_stack(SHOT[None], "a.shadowinv.zarr", run=[1]),
             r"run is \[1\], expected RunOptions",
         ),
         (lambda: fit(np.ones((32, 32)), options="x"), "options is 'x', expected FitOptions"),

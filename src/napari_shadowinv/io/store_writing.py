@@ -1,7 +1,7 @@
 """Writing a store of many shots: create it, add shots to it, write each.
 
-- create a store with all shots pending: `create_store`
-- make room for more shots: `grow_store`
+- create a store without shots: `create_store`
+- make room for shots, all pending: `grow_store`
 - write a shot, or why it failed, also in a worker: `ShotWriter`
 
 The folder's own ``zarr.json`` holds a copy of every array's shape, and who opens the store goes
@@ -15,7 +15,7 @@ import os
 import secrets
 import shutil
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
@@ -28,7 +28,6 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from napari_shadowinv._system.hidden_files import hidden_name
 from napari_shadowinv._system.machine import defer_interrupts
-from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, RunInterruptedError
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.io.store import (
@@ -44,7 +43,7 @@ from napari_shadowinv.io.store_damage import chunk_file, fields_of, is_along_sho
 if TYPE_CHECKING:
     import xarray
 
-OF_SHOTS = ("shot", "name")  # coordinates of the shots
+_OF_SHOTS = ("shot", "name")  # coordinates of the shots
 _TOGETHER = 1024  # of their values are one file
 
 
@@ -131,13 +130,10 @@ def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
     return arrays
 
 
-def create_store(
-    path: Path, empty: xarray.Dataset, shots: Mapping[str, AnyArray], *, overwrite: bool = False
-) -> StackStore:
-    """Create a store with all its shots pending; it appears completely or not at all.
+def create_store(path: Path, empty: xarray.Dataset, *, overwrite: bool = False) -> StackStore:
+    """Create a store of a dataset without shots; it appears completely or not at all.
 
-    It holds the dataset `empty`, without shots, and the coordinates of the `shots`, `OF_SHOTS`. The
-    run must hold the store's lock.
+    The run must hold the store's lock.
     """
     if path.exists() and not overwrite:
         raise FileFormatError(f"{path} exists: resume it, overwrite it, or choose another name")
@@ -149,7 +145,6 @@ def create_store(
             # Zarr writes in a thread of its own, which would go on behind our back.
             with defer_interrupts():
                 _write_template(new, empty)
-                _lengthen(new, shots, {})
             if path.exists():
                 os.replace(path, old)
             os.replace(new, path)
@@ -171,32 +166,23 @@ def remove_unfinished(path: Path) -> None:
                 Path(folder, name).unlink(missing_ok=True)
 
 
-def grow_store(path: Path, shots: Mapping[str, AnyArray], attributes: Mapping[str, Any]) -> None:
-    """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged.
-
-    `shots` are the coordinates of the new shots, as of `create_store`.
-    """
-    with _as_store_errors(path):
-        _lengthen(path, shots, attributes)
-
-
-def _lengthen(path: Path, shots: Mapping[str, AnyArray], attributes: Mapping[str, Any]) -> None:
+def grow_store(path: Path, names: Sequence[str], attributes: Mapping[str, Any]) -> None:
+    """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged."""
     # The store is longer once its description is replaced.
-    with _changing_description(path) as metadata:
+    with _as_store_errors(path), _changing_description(path) as metadata:
         arrays = _open_to_write(path)
         longer = [name for name, array in arrays.items() if is_along_shots(array)]
         before = metadata["consolidated_metadata"]["metadata"]["status"]["shape"][0]
-        length = before + len(shots["shot"])
+        length = before + len(names)
         for name in longer:
             array = arrays[name]
             # Beyond the end stated in the folder's own copy: nobody sees it yet.
             if array.shape[0] < length:
                 array.resize((length, *array.shape[1:]))
-            if name in shots:
-                array[before:length] = shots[name]
-        metadata["attributes"].update(attributes)
-        for name in longer:
             metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
+        arrays["shot"][before:length] = np.arange(before, length)
+        arrays["name"][before:length] = np.array(names, np.dtypes.StringDType())
+        metadata["attributes"].update(attributes)
 
 
 @contextmanager
@@ -234,7 +220,7 @@ def _encoding(name: str, variable: xarray.Variable, small: int = 64) -> dict[str
     """Return how an array is stored; `small` chunks are not worth compressing."""
     # A chunk is one file. Names and numbers of the shots are in few files, with room for new ones;
     # other values along the shots in a file for each.
-    first = [_TOGETHER if name in OF_SHOTS else 1] if variable.dims[:1] == ("shot",) else []
+    first = [_TOGETHER if name in _OF_SHOTS else 1] if variable.dims[:1] == ("shot",) else []
     chunks = (*first, *(max(1, length) for length in variable.shape[len(first) :]))
     is_plain = variable.dtype.kind == "T" or np.prod(chunks) <= small
     # Fields compress well once their slowly changing bytes are next to each other.

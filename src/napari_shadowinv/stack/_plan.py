@@ -65,7 +65,7 @@ class Stack:
     @cached_property
     def sizes(self) -> dict[str, int]:
         height, width = self.task.shape
-        sizes = {"shot": len(self.shots), "y": height, "x": width, "component": 2}
+        sizes = {"shot": 0, "y": height, "x": width, "component": 2}
         for dims, *_ in self.task.masks.values():
             sizes |= zip(dims[-2:], self.task.inputs.shot.shape, strict=True)
         options = self.task.recipe.options
@@ -251,33 +251,27 @@ def _check_variables(names: Collection[str], recipe: Recipe, *, own_masks: bool)
         )
 
 
-def coordinates_of(stack: Stack) -> dict[str, Any]:
-    # Where setups differ, so may the pixels' size.
-    setup = None if stack.task.by_row else stack.task.setup
-    plane = dataset_from_field(np.zeros((2, *stack.task.shape)), None, setup)
-    shots = stack.shots
-    numbers = np.arange(len(shots)) if shots.coordinate is None else shots.coordinate
-    coords: dict[str, Any] = {str(name): value for name, value in plane.coords.items()}
-    coords["shot"] = ("shot", numbers, {"long_name": "Shot"})
-    coords["name"] = ("shot", np.array(shots.names, dtype=str), {"long_name": "Name of the shot"})
-    return coords
-
-
 def empty_results(stack: Stack) -> xarray.Dataset:
     """Return the dataset of a stack as its store has it, without a shot."""
     import xarray as xr
 
-    stack = replace(stack, shots=stack.shots.reordered([]))
-    variables = {}
-    for name, (of_one, labels) in stack.task.labels.items():
-        if name in stack.task.variables:
+    task, sizes, text = stack.task, stack.sizes, np.dtypes.StringDType()
+    variables: dict[str, Any] = {}
+    for name, (of_one, labels) in task.labels.items():
+        if name in task.variables:
             dims = ("shot", *of_one)
             fields = np.float64 if "site" in of_one else stack.dtype
             dtype = bool if name in ("caustic", "mask") else fields
-            variables[name] = dims, np.empty([stack.sizes[dim] for dim in dims], dtype), labels
-    for name, (dims, pixels, labels) in stack.task.masks.items():
-        none = np.empty([stack.sizes[dim] for dim in dims], bool)
+            variables[name] = dims, np.empty([sizes[dim] for dim in dims], dtype), labels
+    for name, (dims, pixels, labels) in task.masks.items():
+        none = np.empty([sizes[dim] for dim in dims], bool)
         variables[name] = dims, none if pixels is None else pixels, labels
-    attributes = dataset_from_field(np.zeros((2, 4, 4)), None, stack.task.setup).attrs
-    attributes = {"format": FORMAT, **attributes, **stack.task.attributes}
-    return xr.Dataset(variables, coords=coordinates_of(stack), attrs=attributes)
+    # Where setups differ, so may the pixels' size.
+    setup = None if task.by_row else task.setup
+    plane = dataset_from_field(np.zeros((2, *task.shape)), None, setup)
+    coords: dict[Any, Any] = dict(plane.coords)
+    coords["component"] = coords["component"].astype(text)
+    coords["shot"] = xr.Variable("shot", np.empty(0, np.int64), {"long_name": "Shot"})
+    coords["name"] = xr.Variable("shot", np.empty(0, text), {"long_name": "Name of the shot"})
+    attributes = dataset_from_field(np.zeros((2, 4, 4)), None, task.setup).attrs
+    return xr.Dataset(variables, coords, {"format": FORMAT, **attributes, **task.attributes})

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import as_model
-from napari_shadowinv._typing import AnyArray, BoolArray
+from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError, RunInterruptedError
 from napari_shadowinv.inversion.compilation import ensure_compiled
 from napari_shadowinv.io import read_stack
@@ -39,7 +39,6 @@ from napari_shadowinv.io.store import (
     check_store_path,
 )
 from napari_shadowinv.io.store_writing import (
-    OF_SHOTS,
     ShotWriter,
     create_store,
     grow_store,
@@ -47,7 +46,7 @@ from napari_shadowinv.io.store_writing import (
 )
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.stack._plan import Stack, coordinates_of, describe_stack, empty_results
+from napari_shadowinv.stack._plan import Stack, describe_stack, empty_results
 from napari_shadowinv.stack._schedulers import Scheduler, scheduler_for
 from napari_shadowinv.stack._shots import FILES, Exposure, Reader, differences
 from napari_shadowinv.stack._worker import ShotOutcome, Task, TaskContext
@@ -191,9 +190,8 @@ def run_stack(
                 )
             if filled is None:
                 filled = StoreRun(create(path, stack, overwrite=run.overwrite))
-            else:
-                new = {name: each[len(filled.names) :] for name, each in _of_shots(stack).items()}
-                filled.append(new, source_image=stack.source_text(None))
+            new = stack.shots.names[len(filled.names) :]
+            filled.append(new, source_image=stack.source_text(None))
 
             def report(outcome: ShotOutcome | None = None) -> None:
                 name = "" if outcome is None else stack.shots.items[outcome.index].name
@@ -273,12 +271,11 @@ class StoreRun:
         """Return the report of a shot that has ended."""
         return dict(json.loads(str(self.writer.arrays()["report"][index]) or "{}"))
 
-    def append(self, shots: Mapping[str, AnyArray], **attributes: str) -> None:
-        """Append pending shots, described by their coordinates in a store."""
-        names = list(map(str, shots["name"]))
+    def append(self, names: Sequence[str], **attributes: str) -> None:
+        """Append pending shots."""
         if not names:
             return
-        grow_store(self._path, shots, attributes)
+        grow_store(self._path, names, attributes)
         self.numbers |= {name: index for index, name in enumerate(names, len(self.names))}
         self.names += names
         self.statuses.extend([PENDING] * len(names))
@@ -312,31 +309,9 @@ class StoreRun:
 
 
 def create(path: Path, stack: Stack, *, overwrite: bool) -> StackStore:
-    """Create the store of a stack, with all shots pending."""
-    dataset = empty_results(stack)
-    coordinates = {name: _as_stored(each.variable) for name, each in dataset.coords.items()}
+    """Create the store of a stack, without a shot."""
     identity = {name: value for name, value in _identity(stack).items() if value}
-    dataset = dataset.assign_coords(coordinates).assign_attrs(identity)
-    return create_store(path, dataset, _of_shots(stack), overwrite=overwrite)
-
-
-def _of_shots(stack: Stack) -> dict[str, AnyArray]:
-    """Return the coordinates of the shots as a store has them."""
-    import xarray as xr
-
-    coordinates = coordinates_of(stack)
-    return {name: _as_stored(xr.as_variable(coordinates[name])).values for name in OF_SHOTS}
-
-
-def _as_stored(coordinate: xarray.Variable) -> xarray.Variable:
-    """Return a coordinate with values that Zarr has: texts of any length, times as numbers."""
-    values = coordinate.to_base_variable()
-    if values.dtype.kind in "mM":
-        values = values.astype("datetime64[ns]").astype("int64")
-        values.attrs = {**values.attrs, "units": "ns since 1970-01-01"}
-    is_text = values.dtype.kind in "UO"
-    stored: xarray.Variable = values.astype(np.dtypes.StringDType()) if is_text else values
-    return stored
+    return create_store(path, empty_results(stack).assign_attrs(identity), overwrite=overwrite)
 
 
 def _identity(stack: Stack, shots: int | None = None) -> dict[str, str]:

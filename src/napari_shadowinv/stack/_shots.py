@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -41,8 +41,6 @@ from napari_shadowinv.shot import Shot
 
 if TYPE_CHECKING:
     import xarray
-
-Value = TypeVar("Value")
 
 _MAX_SHAPE_READS = 3  # shots that are read for the shape of all
 _OF_FITS = ("strength", "psf", "noise")
@@ -280,7 +278,6 @@ class Shots:
 
     items: Sequence[Exposure]
     shape: tuple[int, int]  # that they should have
-    coordinate: Any = None  # values of the coordinate ``shot`` of an xarray object
     mask: BoolArray | None = None  # pixels that can be used, if they came as masked arrays
 
     def __len__(self) -> int:
@@ -296,13 +293,7 @@ class Shots:
         return f"shot {index}" if name == str(index) else f"shot {index} ({name})"
 
     def reordered(self, order: Sequence[int]) -> Shots:
-        if list(order) == list(range(len(self))):
-            return self
-        return replace(
-            self,
-            items=[self.items[index] for index in order],
-            coordinate=None if self.coordinate is None else self.coordinate[list(order)],
-        )
+        return replace(self, items=[self.items[index] for index in order])
 
 
 def find_shots(
@@ -319,18 +310,11 @@ def find_shots(
     if isinstance(shots, Sequence) and all(isinstance(item, (str, Path)) for item in shots):
         items = _shots_of_files(shots, reader)
         return Shots(items, shape or usual_shape(items))
-    if isinstance(shots, Sequence) and all(np.ndim(item) == 2 for item in shots):
-        shapes = {np.shape(item) for item in shots}
-        if len(shapes) > 1:
-            raise InputError(
-                f"shots have shapes {', '.join(map(str, sorted(shapes)))}: expected the same "
-                "shape for all"
-            )
-        shots = np.stack([unpack_array(item, f"shots[{k}]") for k, item in enumerate(shots)])
     if not hasattr(shots, "ndim"):
         raise InputError(
-            f"shots are a {type(shots).__name__}: expected an array (shot, y, x), an xarray "
-            "object, paths, a glob such as 'shots/*.tif', or a file with many frames"
+            f"shots are a {type(shots).__name__}: expected an array (shot, y, x), such as "
+            "numpy.stack makes of images, an xarray object, paths, a glob such as 'shots/*.tif', "
+            "or a file with many frames"
         )
     return _from_array(shots)
 
@@ -368,29 +352,22 @@ def _distinct_names(frames: Sequence[FileFrame]) -> tuple[str, ...]:
 
 def usual_shape(items: Sequence[Exposure]) -> tuple[int, int]:
     """Shape of most of the first few shots that can be read; bad ones fail later, by name."""
-    shapes = _read_first(items, lambda shot: shot.shape(), _MAX_SHAPE_READS)
+    shapes: list[tuple[int, ...]] = []
+    errors: list[Exception] = []
+    for shot in items:
+        try:
+            shapes.append(shot.shape())
+        except Exception as error:
+            errors.append(error)
+        if len(shapes) == _MAX_SHAPE_READS:
+            break
+    if not shapes:
+        first = f", the first: {errors[0]}" if errors else ""
+        raise NoShotError(f"none of {len(items)} shots can be read{first}")
     usual = Counter(shapes).most_common(1)[0][0]
     if len(usual) != 2:
         raise InputError(f"shots have shape {usual}, expected (y, x): choose one channel or plane")
     return usual[0], usual[1]
-
-
-def _read_first(
-    items: Sequence[Exposure], read: Callable[[Exposure], Value], count: int
-) -> list[Value]:
-    """Read the first shots that can be read; others fail later, by name."""
-    values: list[Value] = []
-    first_error: Exception | None = None
-    for shot in items:
-        try:
-            values.append(read(shot))
-        except Exception as error:
-            first_error = first_error or error
-        if len(values) == count:
-            break
-    if not values:
-        raise NoShotError(f"none of {len(items)} shots can be read, the first: {first_error}")
-    return values
 
 
 def failure_text(error: Exception) -> str:
@@ -415,21 +392,19 @@ def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
             )
         shots = shots[chosen[0]]
     name = next((dim for dim in shots.dims if str(dim).lower() not in PLANE), "shot")
-    coordinate, labels = shots.coords.get(name), shots.coords.get("name")
+    labels = shots.coords.get("name")
     if not shots.variable._in_memory and name in shots.dims:
         shots = shots.chunk({name: 1})  # otherwise the whole file would be read
     values = unpack_array(shots, "shots", ("shot", *PLANE))
-    found = _from_array(
-        values,
-        None if coordinate is None else coordinate.values,
-        None if labels is None or labels.dims != (name,) else labels.values,
-    )
+    if labels is None or labels.dims != (name,):
+        labels = shots.coords.get(name)
+    found = _from_array(values, None if labels is None else labels.values)
     if usable is None or usable.dims != PLANE or usable.dtype != np.bool_:
         return found
     return replace(found, mask=usable.values)
 
 
-def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots:
+def _from_array(shots: Any, labels: Any = None) -> Shots:
     da: Any = import_module("dask.array")
     if shots.ndim != 3 or 0 in shots.shape:
         raise InputError(
@@ -446,10 +421,9 @@ def _from_array(shots: Any, coordinate: Any = None, labels: Any = None) -> Shots
         array = shots.rechunk((1, -1, -1))
     else:  # of h5py or zarr
         array = da.from_array(shots, chunks=(1, -1, -1))
-    numbers = range(count) if coordinate is None else coordinate
-    names = map(str, numbers if labels is None else labels)
+    names = map(str, range(count) if labels is None else labels)
     items = [ArrayExposure(name, array, index) for index, name in enumerate(names)]
-    return Shots(items, (shots.shape[1], shots.shape[2]), coordinate)
+    return Shots(items, (shots.shape[1], shots.shape[2]))
 
 
 def find_source(source: Any, reader: FileReader) -> AnyArray | Shots | None:

@@ -11,8 +11,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated, defer_interrupts
 from napari_shadowinv._system.progress import ShouldStop
@@ -101,11 +99,9 @@ class _GrowingRun:
             return
         with defer_interrupts():
             if self.filled is None:
-                empty = replace(self.stack, shots=self.stack.shots.reordered([]))
-                self.filled = StoreRun(create(self.path, empty, overwrite=self.options.overwrite))
-            new = [name for name in shots if name not in self.filled.numbers]
-            numbers = len(self.filled.names) + np.arange(len(new))
-            self.filled.append({"shot": numbers, "name": np.array(new, np.dtypes.StringDType())})
+                store = create(self.path, self.stack, overwrite=self.options.overwrite)
+                self.filled = StoreRun(store)
+            self.filled.append([name for name in shots if name not in self.filled.numbers])
             for name, shot in shots.items():
                 if self._is_to_run(self.filled, name, shot):
                     self.filled.reopen(self.filled.numbers[name])
