@@ -129,12 +129,6 @@ def test_existing_store_is_neither_resumed_nor_replaced(store):
 def test_mistakes_of_an_export_write_nothing(store):
     tiffs = ("export", store, "--format", "tiff", "--shots")
     done(*tiffs, "1", "--out", "tiffs")
-    for arguments in (
-        ["export", store, "--format", "tiff", "--out", store, "--overwrite"],
-        ["export", store, "--format", "csv", "--out", store / "table.csv"],
-        ["movie", store, "--out", store / "film.gif"],
-    ):
-        refused(*arguments, names="is inside the store being read")
     for text in ("6", "a", "1:2:3:4", ""):
         refused(*tiffs, text, names="expected numbers from 0 to 5")
     refused(*tiffs, "1", "--out", "tiffs", names="exists")

@@ -1,4 +1,4 @@
-"""The recipes for clusters, as the page has them, on a cluster imitated by a shell.
+"""The recipe for Slurm, as the page has it, on a cluster imitated by a shell.
 
 `sbatch` starts the job on this machine, with one worker in its process, and `scancel` ends it;
 scheduler, worker and the store are real.
@@ -7,10 +7,8 @@ scheduler, worker and the store are real.
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -39,21 +37,11 @@ SCANCEL = """#!/bin/sh
 kill -TERM -- -$(cat "$FAKE_SLURM/$1.pid")
 touch "$FAKE_SLURM/$1.cancelled"
 """
-SRUN = """#!/bin/sh
-exec "$@"
-"""
-# The commands of this very Python and this very code.
-DASK = f"""#!/bin/sh
-exec {sys.executable} -m dask "$@"
-"""
-SHADOWINV = f"""#!/bin/sh
-exec {sys.executable} -c "from napari_shadowinv.cli import app; app()" "$@"
-"""
 
 
 @pytest.fixture
 def project(night, tmp_path) -> Path:
-    """The folder that the recipes call /project."""
+    """The folder that the recipe calls /project."""
     folder = tmp_path / "project"
     (folder / "shots").mkdir(parents=True)
     for index, image in enumerate(night.images):
@@ -70,8 +58,7 @@ def slurm(tmp_path):
     commands, jobs = tmp_path / "bin", tmp_path / "jobs"
     commands.mkdir()
     jobs.mkdir()
-    scripts = {"sbatch": SBATCH, "scancel": SCANCEL, "srun": SRUN, "dask": DASK}
-    for name, text in {**scripts, "shadowinv": SHADOWINV}.items():
+    for name, text in {"sbatch": SBATCH, "scancel": SCANCEL}.items():
         (commands / name).write_text(text)
         (commands / name).chmod(0o755)
     yield {
@@ -118,30 +105,3 @@ def test_the_recipe_for_slurm_inverts_a_stack(project, slurm, tmp_path):
         assert words in job
     # The job is given back as soon as the run is over.
     assert (jobs / "0.cancelled").exists()
-
-
-def test_the_recipe_without_dask_jobqueue(project, slurm, tmp_path):
-    (lines,) = re.findall(r"^    (dask scheduler .*\n(?:    .*\n)+)", PAGE, re.MULTILINE)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    ours = "--host 127.0.0.1 --dashboard-address 127.0.0.1:0"
-    for theirs, local in (
-        ("/project", str(project)),
-        ("dask scheduler", f"dask scheduler {ours} --port {port}"),
-        ("dask worker", f"dask worker {ours} --no-nanny"),
-        ("--nworkers 32", "--nworkers 1"),
-        ("$(hostname):8786", f"127.0.0.1:{port}"),
-    ):
-        assert theirs in lines
-        lines = lines.replace(theirs, local)
-    job = subprocess.Popen(
-        ["sh", "-c", lines], env=slurm, cwd=tmp_path, start_new_session=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-    )  # fmt: skip
-    try:
-        code = job.wait(PATIENCE)
-    finally:
-        end_group(job.pid)
-    assert code == 0, job.communicate()[0]
-    assert list(read(project / "night.shadowinv.zarr").status) == [DONE] * 6

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv._system.tables import write_cells
 from napari_shadowinv.cli._terminal import escape_invisible
 from napari_shadowinv.errors import InputError
@@ -16,7 +15,7 @@ from napari_shadowinv.io.files import make_folder
 from napari_shadowinv.io.formats import PRADFORMAT, TIFF
 from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import STATUS_NAMES, StackStore
-from napari_shadowinv.io.store_shots import open_shots, parse_shots
+from napari_shadowinv.io.store_shots import check_images, open_shots, parse_shots
 from napari_shadowinv.pipeline.rerun import provenance_of
 
 if TYPE_CHECKING:
@@ -32,12 +31,11 @@ def export_shots(
     """Write shots of a store in another format; return the files."""
     if form not in FORMATS:
         raise InputError(f"format is {form!r}: expected one of {', '.join(FORMATS)}")
-    protect_store(store, out)
     if form == "csv":
         return [_write_table(store, out, shots, overwrite)]
     dataset = open_shots(store, shots)
     if form == "tiff":
-        _check_images(dataset, variables)
+        check_images(dataset, variables)
     contents: dict[Path, tuple[Any, Any]] = {}  # of the files, with their setups
     for position in range(dataset.sizes["shot"]):
         shot = dataset.isel(shot=position)
@@ -68,17 +66,6 @@ def _stem(shot: xarray.Dataset) -> str:
     return f"{int(shot['index']):04d}_{safe}"
 
 
-def _check_images(dataset: xarray.Dataset, variables: list[str]) -> None:
-    for variable in variables:
-        dims = dataset[variable].dims if variable in dataset else ()
-        if dims[:1] != ("shot",) or dims[-2:] != ("y", "x"):
-            images = [name for name in dataset.data_vars if dataset[name].dims[-2:] == ("y", "x")]
-            raise InputError(
-                f"the store has no images {variable!r}: expected one or more of "
-                f"{', '.join(map(str, images))}"
-            )
-
-
 def _planes(shot: xarray.Dataset, variables: list[str]) -> Iterator[tuple[str, xarray.DataArray]]:
     """Yield the planes of variables, of each component, with their names."""
     for variable in variables:
@@ -106,14 +93,6 @@ def _write_table(path: Path, out: Path, shots: str | None, overwrite: bool) -> P
     with replacing(out, overwrite) as temporary:
         write_cells(temporary, columns, rows)
     return out
-
-
-def protect_store(store: Path, output: Path) -> None:
-    """Refuse to write into a store that is read."""
-    if resolved_path(output).is_relative_to(resolved_path(store)):
-        raise InputError(
-            f"{output} is inside the store being read: choose another name for the output"
-        )
 
 
 def _escape_cell(value: Any) -> Any:

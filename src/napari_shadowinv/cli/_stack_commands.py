@@ -166,7 +166,6 @@ def movie(
     quiet: _flags.Quiet = False,
 ) -> None:
     """Make a movie of a store, with all shots on one colour scale."""
-    from napari_shadowinv.cli._export import protect_store
     from napari_shadowinv.io import check_output
     from napari_shadowinv.io.store_shots import open_shots
     from napari_shadowinv.plotting import stack_frames, write_film
@@ -174,7 +173,6 @@ def movie(
     if not 0.1 <= rate <= 120:
         raise InputError(f"--rate is {rate:g}: expected 0.1 to 120 shots per second")
     check_output(out, overwrite, suffixes=(".mp4", ".gif"))
-    protect_store(store, out)
     if out.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise FileFormatError(
             f"{out} needs the package imageio-ffmpeg: install it with pip install "

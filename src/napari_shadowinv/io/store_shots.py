@@ -2,15 +2,18 @@
 
 - the finished ones among them, opened lazily: `open_shots`
 - the numbers that a text stands for: `parse_shots`
+- a variable with an image of each shot: `check_images`
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.store import DAMAGED, DONE, StackStore, read_stack
 
@@ -43,6 +46,17 @@ def open_shots(path: Path, shots: str | None = None) -> xarray.Dataset:
             f"{path} has no finished shots in this selection: wait for them, or choose other shots"
         )
     return done
+
+
+def check_images(stack: xarray.Dataset, names: Sequence[str]) -> None:
+    """Refuse names that are no images of each shot, or vectors at each pixel."""
+    dims = {str(name): variable.dims for name, variable in stack.data_vars.items()}
+    images = [name for name in dims if dims[name][:1] == ("shot",) and dims[name][-2:] == PLANE]
+    for name in names:
+        if name not in images:
+            raise InputError(
+                f"the stack has no images {name!r}: expected one or more of {', '.join(images)}"
+            )
 
 
 def parse_shots(text: str, count: int) -> list[int]:

@@ -17,6 +17,7 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.files import replacing
+from napari_shadowinv.io.store_shots import check_images
 from napari_shadowinv.physics.units import display_unit, prefix_for, takes_prefix
 from napari_shadowinv.plotting._panels import choose_grid, image_scale, new_page, own_style
 
@@ -41,11 +42,7 @@ def stack_frames(
     setup = setup_from_dataset(stack)
     if variable is None:
         variable = "potential" if setup is None else "potential_si"
-    if variable not in stack or stack[variable].dims[-2:] != ("y", "x"):
-        images = [str(name) for name in stack.data_vars if stack[name].dims[-2:] == ("y", "x")]
-        raise InputError(
-            f"the stack has no images {variable!r}: expected one of {', '.join(images)}"
-        )
+    check_images(stack, [variable])
     field = stack[variable]
     used = None if variable in _RECORDED else stack.get("mask")
     low, high = _limits(field, used) if limits is None else limits
