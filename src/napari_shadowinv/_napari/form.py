@@ -114,17 +114,8 @@ class WrappingLabel(QtWidgets.QLabel):
         self.setVisible(bool(text))
 
 
-class SavedLine(QtWidgets.QLineEdit):
-    """An entry that can be saved between sessions."""
-
-    def __init__(self, example: str, tip: str) -> None:
-        super().__init__(placeholderText=example, toolTip=f"<qt>{tip}</qt>" if tip else "")
-
-    def state(self) -> str:
-        return str(self.text())
-
-    def restore(self, text: Any) -> None:
-        self.setText(str(text))
+def text_line(example: str, tip: str) -> QtWidgets.QLineEdit:
+    return QtWidgets.QLineEdit(placeholderText=example, toolTip=f"<qt>{tip}</qt>")
 
 
 # Dialogs of Qt for the path of a field, by the field's ``path``.
@@ -487,16 +478,13 @@ class ModelPicker(QWidget):
         """Return the validated model of the selected kind; None without a form."""
         return None if self.form is None else self.form.model()
 
-    def state(self) -> dict[str, Any]:
-        values = {kind: form.state() for kind, form in self._forms.items()}
-        return {"kind": self.kind, "values": values}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        for kind, values in state.get("values", {}).items():
-            form = self._form_of(kind) if kind in self._kinds else None
+    def restore(self, kind: str, values: Mapping[str, Mapping[str, Any]]) -> None:
+        """Choose a kind, and show values in the forms of kinds."""
+        for each, stated in values.items():
+            form = self._form_of(each) if each in self._kinds else None
             if form is not None:
-                form.restore(values)
-        self.set_kind(str(state.get("kind", self.kind)))
+                form.restore(stated)
+        self.set_kind(kind)
 
     def _remember(self, choice: Any) -> None:
         self.chosen = choice
@@ -571,7 +559,6 @@ class StepsSection(QWidget):
 
     def __init__(self, kinds: Mapping[str, type[Step]] = STEPS) -> None:
         super().__init__()
-        self._kinds = kinds
         self.forms: list[StepForm] = []
         self.choice = combo_box(
             "Processing of image, source and masks before the inversion or fit.",
@@ -580,8 +567,7 @@ class StepsSection(QWidget):
         self._list = QWidget()
         qt.column(self._list)
         self.folded = titled_section(self._list, labelled("", self.choice.native))
-        self._earlier = WrappingLabel(style=PROBLEM_STYLE)
-        qt.column(self, self.folded, self._earlier)
+        qt.column(self, self.folded)
         self.choice.changed.connect(self._on_choice)
         self._on_change()
 
@@ -602,26 +588,11 @@ class StepsSection(QWidget):
 
     def show_steps(self, steps: Sequence[Step]) -> None:
         """Replace the steps by others, folded."""
-        self._show([step.model_dump() for step in steps])
-
-    def state(self) -> list[dict[str, Any]]:
-        return [form.form.state() for form in self.forms]
-
-    def restore(self, state: Any) -> None:
-        """Show the steps of a saved state, and say that they are of an earlier image."""
-        self._show(state)
-        names = ", ".join(form.kind.title for form in self.forms)
-        text = f"Kept from an earlier image: {names}. Remove what does not suit this one."
-        self._earlier.show_text(text if names else "")
-
-    def _show(self, state: Any) -> None:
-        """Show steps from their values; ignore unknown steps."""
         with QSignalBlocker(self):
             for form in list(self.forms):
                 self._move(form, None)
-            for values in state:
-                if isinstance(values, Mapping) and values.get("step") in self._kinds:
-                    self.add(str(values["step"]), values).folded.collapse(animate=False)
+            for step in steps:
+                self.add(step.name(), step.model_dump()).folded.collapse(animate=False)
         self._on_change()
 
     def _on_choice(self, name: str) -> None:
@@ -645,7 +616,6 @@ class StepsSection(QWidget):
         self._on_change()
 
     def _on_change(self) -> None:
-        self._earlier.show_text("")
         # A folded section must show that there are steps.
         names = ", ".join(form.kind.title for form in self.forms)
         title = f"Steps: {names or 'none'}"

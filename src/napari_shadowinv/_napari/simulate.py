@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,7 +158,7 @@ class Simulate(panels.ToolPanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Trace the beam through the object, or invert shots with random imperfections."
-        super().__init__(napari_viewer, "simulate", Run("Run", tip))
+        super().__init__(napari_viewer, Run("Run", tip))
         self._predicted: Any = None  # layers of the last image; plans have others
         self._build_object()
         self._build_task()
@@ -171,7 +170,7 @@ class Simulate(panels.ToolPanel):
         self.add(self.object, self._size_row, self.setup, self.task, self.keep_earlier)
         self.add(self.panel, self.warning, self.verdict, self.save_result, self.plot, self.report)
         self._connect()
-        self.restore_last()
+        self.setup.choose_kind("proton")
         self._ready = True
         self._on_change()
 
@@ -188,9 +187,9 @@ class Simulate(panels.ToolPanel):
             "Object that deflects the beam.",
         )
         tip = "Height and width of an image in px, such as 200 x 200."
-        self.side = forms.SavedLine(_SIZE, tip)
+        self.side = forms.text_line(_SIZE, tip)
         self._size_row = forms.labelled("Size (px)", self.side)
-        self.setup = SetupPicker()
+        self.setup = SetupPicker("simulate")
 
     def _build_task(self) -> None:
         tip = "Image layer of the undisturbed beam."
@@ -206,7 +205,7 @@ class Simulate(panels.ToolPanel):
         self._deflector_row = forms.labelled("Deflected by", self.deflector.native)
         image, plan = QWidget(), QWidget()
         column(image, forms.labelled("Source", self.source), self._deflector_row)
-        self.energies = forms.SavedLine(
+        self.energies = forms.text_line(
             "14.7, 30",
             "Energies of several images of a shot in MeV (of light: wavelengths in m), separated "
             "by commas. Empty: one image with the setup's.",
@@ -245,25 +244,6 @@ class Simulate(panels.ToolPanel):
         self.task.set_kind(_IMAGE)
         self.object.set_kind(_LAYER)
         self.field.layer = layer
-
-    def parts(self) -> dict[str, Any]:
-        return {
-            "task": self.task,
-            "setup": self.setup,
-            "object": self.object,
-            "size": self.side,
-            "energies": self.energies,
-            "instrument": self.instrument,
-            "options": self.options,
-        }
-
-    def state(self) -> dict[str, Any]:
-        return {**super().state(), "setup": {**self.setup.state(), "kind": self.setup.kind}}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        super().restore(state)
-        if self.object.kind != _LAYER:
-            self.setup.choose_kind(str(state.get("setup", {}).get("kind", "proton")))
 
     def request(self) -> ForwardJob | PlanJob:
         setup = self.setup.setup()
@@ -385,4 +365,3 @@ class Simulate(panels.ToolPanel):
         self._deflector_row.setVisible(kind == _LAYER)
         has_size = is_plan and kind not in PHANTOMS
         self.side.setPlaceholderText("that of the field" if has_size else _SIZE)
-        self.keep()

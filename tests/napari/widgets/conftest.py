@@ -81,18 +81,13 @@ def open_widget(window):
 @pytest.fixture
 def opened(viewer, qtbot):
     """Make a widget of a class, as a session does when its menu is used first."""
-    widgets = []
 
     def make(kind):
-        widgets.append(kind(viewer))
-        qtbot.addWidget(widgets[-1])
-        return widgets[-1]
+        widget = kind(viewer)
+        qtbot.addWidget(widget)
+        return widget
 
-    yield make
-    # None writes into the settings of the next test.
-    for widget in widgets:
-        if hasattr(widget, "_writing"):
-            widget._writing.stop()
+    return make
 
 
 @pytest.fixture

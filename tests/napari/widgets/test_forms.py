@@ -161,7 +161,7 @@ def test_choices_for_recipes_have_a_row_while_they_are_stated(qtbot):
 def test_buttons_save_and_load_what_the_command_reads(
     name, request, qtbot, tmp_path, choose, messages
 ):
-    setup, picker = request.getfixturevalue(name), SetupPicker()
+    setup, picker = request.getfixturevalue(name), SetupPicker("test")
     qtbot.addWidget(picker)
     path = tmp_path / "setup.toml"
     choose(path)
@@ -191,17 +191,15 @@ def test_a_file_is_chosen_for_a_number_that_may_be_one(qtbot, monkeypatch):
 
 
 def test_a_picker_remembers_what_each_kind_holds(qtbot):
-    picker, restored = (ModelPicker("Method", kinds_of(ESTIMATES)) for _ in range(2))
-    for widget in (picker, restored):
-        qtbot.addWidget(widget)
+    picker = ModelPicker("Method", kinds_of(ESTIMATES))
+    qtbot.addWidget(picker)
     picker.set_kind("polynomial")
     assert picker.form is not None
     enter(picker.form.entries["degree"], 7)
     picker.set_kind("low-pass")
-    restored.restore(picker.state())
-    assert restored.kind == "low-pass"
-    restored.set_kind("polynomial")
-    assert restored.model() == ESTIMATES["polynomial"](degree=7)
+    assert picker.kind == "low-pass"
+    picker.set_kind("polynomial")
+    assert picker.model() == ESTIMATES["polynomial"](degree=7)
 
 
 def test_what_was_kept_is_loaded_and_damage_is_forgiven(qtbot, settings_folder):

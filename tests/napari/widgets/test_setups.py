@@ -35,7 +35,7 @@ def plain(viewer, shot):
 
 @pytest.fixture
 def picker(qtbot):
-    widget = SetupPicker()
+    widget = SetupPicker("test")
     qtbot.addWidget(widget)
     return widget
 
@@ -66,7 +66,6 @@ def test_a_setup_stays_with_the_image_that_it_came_with(viewer, opened, plain, s
     tool.image.layer = of_a_file
     enter(tool.setup.form.entries["energy"], "3 MeV")
     assert setup_origin_of(of_a_file) == "came with experiment.h5, changed by hand"
-    tool.write_state()
     viewer.layers.clear()
     viewer.add_image(shot, name="another")
     later = opened(Invert)
@@ -97,7 +96,6 @@ def test_what_the_user_typed_is_at_hand_and_says_for_what(viewer, opened, plain,
     tool.image.layer = plain
     assert tool.setup.setup() is None
 
-    tool.write_state()
     viewer.layers.clear()
     new = viewer.add_image(shot, name="new")
     later = opened(Invert)
@@ -117,7 +115,6 @@ def test_the_last_setup_is_selected_where_that_is_preferred(
     assert tool.setup.setup() is None  # there is no last one
     typed(tool, 5.0)
     entered = tool.setup.setup()
-    tool.write_state()
     viewer.layers.clear()
     new = viewer.add_image(shot, name="new")
     later = opened(Invert)
@@ -127,10 +124,8 @@ def test_the_last_setup_is_selected_where_that_is_preferred(
     assert setup_of(new) is None
     # None is a choice, too.
     later.setup.set_kind("none")
-    later.write_state()
     assert opened(Invert).setup.setup() is None
     later.setup.set_kind("proton")
-    later.write_state()
     preferences.widgets.last_setup = False
     viewer.layers.clear()
     viewer.add_image(shot, name="newest")
@@ -182,7 +177,6 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     assert tool.setup.setup() == proton_setup
     tool.object.set_kind("toroid")
     assert tool.setup.setup() == entered
-    tool.write_state()
     later = opened(Simulate)
     assert later.setup.setup() == entered
     tool.side.setText("20 x 20")

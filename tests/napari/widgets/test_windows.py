@@ -1,7 +1,6 @@
-"""What all windows share: their place, their work in a thread, and what they remember."""
+"""What all windows share: their place, and their work in a thread."""
 
 import itertools
-import json
 import math
 import threading
 import time
@@ -21,16 +20,13 @@ from napari_shadowinv._napari.form import PROBLEM_STYLE, ModelPicker
 from napari_shadowinv._napari.layer_metadata import metadata_for, role_of
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.run import Outcome, Run
-from napari_shadowinv._napari.simulate import GridFile, Simulate
-from napari_shadowinv._napari.widgets import _qt
+from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets._qt import Plot
 from napari_shadowinv._napari.widgets.analyse import Analyse
 from napari_shadowinv._napari.widgets.film_pack import FilmPack
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv._system.progress import Progress
-from napari_shadowinv.options import FitOptions, InversionOptions
-from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import STEPS
 
 NAMES = ("Invert", "Fit several images", "Film pack", "Simulate", "Analyse")
@@ -336,69 +332,3 @@ def test_what_went_wrong_stays_until_the_next_run(panel, qtbot, wait, messages):
     assert (status.text(), status.styleSheet()) == ("Starting…", "")
     wait(lambda: not panel.running)
     assert status.isHidden()
-
-
-def remembered_inversion(tool):
-    """Choose something in *Invert*; yield, and check what a later window shows."""
-    tool.options.restore({"seed": 5})
-    tool.source.set_kind("interpolated")
-    for name in STEPS:
-        tool.steps.add(name)
-    tool.store.run.restore({"workers": 3, "overwrite": True})
-    tool = yield
-    assert tool.steps.steps() == tuple(step() for step in STEPS.values())
-    assert tool.options.model() == InversionOptions(seed=5)
-    assert tool.source.kind == "interpolated"
-    assert tool.store.run.model() == RunOptions(workers=3)  # what counts once is not kept
-    yield
-
-
-def remembered_fit(tool):
-    for number in range(2):
-        tool.viewer.add_image(np.eye(8) + number, metadata=metadata_for("shot", "", EXAMPLE))
-    tool.fields.set_kind("B and E")
-    tool.choices.restore({"brightness": "free", "noise": "poisson"})
-    tool.options.restore(QUICK)
-    tool = yield
-    choices = tool.recipe().fit
-    assert (choices.brightness, choices.noise) == ("free", "poisson")
-    assert (choices.fields, choices.options) == (("B", "E"), FitOptions(**QUICK))
-    yield
-
-
-def remembered_object(tool):
-    field = {"file": "cube.nc", "beam": "x", "right": "y", "centre": True}
-    tool.object.set_kind("grid")
-    tool.object.form.restore(field)
-    tool.side.setText("20 x 30")
-    tool = yield
-    assert tool._object() == GridFile(**field)
-    assert tool.side.text() == "20 x 30"
-    yield
-
-
-REMEMBERED = [
-    (Invert, remembered_inversion), (FitImages, remembered_fit), (Simulate, remembered_object)
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("kind", "remembered"), REMEMBERED)
-def test_choices_are_kept_between_sessions(opened, kind, remembered, monkeypatch):
-    tool = opened(kind)
-    chosen = remembered(tool)
-    next(chosen)
-    tool.write_state()
-    chosen.send(opened(kind))
-    # A state that another version saved in another form keeps no window from opening.
-    parts = json.loads(json.dumps(tool.state()))
-    for value in (7, None, "text", [3], {"values": 4, "own": [1], "size": "x"}):
-        monkeypatch.setattr(_qt, "saved_state", lambda _: dict.fromkeys(parts, value))  # noqa: B023
-        assert opened(kind).state().keys() == parts.keys()
-
-
-def test_a_part_of_another_form_leaves_the_other_parts_restored(opened, monkeypatch):
-    first = opened(Invert)
-    first.options.restore({"n_sites": 777})
-    saved = {**first.state(), "source": {"values": 5}, "steps": 3}
-    monkeypatch.setattr(_qt, "saved_state", lambda name: saved)
-    assert opened(Invert).options.model().n_sites == 777

@@ -51,6 +51,8 @@ _UNSTATED = {
 }
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
+# Errors that a saved state causes which another version wrote in another form.
+_UNREADABLE = AttributeError, LookupError, TypeError, ValueError
 UNIFORM, FILE, SUPPLIED, UNKNOWN = "uniform", "file", "own", "unknown"
 """Kinds of sources; all other kinds are estimates."""
 SHOT_SOURCES = tuple(dict.fromkeys((UNIFORM, LAYER, FILE, SUPPLIED, *preprocessing.ESTIMATES)))
@@ -80,8 +82,8 @@ class SetupPicker(forms.ModelPicker):
     image can be shown at its scale.
     """
 
-    def __init__(self, viewer: Any = None) -> None:
-        self._viewer, self._is_loaded = viewer, False
+    def __init__(self, name: str, viewer: Any = None) -> None:
+        self._saved_as, self._viewer, self._is_loaded = name, viewer, False
         self._layer: Any = None
         self._name, self._stores = "", True
         self._last = _NONE  # the kind that the user chose last
@@ -113,7 +115,7 @@ class SetupPicker(forms.ModelPicker):
         row = qt.side_by_side(*buttons, (QWidget(), 1))
         qt.column(below, self.geometry_label, self.warning_label, self.note, row)
         self.layout().addWidget(below)
-        self._show_notes()
+        self._restore()
 
     def setup(self) -> Setup | None:
         return self.model()  # type: ignore[return-value]
@@ -135,17 +137,19 @@ class SetupPicker(forms.ModelPicker):
         kind = self.choice.current_choice
         return f"{kind}, {self.origin}" if self.origin else kind
 
-    def state(self) -> dict[str, Any]:
-        """Return the setups that the user entered; the selection depends on the image."""
+    def _keep(self) -> None:
+        """Save the setups that the user entered; the selection depends on the image."""
         entries = {kind: asdict(entry) for kind, entry in self._entered.items()}
-        return {"own": entries, "last": self._last}
+        qt.save_state(self._saved_as, {"own": entries, "last": self._last})
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        """Restore the entered setups; select the last one only if the user prefers that."""
-        for kind, entry in state.get("own", {}).items():
-            origin = str(entry["origin"]).removesuffix(_EARLIER) + _EARLIER
-            self._entered[kind] = _Entry(dict(entry["values"]), origin)
-        self._last = str(state.get("last", _NONE))
+    def _restore(self) -> None:
+        """Offer the setups of earlier sessions; select the last only if the user prefers that."""
+        state = qt.saved_state(self._saved_as)
+        with suppress(*_UNREADABLE):
+            for kind, entry in state.get("own", {}).items():
+                origin = str(entry["origin"]).removesuffix(_EARLIER) + _EARLIER
+                self._entered[kind] = _Entry(dict(entry["values"]), origin)
+            self._last = str(state.get("last", _NONE))
         self._show_default()
 
     def follow(self, layer: Any, name: str = "", *, store: bool = True) -> None:
@@ -214,7 +218,8 @@ class SetupPicker(forms.ModelPicker):
         self._origins = {each: setup.origin for each, setup in setups.items()}
         values = {each: setup.values for each, setup in setups.items()}
         with QSignalBlocker(self):
-            super().restore({"kind": kind, "values": {each: {} for each in self._forms} | values})
+            empty: dict[str, dict[str, Any]] = {each: {} for each in self._forms}
+            self.restore(kind, empty | values)
         self._show_notes()
 
     def _on_entry(self) -> None:
@@ -238,6 +243,7 @@ class SetupPicker(forms.ModelPicker):
             )
             return
         self._show_notes()
+        self._keep()
         self._store_with_image()
 
     def _enter(self, origin: str) -> None:
@@ -247,6 +253,7 @@ class SetupPicker(forms.ModelPicker):
         if not origin.startswith(about.CAME_WITH):
             self._entered[self.kind] = _Entry(self.form.state(), origin)
         self._show_notes()
+        self._keep()
         self._store_with_image()
 
     def _store_with_image(self) -> None:
@@ -374,7 +381,7 @@ class SourcePicker(layers.LayerPicker):
             self.set_kind(UNKNOWN)
         elif isinstance(source, preprocessing.Estimate):
             name = source.name()
-            self.restore({"kind": name, "values": {name: source.values()}})
+            self.restore(name, {name: source.values()})
         elif source is None:
             self.set_kind(UNIFORM)
         elif FILE not in self._kinds:
@@ -382,7 +389,7 @@ class SourcePicker(layers.LayerPicker):
         elif source.file is None:
             self.set_kind(SUPPLIED)
         else:
-            self.restore({"kind": FILE, "values": {FILE: source.values()}})
+            self.restore(FILE, {FILE: source.values()})
 
     def measured(self, image: Any) -> Shot | None:
         """Return the measured source of an image layer; None for estimates and files."""
@@ -438,19 +445,6 @@ class SourcePicker(layers.LayerPicker):
         beyond_object = metadata.get("source_mask")
         if beyond_object is not None and mask is not None and beyond_object.shape == mask.shape:
             preprocessing.check_masks(mask, beyond_object)
-
-    def state(self) -> dict[str, Any]:
-        """Return the choice without layers and files, which belong to a session."""
-        values = {
-            name: stated for name, stated in super().state()["values"].items() if name != FILE
-        }
-        lasts = self.chosen in (UNKNOWN, *preprocessing.ESTIMATES)
-        return {"kind": self.chosen if lasts else UNIFORM, "values": values}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        super().restore(state)
-        if self.chosen == UNIFORM:
-            self.chosen = None
 
     def follow(self, image: Any) -> None:
         """Select the source supplied with an image, or a likely one; else the chosen one."""
@@ -533,15 +527,9 @@ class ImagePanel(ToolPanel):
         instrument = forms.section("Instrument", self.instrument)
         self.settings = (self.steps, instrument, forms.section("Options", self.options))
 
-    def parts(self) -> dict[str, Any]:
-        return {
-            "source": self.source,
-            "setup": self.setup,
-            "steps": self.steps,
-            "instrument": self.instrument,
-            "options": self.options,
-            "mask": self.masks,
-        }
+    def parts(self) -> tuple[Any, ...]:
+        """Return the controls of a recipe."""
+        return self.source, self.setup, self.steps, self.instrument, self.options, self.masks
 
     def chosen_image(self) -> Any | None:
         """Return the layer to which masks and source belong; None for files."""
@@ -555,9 +543,8 @@ class ImagePanel(ToolPanel):
         """Show a recipe but for its masks; change nothing unless all of it is usable."""
         raise NotImplementedError
 
-    def keep(self) -> None:
-        """Save the changed state soon; say so if the result shown is of other choices."""
-        super().keep()
+    def compare(self) -> None:
+        """Say so if the result shown is of other choices."""
         if self._ready:
             with suppress(InputError):  # Run reports the problem
                 self.view.compare(self.recipe())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -399,13 +399,6 @@ class MaskPicker(LayerPicker):
             if metadata.get("role") == about.MASK and metadata.get("path") == path:
                 self.layer = layer
                 self.painted_is_unusable.setChecked(True)
-
-    def state(self) -> dict[str, Any]:
-        """Return the check box; layers belong to a session."""
-        return {"painted_is_unusable": self.painted_is_unusable.isChecked()}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self.painted_is_unusable.setChecked(bool(state["painted_is_unusable"]))
 
     @qt.notify_errors
     def paint(self) -> None:

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from qtpy import QtWidgets
@@ -36,9 +35,6 @@ _LEVEL_STYLES = {
 }
 _TITLE_WIDTH = "30%"
 _SETTLE_MS = 10  # merges simultaneous changes
-_WRITE_DELAY_MS = 300  # a moving slider is written once
-# Errors that a saved state causes which another version wrote in another form.
-_UNREADABLE = ArithmeticError, AttributeError, LookupError, TypeError, ValueError
 
 
 def fact_rows(facts: Iterable[Fact], *, details: bool = False) -> list[tuple[str, str]]:
@@ -122,7 +118,7 @@ class VerdictLine(forms.WrappingLabel):
 class ToolPanel(qt.Docked):
     """A column of controls that scrolls vertically; its button runs the `request`."""
 
-    def __init__(self, viewer: Any, name: str, panel: Run) -> None:
+    def __init__(self, viewer: Any, panel: Run) -> None:
         super().__init__()
         self.viewer, self.panel = viewer, panel
         self._ready = False
@@ -131,8 +127,6 @@ class ToolPanel(qt.Docked):
         self._last = LastResults(viewer, self)
         self.keep_earlier = self._last.keep_earlier
         self.area, self.column = qt.scrolling_column(self)
-        self._name = name  # of its saved state
-        self._writing = qt.timer(self, _WRITE_DELAY_MS, self.write_state, once=True)
         self._revealed: QtWidgets.QWidget | None = None
         self._revealing = qt.timer(self, _SETTLE_MS, self._reveal, once=True)
         panel.button.clicked.connect(lambda: self._run_or_cancel())
@@ -154,39 +148,6 @@ class ToolPanel(qt.Docked):
     def add(self, *rows: QtWidgets.QWidget) -> None:
         for row in rows:
             self.column.addWidget(row)
-
-    def parts(self) -> dict[str, Any]:
-        """Return the controls with a saved state, by name; they have `state` and `restore`."""
-        return {}
-
-    def state(self) -> dict[str, Any]:
-        """Return the state that is saved between sessions, as JSON values."""
-        return {name: part.state() for name, part in self.parts().items()}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        for name, part in self.parts().items():
-            if name in state:
-                # A part with an unreadable state keeps its defaults; the others are restored.
-                with suppress(*_UNREADABLE):
-                    part.restore(state[name])
-
-    def restore_last(self) -> None:
-        with suppress(*_UNREADABLE):
-            self.restore(qt.saved_state(self._name))
-
-    def keep(self) -> None:
-        """Save the changed state soon."""
-        if self._ready:
-            self._writing.start()
-
-    def write_state(self) -> None:
-        self._writing.stop()
-        qt.save_state(self._name, self.state())
-
-    def hideEvent(self, event: Any) -> None:
-        if self._ready:
-            self.write_state()
-        super().hideEvent(event)
 
     @property
     def is_busy(self) -> bool:

@@ -124,7 +124,7 @@ class ProductForm(ToolPanel):
 
     def __init__(self, viewer: Any) -> None:
         run = Run("Measure", "Measure the product with its bands.")
-        super().__init__(viewer, "products", run)
+        super().__init__(viewer, run)
         self.measured: list[ProductResult] = []
         self._origin: about.Result[Any] | Path | None = None
         tip = "Layer of the result of an inversion or a fit, or of a store of shots."

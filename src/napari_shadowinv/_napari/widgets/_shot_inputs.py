@@ -31,13 +31,7 @@ _MISSING = {
     "file and energy or wavelength",
     FOLDER: "no folder is selected: choose the folder in which the shots appear",
 }
-ONCE = {"overwrite", "redo_failed"}
-"""Choices that count for one run."""
-
-
-def lasting(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the choices of runs but for those that count once."""
-    return {key: value for key, value in values.items() if key not in ONCE}
+_ONCE = {"overwrite", "redo_failed"}  # choices that count for one run
 
 
 def _place(title: str, dialog: str, example: str, description: str) -> type[CheckedModel]:
@@ -206,5 +200,6 @@ class StoreSection(QWidget):
     def begin(self) -> None:
         """Uncheck what counts for one run: another must not discard its shots."""
         for form in (self.run, self.watch):
-            if ONCE & form.state().keys():
-                form.restore(lasting(form.state()))
+            values = form.state()
+            if _ONCE & values.keys():
+                form.restore({key: value for key, value in values.items() if key not in _ONCE})

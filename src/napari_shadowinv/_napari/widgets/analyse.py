@@ -68,7 +68,7 @@ class Analyse(qt.Docked):
         self._listed: list[Any] = []
         self.layers = QtWidgets.QListWidget(maximumHeight=_LIST_HEIGHT_PX)
         self.layers.setSelectionMode(QtWidgets.QListWidget.SelectionMode.NoSelection)
-        self.width_edit = forms.SavedLine(
+        self.width_edit = forms.text_line(
             "0: line only",
             "Width of the strip, perpendicular to the line, over which values are averaged: in "
             "px, or with a unit such as 20 um.",

@@ -201,7 +201,7 @@ class FilmPack(panels.ToolPanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Compute dose and fluence of each film of the pack."
-        super().__init__(napari_viewer, "film-pack", Run("Run", tip))
+        super().__init__(napari_viewer, Run("Run", tip))
         scratch = TemporaryDirectory(prefix="film-pack-")
         qt.when_destroyed(self, scratch.cleanup)
         self._scratch = Path(scratch.name)

@@ -69,10 +69,9 @@ class FitImages(inputs.ImagePanel):
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Fit the fields, and an unknown beam, to all images together."
         panel = Run("Run", tip)
-        super().__init__(napari_viewer, "fit-images", panel)
+        super().__init__(napari_viewer, panel)
         self._build()
         self._connect()
-        self.restore_last()
         self._on_reference()
         self.view.follow()
         self._ready = True
@@ -83,7 +82,7 @@ class FitImages(inputs.ImagePanel):
             "The beam without the object. An unknown beam is fitted as a smooth beam, the same in "
             "all images except for its brightness.",
             FitOptions,
-            inputs.SetupPicker(),
+            inputs.SetupPicker("fit-images"),
             FIT_STEPS,
         )
         self.images = ImageTable(
@@ -112,14 +111,14 @@ class FitImages(inputs.ImagePanel):
         self.source.changed.connect(self.images.fill)
         self.setup.changed.connect(self._on_setup)
         self.choices.changed.connect(self._show_beams)
-        for part in self.parts().values():
-            part.changed.connect(lambda *_: self.keep())
+        for part in self.parts():
+            part.changed.connect(lambda *_: self.compare())
             part.changed.connect(lambda *_: self._show_cost())
         for signal in (self.images.changed, self.images.reference_changed):
             signal.connect(self._show_cost)
 
-    def parts(self) -> dict[str, Any]:
-        return {**super().parts(), "fields": self.fields, "choices": self.choices}
+    def parts(self) -> tuple[Any, ...]:
+        return *super().parts(), self.fields, self.choices
 
     def recipe(self) -> Recipe:
         """Return the recipe of the controls, without table and layers; or raise an `InputError`."""

@@ -26,7 +26,7 @@ from napari_shadowinv._napari.widgets._inputs import (
 )
 from napari_shadowinv._napari.widgets._panels import ResultView
 from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
-from napari_shadowinv._napari.widgets._shot_inputs import FOLDER, ShotPicker, StoreSection, lasting
+from napari_shadowinv._napari.widgets._shot_inputs import FOLDER, ShotPicker, StoreSection
 from napari_shadowinv._napari.widgets._stack_jobs import StackJob, StackView, placement_on
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._typing import FloatArray
@@ -62,13 +62,12 @@ class Invert(ImagePanel):
 
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Invert the image, or all shots that are not in the store yet."
-        super().__init__(napari_viewer, "invert", Run("Run", tip))
+        super().__init__(napari_viewer, Run("Run", tip))
         self._cache = Cache()
         self.previewed = ResultLayers(self.viewer, self)
         self._preview_timer = qt.timer(self, _PREVIEW_DELAY_MS, self._preview, once=True)
         self._build()
         self._connect()
-        self.restore_last()
         self._on_shots()
         self.view.follow()
         self._ready = True
@@ -80,7 +79,7 @@ class Invert(ImagePanel):
             "The beam without the object: ideally a measured reference image, otherwise uniform "
             "or estimated from the shot.",
             InversionOptions,
-            SetupPicker(self.viewer),
+            SetupPicker("invert", self.viewer),
         )
         self.source_masks = layers.MaskPicker(
             self.viewer,
@@ -121,21 +120,14 @@ class Invert(ImagePanel):
         self.image.changed.connect(self._on_shots)
         self.image.edited.connect(self._forget_report)
         self.panel.progressed.connect(self._on_progress)
-        changes = [control.changed for control in self.parts().values()]
+        changes = [control.changed for control in self.parts()]
         picked = self.image, self.masks, self.source_masks, self.crop, self.source
         edits = [picker.edited for picker in picked]
         for signal in (*changes, self.live.toggled, self.crop.picked, *edits):
             signal.connect(self.on_change)
 
-    def parts(self) -> dict[str, Any]:
-        choices = {"run": self.store.run, "watch": self.store.watch}
-        return {**super().parts(), "source_mask": self.source_masks, **choices}
-
-    def state(self) -> dict[str, Any]:
-        state = super().state()
-        for name in ("run", "watch"):
-            state[name] = lasting(state[name])
-        return state
+    def parts(self) -> tuple[Any, ...]:
+        return *super().parts(), self.source_masks
 
     def chosen_image(self) -> Any | None:
         """Return the layer of the shot or of the stack; None for files."""
@@ -317,8 +309,8 @@ class Invert(ImagePanel):
         self.panel.say(_pattern_warning(finished.content, job), problem=True)
 
     def on_change(self) -> None:
-        """Save the state, update the preview and the estimated cost."""
-        self.keep()
+        """Update the preview, the estimated cost, and what is said of the result."""
+        self.compare()
         self._start_preview()
         self.source_masks.setVisible(self.source.is_estimated)
         self._source_row.setVisible(self.source.is_made and not self.image.is_stack)
