@@ -8,9 +8,9 @@ import pytest
 from napari.layers import Layer
 
 from napari_shadowinv import write
-from napari_shadowinv._napari import packs
 from napari_shadowinv._napari.layer_metadata import frame_for, role_of, setup_of, usable_of
 from napari_shadowinv._napari.viewer_sync import connect_viewer
+from napari_shadowinv._napari.widgets.film_pack import film_layers
 
 PLUGIN = "napari-shadowinv"
 
@@ -78,7 +78,7 @@ def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_doses):
     lost = deepcopy(pack_doses)
     lost.usable[1] = False
     frame = frame_for(lost.dose.shape, lost.setup)
-    layers = [Layer.create(*layer_data) for layer_data in packs.film_layers(lost, frame, "trio")]
+    layers = [Layer.create(*layer_data) for layer_data in film_layers(lost, frame, "trio")]
     first, _, last = (f"{energy:.3g} MeV" for energy in pack_doses.energies)
     assert [layer.name for layer in layers] == [f"film 1, {first}", f"film 3, {last}"]
     for layer, k in zip(layers, (0, 2), strict=True):

@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 from napari.layers import Image, Labels, Shapes
 
-from napari_shadowinv._napari.placement import labels_on, matrix_between, pixel_mapper, source_on
+from napari_shadowinv._napari.layer_metadata import (
+    labels_on,
+    matrix_between,
+    pixel_mapper,
+    source_on,
+)
 from napari_shadowinv._napari.shots import source_of_shot
-from napari_shadowinv._napari.widgets._layers import crop_of, image_of, mask_of
+from napari_shadowinv._napari.widgets._layers import crop_of, image_of, painted_on
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import Crop
 
@@ -60,26 +65,23 @@ def test_labels_of_one_plane_mask_all_shots_of_a_stack_and_lengths_count_in_thei
     np.testing.assert_allclose(pixel_mapper(image, labels)(np.array([[0.004, 0.01]])), [[2, 5]])
 
 
-def test_what_is_painted_or_drawn_is_unusable_or_the_only_usable():
+def test_what_is_painted_or_drawn_lies_on_the_image():
     image, labels = Image(np.ones((10, 12)), name="shot"), Labels(np.zeros((10, 12), int))
-    assert mask_of(labels, image, True) is None
+    assert painted_on(labels, image) is None
     labels.data[2, 3] = 5
-    usable = mask_of(labels, image, True)
-    assert usable.sum() == 119
-    assert not usable[2, 3]
-    assert mask_of(labels, image, False).sum() == 1
+    assert np.argwhere(painted_on(labels, image)).tolist() == [[2, 3]]
     larger = Image(np.ones((20, 30)), scale=(2.0, 2.0))
     rectangle = Shapes([np.array([[8, 8], [8, 20], [16, 20], [16, 8]])], shape_type="rectangle")
-    usable = mask_of(rectangle, larger, True)
-    assert not usable[5:8, 5:10].any()
-    assert usable[:3].all()
+    inside = painted_on(rectangle, larger)
+    assert inside[5:8, 5:10].all()
+    assert not inside[:3].any()
     for mask, words in (
         (painted((9, 9), slice(9), slice(9), translate=(50, 0)), "beside the image 'shot'"),
         (Labels(np.ones((3, 10, 12), int)), "expected one plane"),
         (Labels(np.ones((9, 9), int)), "they must match"),
     ):
         with pytest.raises(InputError, match=words):
-            mask_of(mask, image, True)
+            painted_on(mask, image)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,7 @@ from napari_shadowinv import FileFormatError, ProtonSetup, write
 from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, role_of, setup_of
 from napari_shadowinv._napari.layers import add_layers, sample_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
-from napari_shadowinv._napari.result_files import missing_layers
-from napari_shadowinv._napari.stores import follow_shots
+from napari_shadowinv._napari.result_files import follow_shots, missing_layers
 from napari_shadowinv._napari.widgets._layers import cautions_of
 
 PLUGIN = "napari-shadowinv"

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from napari_shadowinv import add_to_viewer
-from napari_shadowinv._napari.layer_metadata import frame_of, metadata_for, role_of
 from napari_shadowinv._napari.viewer_sync import (
     connect,
     connect_layers,
@@ -80,43 +79,6 @@ def test_a_colour_bar_that_was_switched_off_stays_off_and_has_room_for_a_long_na
     short.colorbar.visible = short.visible = False
     viewer.layers["✓ residual (% of mean) – a"].visible = True
     assert not any(layer.colorbar.visible for layer in viewer.layers if hasattr(layer, "colorbar"))
-
-
-def test_an_image_of_the_same_size_lies_on_the_result(
-    viewer, solved, proton_setup, messages, tmp_path
-):
-    layers = add_to_viewer(viewer, solved, proton_setup, name="a", translate=(3.0, 4.0))
-    frame = frame_of(next(layer for layer in layers if role_of(layer) == "field"))
-    for data in (np.ones((40, 52)), np.ones((5, 40, 52)), np.ones((40, 52), np.uint8)):
-        messages.clear()
-        image = viewer.add_image(data, name="other")
-        assert frame_of(image) == frame
-        title = "✓ |∫B×dz| (mT·m) – a"
-        assert f"'{image.name}' has the same size in pixels as '{title}'" in messages[-1]
-        assert "1.5 µm" in messages[-1]
-    np.savetxt(tmp_path / "other.txt", np.ones((40, 52)))
-    (opened,) = viewer.open(tmp_path / "other.txt", plugin="napari-shadowinv")
-    assert frame_of(opened) == frame
-    assert {str(unit) for layer in viewer.layers for unit in layer.units[-2:]} == {"micrometer"}
-    # One of another size is told how to get a scale.
-    image = viewer.add_image(np.ones((30, 52)), name="smaller")
-    assert tuple(image.scale) == (1, 1)
-    assert "'smaller' is in pixels, the results are in µm" in messages[-1]
-    assert "Invert" in messages[-1]
-
-
-def test_what_has_a_place_keeps_it(viewer, solved, proton_setup, messages):
-    viewer.add_image(np.ones((40, 52)))
-    add_to_viewer(viewer, solved, name="in pixels")
-    first = viewer.add_image(np.ones((40, 52)))
-    add_to_viewer(viewer, solved, proton_setup, name="a")
-    messages.clear()
-    with_scale = viewer.add_image(np.ones((40, 52)), scale=(2, 2), units=("um", "um"))
-    of_plugin = viewer.add_image(np.ones((40, 52)), metadata=metadata_for("image", ""))
-    viewer.add_labels(np.ones((40, 52), int))
-    assert tuple(with_scale.scale) == (2, 2)
-    assert tuple(of_plugin.scale) == tuple(first.scale) == (1, 1)
-    assert not any("same position" in text or "in pixels" in text for text in messages)
 
 
 @pytest.mark.parametrize(

@@ -28,11 +28,10 @@ def test_a_forecast_grows_with_what_is_asked_for() -> None:
     assert fit_cost((200, 200), 2, quick, instrument) == fit_cost((200, 200), 2, quick)
 
 
-def test_the_next_forecast_follows_the_last_fit() -> None:
+def test_a_forecast_is_a_sentence() -> None:
     shape, choices = (1000, 1000), FitChoices(fields=("B", "E"))
     text = fit_cost(shape, 3, choices).text
     assert text.startswith("3 images of 1000 × 1000 px, 2 fields: about 80 s, up to 5 min")
-    assert "about 4 min, based on the last fit" in fit_cost(shape, 3, choices, pace=3.0).text
     single = fit_cost((200, 200), 1, FitChoices(beam="unknown"))
     assert single.text.startswith("one image of 200 × 200 px, unknown beam: about ")
 
@@ -44,7 +43,6 @@ def test_cost_of_a_large_image_is_shown_and_that_of_a_small_one_not() -> None:
     # Measured: 16 s of processor time, which two cores share.
     assert 16 / 2 < four.seconds < 16
     assert four.text == "4 Mpx with 10,000 sites: about 10 s and up to 1.3 GB."
-    assert "about 40 s" in inversion_cost((2000, 2000), few, pace=3).text
     huge = inversion_cost((100_000, 100_000), few)
     assert huge.exceeds_memory
     assert "GB: crop or bin the image" in huge.text

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from helpers.command_line import done
-from napari_shadowinv._napari.stores import shot_rows
+from napari_shadowinv._napari.result_files import shot_rows
 from napari_shadowinv.io import store_columns
 from napari_shadowinv.io.store import StackStore
 from napari_shadowinv.io.store_columns import (

@@ -15,8 +15,7 @@ from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
-from napari_shadowinv._napari.layer_metadata import frame_of, layer_name, main_layers
-from napari_shadowinv._napari.placement import source_on
+from napari_shadowinv._napari.layer_metadata import frame_of, layer_name, main_layers, source_on
 from napari_shadowinv._napari.shots import shot_layer, shot_of_layer
 from napari_shadowinv._napari.viewer_sync import without_proxy
 from napari_shadowinv._system.progress import ShouldStop

@@ -23,7 +23,6 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import (
     FitChoices,
 )
-from napari_shadowinv.pipeline.costs import fit_cost, inversion_cost
 from napari_shadowinv.pipeline.fit_run import refinement_choices, run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import Cache, run
 from napari_shadowinv.preprocessing import Estimate, Recipe, estimate_source
@@ -91,14 +90,13 @@ class InversionJob(ImageJob):
     """An inversion of a shot with its masks; image and source may be lazy."""
 
     task: ClassVar[str] = "inversion"
-    pace: ClassVar[float | None] = None  # time of the last inversion relative to its estimate
 
     shot: Shot
     cache: Cache | None = None
     preview: bool = False
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Inversion:
-        inversion = run(
+        return run(
             self.recipe,
             shot_in_memory(self.shot, "the image", "the source"),
             on_progress=on_progress,
@@ -106,12 +104,6 @@ class InversionJob(ImageJob):
             cache=self.cache,
             preview=self.preview,
         )
-        seconds = inversion.report.seconds
-        estimated_s = inversion_cost(inversion.potential.shape, inversion.options).seconds
-        # Previews, cached sites and small images would give a wrong pace.
-        if not self.preview and estimated_s > 1 and seconds.get("sites", 0) > 0.1:
-            InversionJob.pace = sum(seconds.values()) / estimated_s
-        return inversion
 
     def layers(self, content: Inversion) -> LayerData:
         """Describe the layers of the inversion; of a preview only the field and its caustics."""
@@ -169,7 +161,6 @@ class FitJob(ImageJob):
     """
 
     task: ClassVar[str] = "fit"
-    pace: ClassVar[float | None] = None  # time of the last fit relative to its estimate
 
     shots: tuple[Shot, ...]  # with the names of their images
 
@@ -187,11 +178,7 @@ class FitJob(ImageJob):
         return self.recipe.fit
 
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
-        fit = self.compute(on_progress, should_stop)
-        shape, instrument = self.recipe.shape_after(self.shots[0].shape), self.recipe.instrument
-        cost = fit_cost(shape, len(self.shots), self.choices, instrument)
-        FitJob.pace = sum(fit.report.seconds.values()) / cost.seconds
-        return fit
+        return self.compute(on_progress, should_stop)
 
     def layers(self, content: Fit) -> LayerData:
         return fit_layers(Result(content, self.origins), self.frame, self.name)

@@ -1,19 +1,23 @@
-"""Metadata of this plugin's layers, a plain dict under `KEY`, and their placement: `Frame`.
+"""What this plugin knows of a layer: its metadata, a plain dict under `KEY`, and its place.
 
-The metadata name the kind of each layer of a result; some kinds are shown by default.
+- the place of a plane, and of derived ones: `Frame`; layers on the pixels of an image:
+  `matrix_between`, `mapped`, `pixel_mapper`, `labels_on`, `source_on` (which never resamples)
+- the kind of each layer of a result; some kinds are shown by default: `KINDS`, `main_layers`
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
+from scipy.ndimage import affine_transform
 
 from napari_shadowinv._napari.preferences import AUTOMATIC, colour_map, preference
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
 
 if TYPE_CHECKING:
@@ -33,44 +37,44 @@ class Frame:
     scale: tuple[float, float] = (1.0, 1.0)
     translate: tuple[float, float] = (0.0, 0.0)
     units: tuple[str, str] = ("pixel", "pixel")
-    # A rotation matrix, a shear of the rows, and then a homogeneous matrix.
-    rotate: Matrix = ((1.0, 0.0), (0.0, 1.0))
-    shear: float = 0.0
-    affine: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    affine: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # comes after them
+
+    @property
+    def matrix(self) -> FloatArray:
+        """The matrix from (y, x, 1) in pixels to the world."""
+        return np.array(self.affine) @ _upright(self.scale, self.translate)
 
     def beneath(self, matrix: FloatArray) -> Frame:
         """Return the frame of a derived image; `matrix` maps its (y, x, 1) to (y, x, 1) here."""
-        sheared = np.array([[1.0, self.shear], [0.0, 1.0]]) * self.scale
-        pixels = np.array(self.rotate) @ sheared
-        y, x = (float(value) for value in self.translate + pixels @ matrix[:2, 2])
-        translated = replace(self, translate=(y, x))
-        factor = float(matrix[0, 0])
-        if np.array_equal(matrix[:2, :2], factor * np.eye(2)):
-            return replace(translated, scale=(factor * self.scale[0], factor * self.scale[1]))
-        rotate, upright = np.linalg.qr(pixels @ matrix[:2, :2])
-        # napari's order: first the scale, which alone may mirror, then the shear.
-        signs = np.sign(upright[0, 0]) * np.array([1.0, np.round(np.linalg.det(rotate))])
-        rotate, upright = rotate * signs, signs[:, None] * upright
-        scale = float(upright[0, 0]), float(upright[1, 1])
-        shear = float(upright[0, 1] / upright[1, 1])
-        return replace(translated, scale=scale, shear=shear, rotate=matrix_of(rotate))
+        derived = _upright(self.scale, self.translate) @ matrix
+        y, x = (float(value) for value in derived[:2, 2])
+        dy, dx = (float(side) for side in np.diagonal(derived)[:2])
+        if np.array_equal(derived[:2, :2], np.diag([dy, dx])):
+            return replace(self, translate=(y, x), scale=(dy, dx))
+        dy, dx = (float(side) for side in np.hypot(*derived[:2, :2]))
+        turn = derived @ np.linalg.inv(_upright((dy, dx), (y, x)))
+        affine = matrix_of(np.array(self.affine) @ turn)
+        return replace(self, translate=(y, x), scale=(dy, dx), affine=affine)
 
     def keywords(self, *, stacked: bool = False, stack_axis: str = "shot") -> dict[str, Any]:
         """Return the keywords that place a layer; `stacked` if an axis of shots comes first."""
-        keywords: dict[str, Any] = {
+        first = int(stacked)
+        affine = np.eye(first + 3)
+        affine[first:, first:] = self.affine
+        return {
             "scale": (1.0, *self.scale) if stacked else self.scale,
             "translate": (0.0, *self.translate) if stacked else self.translate,
             "units": ("pixel", *self.units) if stacked else self.units,
             "axis_labels": (stack_axis, "y", "x") if stacked else ("y", "x"),
+            "affine": affine,
         }
-        upright = Frame()
-        if self.rotate != upright.rotate:
-            keywords["rotate"] = _with_shots(self.rotate, stacked)
-        if self.shear != upright.shear:
-            keywords["shear"] = [0.0, 0.0, self.shear] if stacked else [self.shear]
-        if self.affine != upright.affine:
-            keywords["affine"] = _with_shots(self.affine, stacked)
-        return keywords
+
+
+def _upright(scale: Sequence[float], translate: Sequence[float]) -> FloatArray:
+    """Return the matrix of a scale followed by a translation."""
+    matrix = np.diag([*scale, 1.0])
+    matrix[:2, 2] = translate
+    return matrix
 
 
 def frame_for(
@@ -104,27 +108,21 @@ def frame_for(
 
 def frame_of(layer: Any) -> Frame:
     """Return the frame of a layer's last two axes."""
+    translate = np.array(layer.translate[-2:])
+    turn = np.eye(3)
+    turn[:2, :2] = layer.rotate[-2:, -2:] @ [[1.0, layer.shear[-1]], [0.0, 1.0]]
+    turn[:2, 2] = translate - turn[:2, :2] @ translate
     return Frame(
         scale=tuple(float(value) for value in layer.scale[-2:]),  # type: ignore[arg-type]
-        translate=tuple(float(value) for value in layer.translate[-2:]),  # type: ignore[arg-type]
+        translate=tuple(float(value) for value in translate),  # type: ignore[arg-type]
         units=tuple(str(unit) for unit in layer.units[-2:]),  # type: ignore[arg-type]
-        rotate=matrix_of(layer.rotate[-2:, -2:]),
-        shear=float(layer.shear[-1]),
-        affine=matrix_of(layer.affine.affine_matrix[-3:, -3:]),
+        affine=matrix_of(layer.affine.affine_matrix[-3:, -3:] @ turn),
     )
 
 
 def matrix_of(values: Any) -> Matrix:
     """Return the rows of a matrix as tuples, which can be compared."""
     return tuple(tuple(float(value) for value in row) for row in values)
-
-
-def _with_shots(matrix: Matrix, stacked: bool) -> FloatArray:
-    """Extend a matrix of the axes y and x by an unchanged first axis of shots, if stacked."""
-    first = int(stacked)
-    extended = np.eye(first + len(matrix))
-    extended[first:, first:] = matrix
-    return extended
 
 
 _LayerTuple = tuple[Any, dict[str, Any], str]
@@ -370,3 +368,103 @@ def source_of(layer: Any) -> FloatArray | None:
     """Return the undisturbed beam that came with an image, or None."""
     source = metadata_of(layer).get("source")
     return None if source is None else np.asarray(source)
+
+
+_MAX_OFFSET_PX = 0.1  # of a beam from whole pixels
+
+
+def matrix_between(layer: Any, image: Any) -> FloatArray:
+    """Return the matrix from (y, x, 1) in pixels of a layer to those of an image."""
+    return (
+        np.linalg.inv(frame_of(image).matrix) @ _unit_ratios(layer, image) @ frame_of(layer).matrix
+    )
+
+
+def mapped(matrix: FloatArray, points: Any) -> FloatArray:
+    """Return points (n, 2) after a matrix; of points with more axes the last two count."""
+    return np.asarray(points)[:, -2:] @ matrix[:2, :2].T + matrix[:2, 2]
+
+
+def pixel_mapper(image: Any, drawn: Any) -> Callable[[Any], Any]:
+    """Return the function from world points of a drawn layer to an image's pixels."""
+    matrix = np.linalg.inv(frame_of(image).matrix) @ _unit_ratios(drawn, image)
+    return lambda points: mapped(matrix, points)
+
+
+def labels_on(layer: Any, image: Any) -> BoolArray:
+    """Return the pixels of an image whose centres lie on painted labels, or an `InputError`."""
+    if frame_of(layer) == frame_of(image) and _shape(layer) != _shape(image):
+        raise _mismatch("mask", layer, image)
+    to_layer, painted = matrix_between(image, layer), (np.asarray(layer.data) != 0).view(np.uint8)
+    on_image = affine_transform(
+        painted, to_layer[:2], output_shape=_shape(image), order=0, mode="grid-constant"
+    )
+    return on_image.astype(np.bool_)
+
+
+def source_on(layer: Any, data: Any, image: Any) -> Any:
+    """Return a beam, or one for each shot, on an image's pixels, or an `InputError`."""
+    height, width = _shape(image)
+    if frame_of(layer) == frame_of(image) or _is_unplaced(layer, image):
+        if _shape(layer) != (height, width):
+            raise _mismatch("source", layer, image)
+        return data
+    matrix = matrix_between(image, layer)
+    corners = np.array([[0, 0], [height - 1, 0], [0, width - 1], [height - 1, width - 1]])
+    moves = mapped(matrix, corners) - corners
+    top, left = np.round(moves[0]).astype(int)
+    if np.abs(moves - (top, left)).max() > _MAX_OFFSET_PX:
+        raise InputError(
+            f"{_sizes('source', layer, image)}: expected pixels that lie on each other; give both "
+            "layers the same scale and place (layer controls → transform), or bin one of them"
+        )
+    below, beyond = data.shape[-2] - top - height, data.shape[-1] - left - width
+    if min(top, left, below, beyond) < 0:
+        raise InputError(
+            f"{_sizes('source', layer, image)}: the source covers only a part of the image; crop "
+            "the image, or give both layers the same place (layer controls → transform)"
+        )
+    return data[..., top : top + height, left : left + width]
+
+
+def _mismatch(role: str, layer: Any, image: Any) -> InputError:
+    """Return the refusal of two sizes at one place: nobody has said which pixels are the same."""
+    return InputError(
+        f"{_sizes(role, layer, image)}: they must match; crop one of them, or move it to where it "
+        "belongs (layer controls → transform)"
+    )
+
+
+def _sizes(role: str, layer: Any, image: Any) -> str:
+    return f"the {role} '{layer.name}' has {_size(layer)}, the image '{image.name}' {_size(image)}"
+
+
+def _size(layer: Any) -> str:
+    (height, width), frame = _shape(layer), frame_of(layer)
+    dy, dx = (f"{abs(side):.4g}" for side in frame.scale)
+    pixel = dx if dx == dy else f"{dx} × {dy}"
+    is_in_pixels = frame.units == Frame().units
+    place = f"scale {pixel}" if is_in_pixels else f"pixels of {pixel} {layer.units[-1]:~P}"
+    return f"{width} × {height} px" + ("" if frame == Frame() else f" ({place})")
+
+
+def _shape(layer: Any) -> tuple[int, int]:
+    height, width = data_of(layer).shape[-2:]
+    return height, width
+
+
+def _unit_ratios(layer: Any, image: Any) -> FloatArray:
+    """Return the matrix between the worlds of two layers; pixels and lengths are mixed as drawn."""
+    pairs = zip(layer.units[-2:], image.units[-2:], strict=True)
+    ratios = [
+        (1 * unit).to(other).magnitude if unit.dimensionality == other.dimensionality else 1.0
+        for unit, other in pairs
+    ]
+    return np.diag([*ratios, 1.0])
+
+
+def _is_unplaced(layer: Any, image: Any) -> bool:
+    """Whether only one of two layers has a place in lengths, and the other none at all."""
+    units, other_units = layer.units[-1], image.units[-1]
+    is_mixed = units.dimensionality != other_units.dimensionality
+    return is_mixed and Frame() in (frame_of(layer), frame_of(image))

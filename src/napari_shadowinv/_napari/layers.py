@@ -1,7 +1,8 @@
 """Results as layers.
 
 - an inversion, with the features of its sites: `result_layers`; in a viewer: `add_to_viewer`
-- a fit, with its images and alternative solutions: `fit_layers`; a field: `field_layers`
+- a fit, with its images: `fit_layers`; a field: `field_layers`
+- the doses of a film pack as stacks with a plane for each film: `pack_layers`
 """
 
 from __future__ import annotations
@@ -12,13 +13,12 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, role_of
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
@@ -34,6 +34,7 @@ from napari_shadowinv.physics.units import (
 if TYPE_CHECKING:
     import xarray
 
+    from napari_shadowinv.film_doses import FilmDoses
     from napari_shadowinv.fitting import Fit
     from napari_shadowinv.inversion import Inversion
     from napari_shadowinv.inversion.result import RetrievedField
@@ -61,8 +62,6 @@ _MIN_ARROW_LENGTH = 0.05  # relative to the longest
 _MAX_SHOWN_SITES = 200_000
 _LIMITS_PERCENTILE = 99.7
 _LIMITS_SAMPLE_SIZE = 100_000  # pixels
-# Of alternative solutions only these are shown.
-_ALTERNATIVE_ROLES = ("field", "arrows")
 _KINDS = {kind.role: kind for kind in about.KINDS if kind.shown_of != "stack"}
 _MAX_BEAM_DIFFERENCE = 1e-6  # relative to the mean
 _MIN_SIGNIFICANCE_LIMIT = 4.0  # σ, so that a map of noise looks like noise
@@ -204,47 +203,35 @@ def fit_layers(
 ) -> LayerData:
     """Describe the layers of a fit, the lowest first; the first of its fields is visible.
 
-    The fields of alternative solutions are hidden. `with_images` as for a file.
+    `with_images` as for a file.
     """
     fit = result.content
     facts = {"result": result, "name": name, "level": fit.headline.level}
     layers = _fitted_images(fit, frame, name, facts) if with_images else []
     layers += _predicted_images(fit, frame, name, facts)
-    for number in reversed(range(len(fit.basins))):
-        layers += _solution_layers(fit, number, frame, name, facts)
-    return layers
+    return layers + _fitted_fields(fit, frame, name, facts)
 
 
-def _solution_layers(
-    fit: Fit, number: int, frame: Frame, name: str, facts: dict[str, Any]
-) -> LayerData:
-    """Describe the fields of a solution; of others than the best, only strength and arrows."""
+def _fitted_fields(fit: Fit, frame: Frame, name: str, facts: dict[str, Any]) -> LayerData:
+    """Describe the fields of a fit, the first on top."""
     import xarray as xr
 
     layers: LayerData = []
     for m, field in reversed(list(enumerate(fit.fields))):
-        title, displacement = name, field.displacement
-        if number:
-            start = fit.basins[number].start
-            title = f"{name} from the inversion" if start == "given" else f"{name} {start}"
-            displacement = _full_size(fit.basins[number].displacement[m], displacement.shape[1:])
-        variables: dict[str, Any] = {"displacement": (("component", "y", "x"), displacement)}
-        more = {"part": f"{field.name} {number}", "level": None}
-        if not number:
-            variables["potential"] = ("y", "x"), field.potential
-            if fit.mask.shape[1:] == field.potential.shape:
-                variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
-            std, structures = per_pixel_of(field.errors), fit.structures(field)
-            variables |= significance_variables(displacement, std, structures)
-            more = {"part": field.name} if m else {}
-        title = title if len(fit.fields) == 1 else f"{title} {field.name}"
-        deflector = deflector_titles()[field.name]
-        view = View(xr.Dataset(variables), fit.setup, deflector=deflector)
-        more = facts | more | {"displacement": displacement}
+        variables: dict[str, Any] = {
+            "displacement": (("component", "y", "x"), field.displacement),
+            "potential": (("y", "x"), field.potential),
+        }
+        if fit.mask.shape[1:] == field.potential.shape:
+            variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
+        std, structures = per_pixel_of(field.errors), fit.structures(field)
+        variables |= significance_variables(field.displacement, std, structures)
+        more = facts | {"displacement": field.displacement} | ({"part": field.name} if m else {})
+        title = name if len(fit.fields) == 1 else f"{name} {field.name}"
+        view = View(xr.Dataset(variables), fit.setup, deflector=deflector_titles()[field.name])
         for layer in dataset_layers(view, frame, title, more):
-            layer[1]["visible"] &= m == number == 0
-            if not number or role_of(layer[1]) in _ALTERNATIVE_ROLES:
-                layers.append(layer)
+            layer[1]["visible"] &= m == 0
+            layers.append(layer)
     return layers
 
 
@@ -279,17 +266,62 @@ def _fitted_images(fit: Fit, frame: Frame, name: str, facts: dict[str, Any]) -> 
         if is_single:
             more["source"] = fit.source[k]
         else:
-            more |= {"part": str(k + 1), "strength": float(fit.strengths[k, 0])}
+            more |= {"part": str(k + 1)}
         title = name if is_single else f"{name} {k + 1}"
         layers.append(_KINDS["image"].layer(image, title, frame, setup, look, **more))
     return layers
 
 
-def _full_size(displacement: FloatArray, shape: tuple[int, ...]) -> FloatArray:
-    """Interpolate values at every second pixel, between pixel pairs, to all pixels."""
-    points = (np.mgrid[: shape[0], : shape[1]] - 0.5) / 2
-    planes = [map_coordinates(plane, points, order=1, mode="nearest") for plane in displacement]
-    return np.stack(planes)
+FLUENCE, DOSE, UNUSABLE = "fluence", "dose", "unusable"
+PER_AREA = "1/(m² MeV)"
+
+PACK_KINDS = (
+    Kind(DOSE, "dose", "dose (Gy)", "Gy", "uncertainty"),
+    Kind(FLUENCE, "fluence", f"fluence ({PER_AREA})", PER_AREA, "field", visible=True),
+    Kind(UNUSABLE, "usable", "unusable", type="labels"),
+)
+
+EXCLUDED, BY_HAND = 1, 2
+"""Labels of unusable pixels: excluded by `run_film`, and painted by the user."""
+
+
+def pack_layers(
+    result: Result[FilmDoses],
+    frame: Frame,
+    name: str,
+    *,
+    by_hand: BoolArray | None = None,
+    plane: int = 0,
+    **facts: Any,
+) -> LayerData:
+    """Describe the layers of a pack, the lowest first; their names end with the pack's.
+
+    Painted pixels, `by_hand`, shape (n, H, W), are not usable. The displayed film, `plane`, sets
+    the contrast. `facts` are metadata of each layer.
+    """
+    doses = result.content
+    layers = []
+    for kind in PACK_KINDS:
+        more: dict[str, Any] = {**facts, "name": name, "result": result, "main": True}
+        if kind.type == "labels":
+            data: AnyArray = np.where(doses.usable, 0, EXCLUDED).astype(np.uint8)
+            if by_hand is not None:
+                data[by_hand] = BY_HAND
+            look: dict[str, Any] = {"colormap": label_colours("#5dff5d", "#00c8ff"), "opacity": 0.5}
+        else:
+            data = getattr(doses, kind.variable)
+            limits = [
+                film_limits(film, used) for film, used in zip(data, doses.usable, strict=True)
+            ]
+            more |= {"limits": limits, "plane": plane}
+            look = {"contrast_limits": limits[plane]}
+        layers.append(kind.layer(data, name, frame, doses.setup, look, stack_axis="layer", **more))
+    return layers
+
+
+def film_limits(plane: AnyArray, used: BoolArray) -> Limits:
+    """Return the contrast limits of a film from its usable pixels."""
+    return intensity_limits(np.where(used, plane, np.nan), peak=np.inf)
 
 
 def dataset_layers(view: View, frame: Frame, name: str, facts: Mapping[str, Any]) -> LayerData:

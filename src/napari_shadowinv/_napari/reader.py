@@ -61,7 +61,7 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
         return stack_layers([Path(item) for item in path])
     file, variable = split_address(path)
     if file.name.endswith(STORE.suffix):
-        from napari_shadowinv._napari.stores import store_layers
+        from napari_shadowinv._napari.result_files import store_layers
 
         layers = main_layers(store_layers(file))
         _show_in_window(layers)
@@ -123,7 +123,7 @@ def _read_content(path: Path, array: str) -> list[Any]:
 def _show_in_window(layers: Sequence[Any]) -> None:
     """In a window, show an opened result with its bars, and select its field."""
     from napari_shadowinv._napari.layers import present
-    from napari_shadowinv._napari.stores import follow_shots, viewer_in_window
+    from napari_shadowinv._napari.result_files import follow_shots, viewer_in_window
 
     viewer = viewer_in_window()
     if viewer is None:

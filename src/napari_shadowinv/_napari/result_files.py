@@ -1,13 +1,16 @@
-"""Results in files: their layers with the saved appearance, and napari's writers.
+"""Results in files and stores: their layers, and napari's writers.
 
-Any layers of a result save the complete result.
+- a result: any of its layers save it whole
+- a store of shots as lazy layers; only the first finished shot is read now: `store_layers`
 """
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from contextlib import ExitStack, suppress
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,19 +18,43 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.layer_metadata import Frame, Result, frame_for, frame_of, main_layers
+from napari_shadowinv._napari.layer_metadata import (
+    Frame,
+    Result,
+    frame_for,
+    frame_of,
+    main_layers,
+    metadata_of,
+)
 from napari_shadowinv._napari.layers import (
     FullLayerData,
     LayerData,
+    View,
+    arrows_in_shot,
+    dataset_layers,
     field_layers,
     fit_layers,
+    pack_layers,
     result_layers,
+    sample_arrows,
+    widen_limits,
 )
-from napari_shadowinv._napari.packs import pack_layers
+from napari_shadowinv._napari.viewer_sync import connect
+from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import write
 from napari_shadowinv.io.formats import PRADFORMAT, RESULT, Format
+from napari_shadowinv.io.store import (
+    DONE,
+    STATUS_NAMES,
+    StackStore,
+    columns_of_store,
+    open_dataset,
+    read_stack,
+    with_own_setups,
+)
 from napari_shadowinv.results import result_from_dataset
 
 if TYPE_CHECKING:
@@ -35,17 +62,8 @@ if TYPE_CHECKING:
 
     from napari_shadowinv.results import AnyResult
 
-_STATE = "napari"  # attribute with a result's name, its origins in words, its layers' looks
+_STATE = "napari"  # attribute with a result's name, its place, and its origins in words
 _MAX_NAMES = 3  # in a message
-
-_PLACEMENT = ("scale", "translate", "units")
-_TRANSFORM = ("rotate", "shear", "affine")
-_SAVED_KEYWORDS: dict[str, tuple[str, ...]] = {
-    "image": ("colormap", "contrast_limits", "gamma", "interpolation2d"),
-    "points": ("face_colormap", "face_contrast_limits"),
-    "vectors": ("length", "edge_width", "vector_style"),
-}
-_COMMON_KEYWORDS = ("name", "visible", "opacity", "blending", *_PLACEMENT, *_TRANSFORM)
 
 
 def layers_of_result(result: Result[AnyResult], frame: Frame, name: str = "") -> LayerData:
@@ -60,122 +78,56 @@ def layers_of_result(result: Result[AnyResult], frame: Frame, name: str = "") ->
 
 
 def layers_of_dataset(dataset: xarray.Dataset, name: str) -> LayerData:
-    """Describe the saved layers of a result, the main layers, and its image."""
+    """Describe the main layers of a result, and its image, where they were saved."""
     state = json.loads(dataset.attrs.get(_STATE, "{}"))
-    looks: dict[str, dict[str, Any]] = state.get("looks", {})
     content = result_from_dataset(dataset)
-    result = Result(content, dict(state.get("origins", {})))
-    placement = next(iter(looks.values()), {})
     shape = dataset.sizes["y"], dataset.sizes["x"]
-    places = {key: placement.get(key) for key in _PLACEMENT}
-    frame = frame_for(
-        shape, content.setup, **places, pixel_size=dataset.attrs.get("scan_pixel_size")
-    )
-    if all(name in placement for name in _TRANSFORM):  # not in those of a script
-        frame = replace(
-            frame,
-            rotate=about.matrix_of(np.array(placement["rotate"])[-2:, -2:]),
-            shear=float(placement["shear"][-1]),
-            affine=about.matrix_of(np.array(placement["affine"])[-3:, -3:]),
-        )
-    layers = layers_of_result(result, frame, state.get("name", name))
-    return [
-        (data, keywords | looks.get(about.layer_key(keywords), {}), kind)
-        for data, keywords, kind in main_layers(layers, also={*looks, "image"})
-    ]
+    if "frame" in state:
+        affine = about.matrix_of(state["frame"].pop("affine"))
+        frame = Frame(**{key: tuple(value) for key, value in state["frame"].items()}, affine=affine)
+    else:  # written by a command or a script
+        frame = frame_for(shape, content.setup, pixel_size=dataset.attrs.get("scan_pixel_size"))
+    result = Result(content, dict(state.get("origins", {})))
+    layers = layers_of_result(result, frame, state.get("name") or name)
+    return main_layers(layers, also={"image"})
 
 
 def missing_layers(viewer: Any, layer: Any) -> LayerData:
     """Describe the layers of a result or store that are missing in a viewer.
 
-    `layer` belongs to it. An image that no step changed counts as present.
+    `layer` belongs to it.
     """
-    from napari_shadowinv._napari.stores import store_layers
+    from napari_shadowinv._napari.result_files import store_layers
 
-    facts = about.metadata_of(layer)
+    facts, frame = about.metadata_of(layer), frame_of(layer)
     result, store = facts.get("result"), facts.get("store")
     if result is not None:
-        layer_data = layers_of_result(result, frame_of(layer), str(facts.get("name", "")))
+        layer_data = layers_of_result(result, frame, str(facts.get("name", "")))
     elif store is not None:
+        placement = {"cache": False, **frame.keywords(stacked=True)}
         layer_data = store_layers(Path(store), str(facts.get("name", "")))
-        placement = {"cache": False, **frame_of(layer).keywords(stacked=True)}
         layer_data = [(data, keywords | placement, kind) for data, keywords, kind in layer_data]
     else:
         raise InputError(
             f"'{layer.name}' shows no result: select a layer of a result, or press Run first"
         )
-    present = about.layers_of(viewer, layer)
-    keys, inputs = {about.layer_key(layer) for layer in present}, _shown_inputs(viewer, result)
-    missing = [
-        entry
-        for entry in layer_data
-        if about.layer_key(entry[1]) not in keys and about.role_of(entry[1]) not in inputs
+    keys = {about.layer_key(each) for each in about.layers_of(viewer, layer)}
+    return [
+        (data, {**keywords, "visible": False}, kind)
+        for data, keywords, kind in layer_data
+        if about.layer_key(keywords) not in keys
     ]
-    for _, keywords, _ in missing:
-        keywords["visible"] = False
-    return missing
 
 
-def _shown_inputs(viewer: Any, result: Result[AnyResult] | None) -> set[str]:
-    """Return roles that a viewer shows as the shot and its source, unchanged by any step."""
-    content = None if result is None else result.content
-    recipe = getattr(getattr(content, "provenance", None), "recipe", None)
-    if recipe is None or recipe.steps:
-        return set()
-    planes: Any = getattr(content, "images", getattr(content, "image", None))
-    shape = () if planes is None else tuple(planes.shape[-2:])
-    inputs = {about.SHOT: "image", about.SOURCE: "source", None: "image"}
-    return {
-        inputs[about.role_of(layer)]
-        for layer in viewer.layers
-        if about.kind_of(layer) == "image"
-        and about.role_of(layer) in inputs
-        and tuple(layer.data.shape) == shape
-    }
-
-
-def dataset_of_layers(layers: Sequence[FullLayerData], result: Result[AnyResult]) -> xarray.Dataset:
-    """Return the dataset of a result with its layers' appearance and painted caustics."""
-    content: Any = result.content
-    looks = {about.layer_key(keywords): _look(keywords, kind) for _, keywords, kind in layers}
-    state = {"looks": looks, "origins": dict(result.origins)}
-    for data, keywords, _ in layers:
-        if (name := about.metadata_of(keywords).get("name")) is not None:
-            state["name"] = name
-        if about.role_of(keywords) == "caustic":  # of an inversion
-            content = replace(content, caustic=np.asarray(data) > 0)
-    saved: xarray.Dataset = content.to_dataset()
-    return saved.assign_attrs({_STATE: json.dumps(state, default=_plain)})
-
-
-def _look(keywords: dict[str, Any], kind: str) -> dict[str, Any]:
-    names = (*_COMMON_KEYWORDS, *_SAVED_KEYWORDS.get(kind, ()))
-    look = {name: keywords[name] for name in names if keywords.get(name) is not None}
-    return {
-        name: _colormap_look(value) if isinstance(value, dict) else value
-        for name, value in look.items()
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Convert a value that JSON does not have."""
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value)
-
-
-def _colormap_look(colormap: dict[str, Any]) -> Any:
-    """Return the name of one of napari's colour maps, or else its colours."""
-    from napari.utils.colormaps import AVAILABLE_COLORMAPS, ensure_colormap
-
-    name = colormap.get("name")
-    if name in AVAILABLE_COLORMAPS and np.array_equal(
-        ensure_colormap(name).colors, colormap["colors"]
-    ):
-        return name
-    return {key: colormap[key] for key in ("name", "colors", "controls") if key in colormap}
+def dataset_to_save(result: Result[AnyResult], layer: Any) -> xarray.Dataset:
+    """Return the dataset of a result, with the name and the place of a layer that shows it."""
+    name, frame = about.metadata_of(layer).get("name"), asdict(frame_of(layer))
+    state = {"name": name, "frame": frame, "origins": dict(result.origins)}
+    return result.content.to_dataset().assign_attrs({_STATE: json.dumps(state)})
 
 
 def write_result(path: str, layers: Sequence[FullLayerData]) -> list[str]:
-    """Write a complete result, with the appearance of its layers, as ``.shadowinv``."""
+    """Write a complete result as ``.shadowinv``."""
     return _write(path, layers, RESULT)
 
 
@@ -191,39 +143,183 @@ def _write(path: str, layers: Sequence[FullLayerData], form: Format) -> list[str
         if not has_suffix:
             target = target.with_name(target.name + form.suffix)
         # napari's dialog asked about replacing the entered name only.
-        return [str(write(target, dataset_to_save(layers), overwrite=has_suffix))]
+        return [str(write(target, _common_result(layers), overwrite=has_suffix))]
     except InputError as error:
         # napari takes a ValueError of a writer as "no writer" and hides its message.
         raise FileFormatError(str(error)) from error
 
 
-def dataset_to_save(layers: Sequence[FullLayerData]) -> xarray.Dataset:
-    """Return the dataset of the result that layers show, as it was computed."""
-    return dataset_of_layers(*_common_result(layers))
+def _common_result(layers: Sequence[FullLayerData]) -> xarray.Dataset:
+    """Return the dataset of the one result that layers show."""
+    from napari.layers import Layer
 
-
-def _common_result(layers: Sequence[FullLayerData]) -> tuple[LayerData, Result[AnyResult]]:
-    owners = [about.result_of(layer[1]) for layer in layers]
-    results = {id(result): result for result in owners if result is not None}
-    if len(results) > 1:
-        names = [_name(layer) for layer in layers if about.result_of(layer[1]) is not None]
+    shown = [(about.result_of(layer[1]), layer) for layer in layers]
+    of_results = [(result, layer) for result, layer in shown if result is not None]
+    if len({id(result) for result, _ in of_results}) > 1:
+        names = _quote_names([layer for _, layer in of_results])
         raise InputError(
-            f"the layers belong to {len(results)} results ({_quote_names(names)}): select layers "
-            "of one result and save the selected layers"
+            f"the layers belong to several results ({names}): select layers of one result and save "
+            "the selected layers"
         )
-    if not results:
+    if not of_results:
         raise InputError(
-            f"no layer belongs to a result ({_quote_names([_name(layer) for layer in layers])}): "
-            "expected at least one layer of an inversion; save other layers as images"
+            f"no layer belongs to a result ({_quote_names(layers)}): expected at least one layer "
+            "of an inversion; save other layers as images"
         )
-    (common,) = results.values()
-    return [layer for layer in layers if about.result_of(layer[1]) is common], common
+    result, layer = of_results[0]
+    return dataset_to_save(result, Layer.create(*layer))
 
 
-def _name(layer: FullLayerData) -> str:
-    return str(layer[1].get("name", "?"))
+def _quote_names(layers: Sequence[FullLayerData]) -> str:
+    names = [f"'{keywords.get('name', '?')}'" for _, keywords, _ in layers]
+    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
+    return ", ".join(names[:_MAX_NAMES]) + more
 
 
-def _quote_names(names: Sequence[str]) -> str:
-    text = ", ".join(f"'{name}'" for name in names[:_MAX_NAMES])
-    return text + (f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else "")
+_CONTRAST_SHOTS = 16
+
+
+@as_file_errors
+def store_layers(path: Path, name: str = "") -> LayerData:
+    """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
+
+    Units are those of the first finished shot, and the contrast suits up to 16 finished shots.
+    """
+    dataset = _open(path)
+    name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
+    reference = _first_done(dataset, path)
+    setup = setup_from_dataset(dataset.isel(shot=reference))
+    frame = frame_for(dataset["displacement"].shape, setup)
+    facts = {"store": str(path), "name": name, "shots": _shot_names(dataset)}
+    layers = dataset_layers(View(dataset, setup, reference), frame, name, facts)
+    _widen_contrast(layers, _finished_shots(dataset))
+    return layers
+
+
+def _widen_contrast(layers: Sequence[FullLayerData], finished: Sequence[int]) -> None:
+    """Extend the limits of the images shown by default to some of the finished shots."""
+    places = np.linspace(0, len(finished) - 1, min(len(finished), _CONTRAST_SHOTS))
+    images = [(data, words) for data, words, kind in main_layers(layers) if kind == "image"]
+    for shot in np.take(finished, np.rint(places).astype(int)).tolist():
+        with suppress(FileFormatError, OSError):  # the shot is damaged
+            for data, words in images:
+                plane = np.asarray(data[shot])
+                words["contrast_limits"] = widen_limits(words["contrast_limits"], plane)
+
+
+@as_file_errors
+def _open(path: Path) -> xarray.Dataset:
+    """Open a store lazily with the axis of shots first, or raise a `FileFormatError`."""
+    if not path.is_dir():
+        raise FileFormatError(f"{path} does not exist: expected a folder made by an inversion")
+    dataset = open_dataset(path)
+    if "displacement" not in dataset or "shot" not in dataset["displacement"].dims:
+        raise FileFormatError(
+            f"{path} is a Zarr folder but not a store of inverted shots (it has no "
+            "displacement): open it with napari's own reader"
+        )
+    return with_own_setups(dataset).transpose("shot", "component", "y", "x", ...)
+
+
+@as_file_errors
+def shot_of_store(path: Path, index: int) -> xarray.Dataset:
+    """Read a shot of a store as the dataset of a single result; an `InputError` if not done."""
+    store = StackStore(path)
+    status = store.statuses()[index]
+    if status != DONE:
+        raise InputError(
+            f"shot {index} ('{store.names[index]}') is {STATUS_NAMES[status]}: move the slider to "
+            "a finished shot"
+        )
+    shot = read_stack(path).isel(shot=index)
+    name = str(shot["name"].values) if "name" in shot else str(index)
+    planes = [str(variable) for variable in shot.data_vars if "y" in shot[variable].dims]
+    return shot[planes].drop_vars("shot", errors="ignore").compute().assign_attrs(shot=name)
+
+
+@as_file_errors
+def shot_rows(path: Path, index: int) -> list[tuple[str, str]]:
+    """Return the quantities of a shot that tables list, as rows of a report."""
+    dataset = _open(path)
+    report = json.loads(str(dataset["report"][index].values) or "{}")
+    columns = columns_of_store(dataset.attrs)
+    texts = {"result": report.get("headline", "")}
+    texts |= {column.title: column.text(report) for column in columns if column.show}
+    rows = [(title.capitalize(), text) for title, text in texts.items() if text]
+    return [("Shot", f"{index} ({_shot_names(dataset)[index]})"), *rows]
+
+
+def _first_done(dataset: xarray.Dataset, path: Path) -> int:
+    for shot in _finished_shots(dataset):
+        with suppress(FileFormatError):  # the shot is damaged
+            if np.isfinite(dataset["displacement"][shot].values).all():
+                return int(shot)
+    raise FileFormatError(f"{path} contains no finished shot yet: wait for the first one")
+
+
+def _finished_shots(dataset: xarray.Dataset) -> Sequence[int]:
+    if "status" in dataset and "shot" in dataset["status"].dims:
+        return np.flatnonzero(dataset["status"].values == DONE).tolist()
+    return range(dataset.sizes["shot"])
+
+
+def _shot_names(dataset: xarray.Dataset) -> list[str]:
+    for name in ("name", "shot"):
+        if name in dataset.variables and dataset[name].dims == ("shot",):
+            return [str(value) for value in dataset[name].values]
+    return [str(shot) for shot in range(dataset.sizes["shot"])]
+
+
+def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
+    """Show the arrows of the shot in view, as they cannot be lazy; return how to reload them."""
+    displacement = _displacement(layer)
+    current: list[int] = []
+
+    def shot_in_view() -> int:
+        return round(float(layer.world_to_data(viewer.dims.point[-layer.ndim :])[0]))
+
+    def read() -> None:
+        shot = shot_in_view()
+        if not layer.visible or not 0 <= shot < len(displacement):
+            return
+        current[:] = [shot]
+        try:
+            plane = displacement[shot].values
+        except OSError:
+            return  # the field, from the same chunk, reports it
+        data, _ = sample_arrows(plane)
+        layer.data = arrows_in_shot(data, shot)
+        layer.features = {"displacement": np.hypot(*data[:, 1].T)}
+
+    def reload() -> None:
+        nonlocal displacement
+        displacement = _displacement(layer)
+        read()
+
+    def follow(_: Any = None) -> None:
+        if current != [shot_in_view()]:
+            read()
+
+    def leave(event: Any) -> None:
+        if event.value is layer:
+            connections.close()
+
+    connections = ExitStack()
+    connections.callback(connect(viewer.dims, "current_step", follow))
+    connections.callback(connect(viewer.layers, "removed", leave))
+    connect(layer, "visible", follow)
+    follow()
+    return reload
+
+
+def _displacement(layer: Any) -> xarray.DataArray:
+    return _open(Path(metadata_of(layer)["store"]))["displacement"]
+
+
+def viewer_in_window() -> Any | None:
+    """Return the viewer of the current window, None without a window."""
+    if "napari._qt" not in sys.modules:
+        return None
+    from napari import current_viewer
+
+    return current_viewer()

@@ -13,9 +13,14 @@ import numpy as np
 
 from napari_shadowinv import io
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.layer_metadata import Frame, frame_for, metadata_for, metadata_of
+from napari_shadowinv._napari.layer_metadata import (
+    Frame,
+    frame_for,
+    metadata_for,
+    metadata_of,
+    source_on,
+)
 from napari_shadowinv._napari.layers import FullLayerData, LayerData, Limits
-from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._typing import BoolArray, FloatArray

@@ -18,8 +18,8 @@ from qtpy.QtWidgets import QWidget
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job, name_of_result
+from napari_shadowinv._napari.layer_metadata import source_on
 from napari_shadowinv._napari.layers import LayerData
-from napari_shadowinv._napari.placement import source_on
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.widgets import _panels as panels

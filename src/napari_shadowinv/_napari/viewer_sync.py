@@ -2,7 +2,7 @@
 
 - events of napari's models: `connect`, of all layers: `connect_layers`
 - a sentence instead of a traceback for a user's error: `notify_errors`
-- colour bar, placement of new images, label of the shown film: `connect_viewer`
+- colour bar, and the label of the shown film: `connect_viewer`
 """
 
 from __future__ import annotations
@@ -15,9 +15,6 @@ from contextlib import ExitStack
 from typing import Any, TypeVar
 
 from napari_shadowinv._napari.layer_metadata import (
-    Frame,
-    data_of,
-    frame_of,
     kind_of,
     metadata_of,
     result_of,
@@ -140,7 +137,6 @@ def connect_viewer(viewer: Any) -> None:
     if layers not in _connected:
         _connected.add(layers)
         _follow_top_image(viewer)
-        _place_new_images(viewer)
         _label_films(viewer)
 
 
@@ -202,50 +198,6 @@ def _show_bar(layer: Any, on: bool) -> None:
     layer.name_overlay.position = layer.colorbar.position
     layer.name_overlay.font_size = min(_NAME_SIZE_PT, _LINE_WIDTH_PT / len(layer.name or " "))
     layer.name_overlay.visible = on
-
-
-def _place_new_images(viewer: Any) -> None:
-    """Place new images without a scale on results of the same size, or explain how to."""
-    # With pixels and lengths together, napari drops the unit of its scale bar.
-
-    def receive(event: Any) -> None:
-        layer = event.value
-        fields = [result for result in viewer.layers if role_of(result) == "field"]
-        fields = [field for field in fields if frame_of(field).units != Frame().units]
-        if fields and _is_bare_image(layer):
-            _place_on_result(layer, fields)
-
-    connect(viewer.layers, "inserted", receive)
-
-
-def _place_on_result(layer: Any, fields: list[Any]) -> None:
-    from napari.utils.notifications import show_info, show_warning
-
-    shape = data_of(layer).shape[: -1 if layer.rgb else None]
-    same_size = [field for field in fields if field.data.shape[-2:] == tuple(shape[-2:])]
-    if not same_size:
-        unit = f"{fields[-1].units[-1]:~P}"
-        show_warning(
-            f"'{layer.name}' is in pixels, the results are in {unit}, and their sizes differ, so "
-            "they do not overlap. To set the scale, select the layer and its setup in 'Invert' "
-            "and press 'Show at scale', or move the layer (layer controls → transform)"
-        )
-        return
-    frame = frame_of(same_size[-1])
-    for name, value in frame.keywords(stacked=layer.ndim > 2).items():
-        setattr(layer, name, value)
-    show_info(
-        f"'{layer.name}' has the same size in pixels as '{same_size[-1].name}': it was placed at "
-        f"the same position, with pixels of {frame.scale[-1]:.4g} {same_size[-1].units[-1]:~P}"
-    )
-
-
-def _is_bare_image(layer: Any) -> bool:
-    """Whether a layer is the user's image at napari's default placement."""
-    if kind_of(layer) != "image" or not 2 <= layer.ndim <= 3:
-        return False
-    is_plugin_layer = role_of(layer) is not None and layer.source.path is None
-    return not is_plugin_layer and frame_of(layer) == Frame()
 
 
 def plane_in_view(viewer: Any, layer: Any) -> int:

@@ -38,13 +38,11 @@ class Cost:
     exceeds_memory: bool = False
 
 
-def inversion_cost(
-    shape: Sequence[int], options: InversionOptions, pace: float | None = None
-) -> Cost:
-    """Estimate an inversion that takes `pace` times the reference time on this machine."""
+def inversion_cost(shape: Sequence[int], options: InversionOptions) -> Cost:
+    """Estimate an inversion from times on two cores."""
     pixels, available = shape[0] * shape[1], physical_memory()
     sites = options.n_sites or min(pixels, MAX_DEFAULT_SITES)
-    seconds = (pace or 1) * (_SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites)
+    seconds = _SECONDS_PER_PIXEL * pixels + _SECONDS_PER_SITE * sites
     memory = _BYTES + _BYTES_PER_PIXEL * pixels + _BYTES_PER_SITE * sites
     text = (
         f"{pixels / 1e6:.3g} Mpx with {sites:,} sites: about {_in_words(seconds)} and up to "
@@ -62,9 +60,8 @@ def fit_cost(
     images: int,
     choices: FitChoices,
     instrument: Instrument | None = None,
-    pace: float | None = None,
 ) -> Cost:
-    """Estimate a fit without crossing rays, by the pace of the last one if it is known."""
+    """Estimate a fit without crossing rays."""
     fields, is_unknown = len(choices.fields or ("B",)), choices.beam == "unknown"
     seconds = _TIME_S + _TIME_PER_PIXEL_S * images * shape[0] * shape[1]
     seconds *= _TWO_FIELDS_FACTOR if fields > 1 else 1
@@ -75,13 +72,10 @@ def fit_cost(
     if samples and images > 1 and instrument is not None and instrument.beam_between:
         of_samples = max(samples, _LEAST_FITTED_SAMPLES) * _TIME_PER_FITTED_SAMPLE
     seconds *= 1 + of_samples
-    seconds *= pace or 1
     count = "one image" if images == 1 else f"{images} images"
     more = f", {fields} fields" if fields > 1 else ""
     more += ", unknown beam" if is_unknown else ""
-    basis = "based on the last fit"
-    if pace is None:
-        basis = f"up to {_in_words(_CROSSING_RAYS_FACTOR * seconds)} if rays cross"
+    basis = f"up to {_in_words(_CROSSING_RAYS_FACTOR * seconds)} if rays cross"
     subject = f"{count} of {shape[0]} × {shape[1]} px{more}"
     return Cost(seconds, f"{subject}: about {_in_words(seconds)}, {basis}.")
 

@@ -1,21 +1,16 @@
 """The widget that converts scans of a film pack to fluences, mostly without a window."""
 
-import csv
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from qtpy.QtCore import Qt
-from qtpy.QtWidgets import QFileDialog
 
 from helpers.layers import layer_of
 from napari_shadowinv import read, write
-from napari_shadowinv._napari import packs
-from napari_shadowinv._napari.layer_metadata import Frame, role_of, setup_of, usable_of
-from napari_shadowinv._napari.layers import add_layers
-from napari_shadowinv._napari.packs import BY_HAND, film_layers
-from napari_shadowinv._napari.widgets.film_pack import FilmPack
+from napari_shadowinv._napari.layer_metadata import role_of, setup_of, usable_of
+from napari_shadowinv._napari.layers import BY_HAND
+from napari_shadowinv._napari.widgets import film_pack
+from napari_shadowinv._napari.widgets.film_pack import FilmPack, corner_layers, dragged_corners
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.errors import InversionCancelled
@@ -64,21 +59,22 @@ def test_the_spectrum_follows_the_region(evaluated, pack_doses, wait):
 
 
 def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, run, wait):
-    tool, names = evaluated, {layer.name for layer in viewer.layers}
+    tool = evaluated
     layer_of(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND
     viewer.dims.set_current_step(0, 1)
     tool.show_corners.click()
-    assert tool.corners.polygon.mode == "direct"
+    polygon = viewer.layers.selection.active
+    assert polygon.mode == "direct"
     corners = pack_doses.corners
-    np.testing.assert_allclose(tool.corners.polygon.data[0], corners[1], atol=1e-4)
-    assert tool.corners.scan.rgb
-    assert tool.corners.corners(pack_doses) is None
+    np.testing.assert_allclose(polygon.data[0], corners[1], atol=1e-4)
+    assert viewer.layers["scan of film 2"].rgb
+    assert dragged_corners(viewer, tool._selected()[1]) is None
     moved = corners + np.array([[-2.0, 1.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    tool.corners.polygon.data = [moved[1]]
+    polygon.data = [moved[1]]
     viewer.dims.set_current_step(0, 2)
-    wait(lambda: tool.corners.scan.name == "scan of film 3")
-    np.testing.assert_allclose(tool.corners.polygon.data[0], corners[2], atol=1e-4)
-    tool.corners.polygon.data = [moved[2]]
+    tool.show_corners.click()
+    assert not viewer.layers["scan of film 2"].visible
+    viewer.layers.selection.active.data = [moved[2]]
     run(tool)
     doses = tool._selected()[1]
     assert doses is not pack_doses
@@ -94,13 +90,12 @@ def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, run, 
     assert spot.sum() == spot.size - 20
     marks = tool._partner(tool.packs.layer, "unusable")
     assert (marks.data[0, 38:46, 48:57][~spot] == BY_HAND).all()
-    assert not tool.corners.shown
-    assert {layer.name for layer in viewer.layers} == names  # those of the file, updated
+    assert not corner_layers(viewer)
 
 
 def test_a_polygon_that_is_no_film_is_refused(evaluated, refused):
     evaluated.show_corners.click()
-    polygon = evaluated.corners.polygon
+    polygon = evaluated.viewer.layers.selection.active
     (film,) = polygon.data
     for shapes, words in (
         ([film[[0, 2, 1, 3]]], "do not go around a film"),
@@ -115,7 +110,7 @@ def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, run, tmp_pat
     tool = evaluated
     tool.show_corners.click()
     tool.paint.click()
-    assert not tool.corners.scan.visible  # it would cover what is painted
+    assert not any(layer.visible for layer in corner_layers(viewer))  # they would cover it
     marks = layer_of(viewer, "unusable")
     assert marks.visible
     assert marks.mode == "paint"
@@ -157,7 +152,7 @@ def test_cancelling_removes_what_was_written_for_the_run(
             time.sleep(0.01)
         raise InversionCancelled
 
-    monkeypatch.setattr(packs, "run_film", work)
+    monkeypatch.setattr(film_pack, "run_film", work)
     layer_of(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
     cancelled(evaluated, lambda: bool(written))
     assert written == ["mask_01.tif"]
@@ -182,27 +177,3 @@ def test_films_become_images_that_can_be_fitted(viewer, opened, evaluated, pack_
     request = invert.request()
     np.testing.assert_array_equal(request.shot.mask, pack_doses.usable[1])
     assert request.recipe.setup == setup_of(images[1])
-
-
-def test_layers_are_written_with_a_table(evaluated, tmp_path, monkeypatch, refused):
-    folder = tmp_path / "layers"
-    monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_, **__: str(folder))
-    evaluated.write.click()
-    with (folder / "layers.csv").open(newline="") as file:
-        files = [row["file"] for row in csv.DictReader(file)]
-    assert files == [f"layer_0{number}.tif" for number in (1, 2, 3)]
-    refused(evaluated, "exists", evaluated.write.click)
-
-
-def test_without_a_setup_films_know_how_strongly_they_are_displaced(viewer, opened, pack_doses):
-    bare = replace(pack_doses, setups=())
-    add_layers(viewer, film_layers(bare, Frame(), "trio"))
-    fit = opened(FitImages)
-    fit.source.set_kind("unknown")
-    strengths = pack_doses.strengths
-    in_fit = [shot.strength[0] for shot in fit.request().shots]
-    np.testing.assert_allclose(in_fit, strengths)
-    # The first that is used is the reference, whatever the pack's first film is.
-    fit.images.item(0, 0).setCheckState(Qt.CheckState.Unchecked)
-    in_fit = [shot.strength[0] for shot in fit.request().shots]
-    np.testing.assert_allclose(in_fit, strengths[1:] / strengths[1])

@@ -188,24 +188,6 @@ def test_a_mask_over_the_object_is_refused(viewer, opened, hump, run, wait, refu
         later.request()
 
 
-def test_an_estimate_that_contains_the_object_says_so(viewer, opened, run):
-    image = synthetic_image(1.5 * ellipse_pair((96, 120)).displacement)
-    viewer.add_image(image * np.random.default_rng(5).normal(1, 0.01, image.shape), name="shot")
-    tool = opened(Invert)
-
-    def said(method):
-        tool.source.set_kind(method)
-        run(tool, tool.show_source)
-        return tool.panel.status.text()
-
-    assert said("polynomial") == ""
-    assert "of the pattern in the image" in said("total-variation")
-    mask = np.zeros(image.shape, int)
-    mask[20:76, 20:100] = 1
-    tool.source_masks.layer = viewer.add_labels(mask)
-    assert said("total-variation") == ""
-
-
 def test_a_result_says_where_everything_came_from(viewer, opened, of_a_file, run):
     tool = opened(Invert)
     tool.options.restore({"n_sites": 300})

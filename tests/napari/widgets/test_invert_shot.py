@@ -120,7 +120,6 @@ def test_what_a_file_brings_is_used_and_told(viewer, tool, shot):
     viewer.add_labels(mask, metadata=metadata_for("mask", "", path="a.txt"))
     cautions = [Caution("film-scan", "it may be film")]
     metadata = metadata_for("shot", "", path="a.txt", cautions=cautions)
-    tool.masks.painted_is_unusable.setChecked(False)
     tool.image.layer = viewer.add_image(shot, name="other", metadata=metadata)
     inversion = computed(tool)
     assert (inversion.mask == (mask == 0)).all()
@@ -341,7 +340,8 @@ def test_more_layers_adds_those_that_are_missing(tool, viewer, run, rest, proton
     rest(tool)
     added = {role_of(layer) for layer in viewer.layers} - set(few)
     assert added == {
-        "reprojection", "potential", "field y", "field x", "direction", "field arrows", "sites"
+        "image", "reprojection", "potential", "field y", "field x", "direction", "field arrows",
+        "sites",
     }  # fmt: skip
     visible = {role_of(layer) for layer in viewer.layers if layer.visible}
     assert visible == {None, "field", "arrows"}

@@ -13,7 +13,7 @@ from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.jobs import SourceJob
 from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
-from napari_shadowinv._napari.widgets._stack_jobs import StackJob
+from napari_shadowinv._napari.widgets._stacks import StackJob
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.inversion import compilation

@@ -70,7 +70,7 @@ def of_a_fit(tool, viewer):
     shape, rng = (32, 40), np.random.default_rng(0)
     for name in ("one", "two"):
         viewer.add_image(rng.normal(1, 0.01, shape), name=name)
-    yield "'two' has no strength"
+    yield "here is no setup"
     tool.setup.show_setup(ProtonSetup.example().model_dump())
     for row, words in ((1, "1 image is checked"), (0, "No images are checked")):
         check(row, Qt.CheckState.Unchecked)

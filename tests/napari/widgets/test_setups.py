@@ -222,7 +222,7 @@ def test_an_error_calls_the_fields_of_a_setup_by_their_labels():
 
 
 @pytest.mark.parametrize("is_by_us", [True, False])
-def test_sizes_in_the_file_begin_a_setup(tmp_path, picker, is_by_us):
+def test_sizes_in_the_file_complete_a_setup(tmp_path, picker, is_by_us):
     """Napari itself knows nothing of them."""
     path = tmp_path / "shot.h5"
     save_pradformat(path, np.ones((8, 9)), pixel_width=2.5e-05, object_image_dist=0.1)
@@ -234,12 +234,6 @@ def test_sizes_in_the_file_begin_a_setup(tmp_path, picker, is_by_us):
     else:
         layer._source = layer.source.model_copy(update={"path": str(path)})
     picker.follow(layer)
-    picker.set_kind("proton")
-    values = picker.form.state()
-    assert values["detector_pixel_size"] == 2.5e-5
-    assert values["object_image_distance"] == 0.1
-    assert "energy" not in values
-    assert picker.note.text() == "Begun with the file of 'shot'."
     # A setup file needs not repeat it, and is not overruled.
     entries = {"kind": "proton", "energy": 14.7, "source_object_distance": 0.01}
     picker.load(entries, "setup.toml")

@@ -383,9 +383,10 @@ def test_film_pack_is_clicked_to_its_end(
     wait(lambda: (tool.spectrum.fluence != whole).all())
 
     press(tool, "Show corners")
-    corners = np.array(tool.corners.polygon.data[0])
+    polygon = window.layers.selection.active
+    corners = np.array(polygon.data[0])
     corners[0] -= [2, 0]
-    tool.corners.polygon.data = [corners]
+    polygon.data = [corners]
     press(tool, "Paint mask")
     marks = window.layers.selection.active
     assert marks.mode == "paint"

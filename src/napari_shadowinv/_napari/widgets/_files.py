@@ -19,12 +19,16 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.form import TOML
 from napari_shadowinv._napari.jobs import Job, name_of_result
 from napari_shadowinv._napari.layers import add_layers
-from napari_shadowinv._napari.result_files import dataset_to_save, layers_of_result, missing_layers
-from napari_shadowinv._napari.stores import shot_of_store
+from napari_shadowinv._napari.result_files import (
+    dataset_to_save,
+    layers_of_result,
+    missing_layers,
+    shot_of_store,
+)
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._layers import new_mask
+from napari_shadowinv._napari.widgets._panels import ResultLayers
 from napari_shadowinv._napari.widgets._qt import ask_file, filter_of, notify_errors
-from napari_shadowinv._napari.widgets._results import ResultLayers
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
@@ -205,7 +209,6 @@ def _show_mask(picker: Any, usable: BoolArray | None, viewer: Any, image: Any) -
     picker.layer = None
     if usable is not None:
         picker.layer = new_mask(viewer, image, picker.title.lower(), ~usable)
-        picker.painted_is_unusable.setChecked(True)
 
 
 def _read_mask(file: Path | None, shape: tuple[int, ...] | None) -> BoolArray | None:
@@ -250,12 +253,11 @@ def shown_result(viewer: Any, preferred: Iterable[Any] = ()) -> Any:
 
 
 def result_to_save(viewer: Any, layer: Any) -> Savable:
-    """Collect the result of a layer with the appearance of its layers; of a store, its shot."""
+    """Collect the result of a layer; of a store, its shot."""
     result, facts = about.result_of(layer), about.metadata_of(layer)
     content: Any
     if result is not None:
-        layers = [each for each in viewer.layers if about.result_of(each) is result]
-        content = dataset_to_save([each.as_layer_data_tuple() for each in layers])
+        content = dataset_to_save(result, layer)
         name, kind, setup = name_of_result(layer), result.content.kind, result.content.setup
     else:
         index, shots = plane_in_view(viewer, layer), facts.get("shots", ())

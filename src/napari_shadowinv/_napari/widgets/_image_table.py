@@ -17,7 +17,7 @@ from napari_shadowinv._napari.layer_metadata import kind_of
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import number_in_unit, text_in_unit
-from napari_shadowinv.physics.setup import SETUPS
+from napari_shadowinv.physics.setup import SETUPS, ProtonSetup
 from napari_shadowinv.pipeline.shot_table import ShotRow
 
 _PREFIXED_UNIT = "m"  # cells show it, with the prefix of each number
@@ -78,11 +78,8 @@ _OTHER_COLUMNS = (
 
 
 def beam_column(kind: str) -> Column:
-    """Return the column for a kind of setup; without a setup, the relative displacement."""
-    if kind not in SETUPS:
-        tip = "Displacement in this image relative to the first image, such as 0.6."
-        return Column("strength", "Strength", "", tip)
-    quantity = SETUPS[kind].beam_quantity()
+    """Return the column for a kind of setup, by default of protons."""
+    quantity = SETUPS.get(kind, ProtonSetup).beam_quantity()
     title = quantity.noun.capitalize()
     return Column(quantity.name, title, quantity.unit, quantity.description)
 
@@ -160,9 +157,8 @@ class ImageTable(QTableWidget):
     def show_beams(self, kind: str, value: Any, is_brightness_known: bool) -> None:
         """Fill the cells; `value` is the reference's energy or wavelength in the shown setup."""
         self._set_beam(beam_column(kind))
-        reference_beam = value if kind in SETUPS else 1.0
         for row, image in enumerate(self.images):
-            beam = reference_beam if image is self.reference else self._beam_of(image)
+            beam = value if image is self.reference else self._beam_of(image)
             values = {**entries_of(image), self.beam.name: beam}
             for number, spec in enumerate(self._columns, 1):
                 self._write(row, number, values.get(spec.name, spec.default))
@@ -187,7 +183,7 @@ class ImageTable(QTableWidget):
         return values
 
     def beam_value(self, image: Any) -> float:
-        """Return energy, wavelength or strength of an image, or raise an `InputError`."""
+        """Return energy or wavelength of an image, or raise an `InputError`."""
         value = self.values(image)[self.beam.name]
         if value is None:
             raise InputError(
@@ -212,11 +208,6 @@ class ImageTable(QTableWidget):
         entry = entries_of(image).get(self.beam.name)
         if entry is not None:
             return entry
-        if self.beam.name == "strength" and self.reference is not None:
-            own_strength, first_strength = (
-                about.metadata_of(each).get("strength") for each in (image, self.reference)
-            )
-            return own_strength / first_strength if own_strength and first_strength else None
         return getattr(about.setup_of(image), self.beam.name, None)
 
     def _write(self, row: int, number: int, value: Any) -> None:

@@ -16,15 +16,14 @@ from qtpy.QtWidgets import QFileDialog, QWidget
 from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.placement import source_on
+from napari_shadowinv._napari.layer_metadata import source_on
 from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.shots import shot_of_layer, source_of_shot
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import RecipeButton
 from napari_shadowinv._napari.widgets._layers import LAYER
-from napari_shadowinv._napari.widgets._panels import ResultView, ToolPanel
-from napari_shadowinv._napari.widgets._results import place_together
+from napari_shadowinv._napari.widgets._panels import ResultView, ToolPanel, place_together
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import read_shot, read_toml
@@ -233,7 +232,6 @@ class SetupPicker(forms.ModelPicker):
         self._last = kind
         if kind != earlier_kind:
             self._is_loaded = False
-            self._begin_with_file()
         # Leaving a field as it was changes no values.
         elif self.form is not None and self.form.state() != earlier_values:
             origin = self._origins.get(kind, "typed")
@@ -291,18 +289,6 @@ class SetupPicker(forms.ModelPicker):
             with suppress(InputError, OSError):
                 metadata = read_shot(path).metadata
         return dict((metadata or {}).get("geometry", {}))
-
-    def _begin_with_file(self) -> None:
-        """Begin an empty form with what the image's file says."""
-        form = self.form
-        if form is None or not form.is_empty:
-            return
-        geometry = self._file_geometry()
-        values = {name: geometry[name] for name in form.entries if name in geometry}
-        if values:
-            with QSignalBlocker(self):
-                form.restore(form.state() | values)
-            self._origins[self.kind] = f"begun with the file of '{self._layer.name}'"
 
     @qt.notify_errors
     def _save(self) -> None:

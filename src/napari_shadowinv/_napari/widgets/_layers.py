@@ -9,13 +9,17 @@ from typing import Any
 import numpy as np
 from napari.layers import Layer, Shapes
 from qtpy.QtCore import Signal
-from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.form import Kinds, ModelPicker, labelled
+from napari_shadowinv._napari.form import Kinds, ModelPicker
 from napari_shadowinv._napari.jobs import name_of_result
-from napari_shadowinv._napari.layer_metadata import data_of, kind_of
-from napari_shadowinv._napari.placement import labels_on, mapped, matrix_between
+from napari_shadowinv._napari.layer_metadata import (
+    data_of,
+    kind_of,
+    labels_on,
+    mapped,
+    matrix_between,
+)
 from napari_shadowinv._napari.viewer_sync import without_proxy
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._system.arrays import complete_block_means, join_masks
@@ -91,8 +95,8 @@ def cautions_of(layer: Any) -> tuple[Caution, ...]:
     return film_cautions(layer.data, None)
 
 
-def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArray | None:
-    """Return the usable pixels of an image (None for files) by labels or shapes; None for all."""
+def painted_on(layer: Any | None, image: Any) -> BoolArray | None:
+    """Return the pixels of an image (None for files) under labels or shapes; None without any."""
     if layer is None:
         return None
     if image is not None:
@@ -120,7 +124,7 @@ def mask_of(layer: Any | None, image: Any, painted_is_unusable: bool) -> BoolArr
             f"the mask '{layer.name}' lies beside the image '{image.name}': draw it on the image, "
             "or move it there (layer controls → transform)"
         )
-    return ~painted if painted_is_unusable else painted
+    return painted
 
 
 def _pixels_in_shapes(layer: Any, image: Any) -> BoolArray:
@@ -195,7 +199,7 @@ def _add_layer(viewer: Any, image: Any, kind: str, data: Any, title: str, **keyw
     return layer
 
 
-BLOCK_PX = 8
+_BLOCK_PX = 8
 _MIN_STRUCTURE_RATIO, _MIN_RATIO_OF_PAIR = 2.0, 1.2
 
 
@@ -327,41 +331,21 @@ def _has_word(layer: Any, words: re.Pattern[str]) -> bool:
 
 def _structure(layer: Any) -> float:
     """Return the relative r.m.s. of structures between noise and the beam's shape; or NaN."""
-    pattern = block_pattern(layer.data)
-    return np.nan if pattern is None else float(np.std(pattern))
-
-
-def block_pattern(data: Any) -> FloatArray | None:
-    """Return an image's relative means of blocks without its smooth beam; None if unknown."""
-    if not isinstance(data, np.ndarray) or data.ndim != 2 or min(data.shape) < 4 * BLOCK_PX:
-        return None
-    means = complete_block_means(data, BLOCK_PX)
+    data = layer.data
+    if not isinstance(data, np.ndarray) or data.ndim != 2 or min(data.shape) < 4 * _BLOCK_PX:
+        return np.nan
+    means = complete_block_means(data, _BLOCK_PX)
     mean = means.mean()
     if not np.isfinite(mean) or mean <= 0:
-        return None
+        return np.nan
     y, x = np.mgrid[-1 : 1 : means.shape[0] * 1j, -1 : 1 : means.shape[1] * 1j].reshape(2, -1)
     beam = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
     smooth = beam @ np.linalg.lstsq(beam, means.ravel(), rcond=None)[0]
-    return (means - smooth.reshape(means.shape)) / mean
-
-
-# By the mask's title: the meaning of painted pixels, and its tooltip.
-_PAINT = {
-    "Mask": (
-        "unusable",
-        "Checked: painted pixels are excluded (handwriting, dead pixels). Unchecked: only painted "
-        "pixels are used. For opaque obstacles, set the source to zero instead.",
-    ),
-    "Source mask": (
-        "object",
-        "Checked: the source is estimated from the unpainted pixels. Unchecked: from the painted "
-        "ones.",
-    ),
-}
+    return float(np.std(means.ravel() - smooth) / mean)
 
 
 class MaskPicker(LayerPicker):
-    """A layer of painted pixels, and their meaning, for the image that `image` returns."""
+    """A layer of painted pixels, which are not used, for the image that `image` returns."""
 
     def __init__(
         self, viewer: Any, image: Callable[[], Any], tip: str, title: str = "Mask"
@@ -369,17 +353,13 @@ class MaskPicker(LayerPicker):
         kinds = "labels", "shapes"
         super().__init__(viewer, tip, "none", about.may_be_mask, kinds=kinds, label=title)
         self._image, self.title = image, title
-        target, meaning = _PAINT[title]
-        tip = f"<qt>{meaning}</qt>"
-        self.painted_is_unusable = QCheckBox(f"painted = {target}", checked=True, toolTip=tip)
         self.add_button("✎", f"Paint a {title.lower()}.", self.paint)
-        self.layout().addWidget(labelled("", self.painted_is_unusable))
-        self.painted_is_unusable.toggled.connect(self.changed)
 
     def usable(self, image: Any) -> BoolArray | None:
         """Return the usable pixels of an image layer, of a stack's planes, or of files (None)."""
-        painted = mask_of(self.layer, image, self.painted_is_unusable.isChecked())
-        return join_masks(painted, None if image is None else about.usable_of(image))
+        painted = painted_on(self.layer, image)
+        unpainted = None if painted is None else ~painted
+        return join_masks(unpainted, None if image is None else about.usable_of(image))
 
     def summary(self, image: Any) -> str:
         """Return the layer's name and the share of excluded pixels; empty if there are none."""
@@ -398,7 +378,6 @@ class MaskPicker(LayerPicker):
             metadata = about.metadata_of(layer)
             if metadata.get("role") == about.MASK and metadata.get("path") == path:
                 self.layer = layer
-                self.painted_is_unusable.setChecked(True)
 
     @qt.notify_errors
     def paint(self) -> None:

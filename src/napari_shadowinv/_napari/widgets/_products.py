@@ -16,8 +16,8 @@ from qtpy import QtWidgets
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job, name_of_result
+from napari_shadowinv._napari.layer_metadata import mapped, matrix_between
 from napari_shadowinv._napari.layers import LayerData, add_layers
-from napari_shadowinv._napari.placement import mapped, matrix_between
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes

@@ -11,8 +11,7 @@ from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt
 
 from napari_shadowinv._napari import form as forms
-from napari_shadowinv._napari.layer_metadata import kind_of, role_of, unit_of
-from napari_shadowinv._napari.placement import pixel_mapper
+from napari_shadowinv._napari.layer_metadata import kind_of, pixel_mapper, role_of, unit_of
 from napari_shadowinv._napari.widgets import _products as products
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes, shown_plane

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
@@ -11,156 +13,114 @@ import numpy as np
 from napari.utils.notifications import show_info
 from pydantic import Field
 from qtpy import QtWidgets
-from qtpy.QtCore import QObject, Qt
+from qtpy.QtCore import Qt
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari import packs
-from napari_shadowinv._napari.jobs import Finished, name_of_result
-from napari_shadowinv._napari.layers import add_layers
-from napari_shadowinv._napari.packs import PackJob
-from napari_shadowinv._napari.result_files import dataset_of_layers
+from napari_shadowinv._napari.jobs import Finished, Job, name_of_result
+from napari_shadowinv._napari.layers import (
+    BY_HAND,
+    FLUENCE,
+    PACK_KINDS,
+    PER_AREA,
+    UNUSABLE,
+    LayerData,
+    add_layers,
+    film_limits,
+    pack_layers,
+)
+from napari_shadowinv._napari.result_files import dataset_to_save
 from napari_shadowinv._napari.run import Run
+from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._napari.widgets._layers import LayerPicker, mask_of, new_shapes
-from napari_shadowinv._napari.widgets._results import ResultLayers
+from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes, painted_on
+from napari_shadowinv._napari.widgets._panels import ResultLayers
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
-from napari_shadowinv._typing import AnyArray, FloatArray
+from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.film import Pack
 from napari_shadowinv.film.scans import checked_corners
 from napari_shadowinv.film_doses import FilmDoses, Spectrum
 from napari_shadowinv.io import write
 from napari_shadowinv.io.images import read_scan
-from napari_shadowinv.pipeline import read_pack, write_layers
-from napari_shadowinv.pipeline.film_files import copy_corrections
+from napari_shadowinv.pipeline import read_pack, run_film
+from napari_shadowinv.pipeline.film_files import copy_corrections, corrected_pack
 
-_SETTLE_MS = 60
 _MIN_MOVE_PX = 0.01  # napari rounds coordinates
 
 
-class CornerEditor(QObject):
-    """Layers with the scan of the displayed film and a polygon of its corners."""
+def corner_layers(viewer: Any, doses: FilmDoses | None = None) -> list[Any]:
+    """Return the scans of films with the polygons of their corners, of one result or of all."""
+    layers = [layer for layer in viewer.layers if about.role_of(layer) in ("scan", "corners")]
+    return [each for each in layers if doses in (None, about.metadata_of(each)["doses"])]
 
-    def __init__(self, viewer: Any, parent: QObject) -> None:
-        super().__init__(parent)
-        self._viewer = viewer
-        self._films: Any = None  # the fluence layer
-        self._doses: Any = None
-        self._plane = 0
-        self._moved: dict[int, FloatArray] = {}  # by plane
-        self._read_scan = lru_cache(maxsize=1)(read_scan)
-        self.scan: Any = None
-        self.polygon: Any = None
-        self._settle_timer = qt.timer(self, _SETTLE_MS, self._follow, once=True)
-        qt.while_alive(self, viewer.dims, "current_step", self._on_step)
 
-    @property
-    def shown(self) -> bool:
-        return all(layer in self._viewer.layers for layer in (self.scan, self.polygon))
+def show_corners(viewer: Any, films: Any, doses: FilmDoses) -> None:
+    """Show the scan of the film in view, with a polygon of its corners; hide those of others."""
+    plane, shown = plane_in_view(viewer, films), []
+    for layer in corner_layers(viewer):
+        layer.visible = about.metadata_of(layer)["plane"] == plane
+        shown += [layer] if layer.visible else []
+    if len(shown) != 2:
+        for layer in shown:
+            viewer.layers.remove(layer)
+        shown = _add_corners(viewer, films, doses, plane)
+    viewer.layers.selection.active = shown[-1]
+    shown[-1].mode = "direct"
 
-    def show(self, films: Any, doses: FilmDoses) -> None:
-        """Show the displayed film of a pack's layer; changes to another pack are discarded."""
-        if doses is not self._doses:
-            self.close()
-        self._films, self._doses = films, doses
-        self.set_visible(True)  # first, as it ends the mode in which corners are dragged
-        self._show(plane_in_view(self._viewer, films))
 
-    def close(self) -> None:
-        """Remove the layers and discard the changes."""
-        for layer in (self.polygon, self.scan):
-            if layer is not None and layer in self._viewer.layers:
-                self._viewer.layers.remove(layer)
-        self.scan = self.polygon = self._doses = None
-        self._moved = {}
+def _add_corners(viewer: Any, films: Any, doses: FilmDoses, plane: int) -> list[Any]:
+    corners = doses.corners[plane]
+    if not np.isfinite(corners).all():
+        raise InputError(
+            f"{doses.film_label(plane)}: the layer is excluded and shows no film; choose another "
+            "film"
+        )
+    path: Any = doses.pack.layers[plane].file or doses.pack.scan
+    pixels = read_scan(path).pixels
+    pixels = pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
+    # The scan has the pixel size of the films, and its film lies over them.
+    frame = about.frame_of(films)
+    centre = np.asarray(frame.translate) + (np.array(films.data.shape[-2:]) - 1) / 2 * frame.scale
+    y, x = centre - corners.mean(axis=0) * frame.scale
+    metadata = about.metadata_for("scan", "", doses=doses, plane=plane)
+    look = {"rgb": True, "name": f"scan of film {plane + 1}", "metadata": metadata}
+    place = replace(frame, translate=(y, x)).keywords()
+    (scan,) = add_layers(viewer, [(pixels, look | place, "image")])
+    polygon = new_shapes(viewer, scan, "corners", "direct")
+    polygon.metadata = about.metadata_for("corners", "", doses=doses, plane=plane)
+    polygon.add_polygons([corners])
+    viewer.reset_view()
+    return [scan, polygon]
 
-    def corners(self, doses: FilmDoses) -> dict[str, FloatArray] | None:
-        """Return the corners of all films by number; None if the user moved none."""
-        if doses is not self._doses:
-            return None
-        self._store_changes()
-        if not self._moved:
-            return None
-        corners = {k: film for k, film in enumerate(doses.corners) if np.isfinite(film).all()}
-        try:
-            return {
-                str(k + 1): checked_corners(film) for k, film in (corners | self._moved).items()
-            }
-        except InputError as error:
-            raise InputError(f"{error}; press Show corners to reset them") from None
 
-    def _store_changes(self) -> None:
-        """Store the polygon of the shown film if the user moved it."""
-        if not self.shown:
-            return
-        shapes = [np.asarray(vertices, np.float64)[:, -2:] for vertices in self.polygon.data]
-        if len(shapes) != 1 or len(shapes[0]) != 4:
-            counts = ", ".join(str(len(vertices)) for vertices in shapes)
-            corners = f" with {counts} corners" if shapes else ""
-            raise InputError(
-                f"'{self.polygon.name}' has {len(shapes)} shapes{corners}: expected one polygon "
-                "with the four corners of the film; press Show corners to reset it"
-            )
-        old_corners = self._moved.get(self._plane, self._doses.corners[self._plane])
-        if np.abs(shapes[0] - old_corners).max() > _MIN_MOVE_PX:
-            self._moved[self._plane] = shapes[0]
+def dragged_corners(viewer: Any, doses: FilmDoses) -> dict[str, FloatArray] | None:
+    """Return the corners of all films by number; None if the user moved none."""
+    corners = {k: film for k, film in enumerate(doses.corners) if np.isfinite(film).all()}
+    is_moved = False
+    for polygon in corner_layers(viewer, doses):
+        if about.role_of(polygon) == "corners":
+            plane = about.metadata_of(polygon)["plane"]
+            film = _film_in(polygon)
+            if np.abs(film - corners[plane]).max() > _MIN_MOVE_PX:
+                corners[plane], is_moved = checked_corners(film), True
+    return {str(k + 1): film for k, film in corners.items()} if is_moved else None
 
-    def _show(self, plane: int) -> None:
-        corners = self._moved.get(plane, self._doses.corners[plane])
-        if not np.isfinite(corners).all():
-            raise InputError(
-                f"{self._doses.film_label(plane)}: the layer is excluded and shows no film; choose "
-                "another film"
-            )
-        pixels = self._scan_of(plane)
-        self._plane = plane
-        name = f"scan of film {plane + 1}"
-        # The scan has the pixel size of the films, and its film lies over them.
-        frame = about.frame_of(self._films)
-        size = np.array(self._films.data.shape[-2:])
-        centre = np.asarray(frame.translate) + (size - 1) / 2 * frame.scale
-        is_new = not self.shown
-        if is_new:
-            metadata = about.metadata_for("scan", "")
-            look = {"rgb": True, "name": name, "metadata": metadata, **frame.keywords()}
-            (self.scan,) = add_layers(self._viewer, [(pixels, look, "image")])
-            self.polygon = new_shapes(self._viewer, self.scan, "corners", "direct")
-            self.polygon.metadata = about.metadata_for("corners", "")
-        self.scan.data, self.scan.name = pixels, name
-        self.polygon.name = about.layer_name("corners", name)
-        self.polygon.data = []
-        self.polygon.add_polygons([corners])
-        for layer in (self.scan, self.polygon):
-            layer.translate = centre - corners.mean(axis=0) * frame.scale
-        self.polygon.mode = "direct"
-        if is_new:
-            self._viewer.reset_view()
 
-    def set_visible(self, visible: bool) -> None:
-        """Show or hide the layers, if they are there."""
-        if self.shown:
-            self.scan.visible = self.polygon.visible = visible
-
-    def _scan_of(self, plane: int) -> AnyArray:
-        """Return the pixels of a film's scan with eight bits."""
-        path = self._doses.pack.layers[plane].file or self._doses.pack.scan
-        pixels = self._read_scan(path).pixels
-        return pixels if pixels.dtype == np.uint8 else (pixels >> 8).astype(np.uint8)
-
-    def _on_step(self, _: Any = None) -> None:
-        if self.shown and self._films in self._viewer.layers:
-            self._settle_timer.start()
-
-    @qt.notify_errors
-    def _follow(self) -> None:
-        if not self.shown or self._films not in self._viewer.layers:
-            return
-        plane = plane_in_view(self._viewer, self._films)
-        if plane != self._plane:
-            self._store_changes()
-            self._show(plane)
+def _film_in(polygon: Any) -> FloatArray:
+    """Return the only four corners in a layer of shapes, or raise an `InputError`."""
+    shapes = [np.asarray(vertices, np.float64)[:, -2:] for vertices in polygon.data]
+    if len(shapes) != 1 or len(shapes[0]) != 4:
+        counts = ", ".join(str(len(vertices)) for vertices in shapes)
+        corners = f" with {counts} corners" if shapes else ""
+        raise InputError(
+            f"'{polygon.name}' has {len(shapes)} shapes{corners}: expected one polygon with the "
+            "four corners of the film; delete the layer, and press Show corners"
+        )
+    return shapes[0]
 
 
 _REDRAW_MS = 60  # while a region is drawn
@@ -183,7 +143,7 @@ def draw_spectrum(axes: Any, spectrum: Spectrum, where: str, ink: str) -> None:
     if positive.size:
         axes.set_ylim(positive.min() / 3, 3 * positive.max())
     axes.set_xlabel(f"energy (MeV), mean {where}")
-    axes.set_ylabel(f"fluence ({packs.PER_AREA})")
+    axes.set_ylabel(f"fluence ({PER_AREA})")
 
 
 class _PackFile(CheckedModel):
@@ -194,6 +154,79 @@ class _PackFile(CheckedModel):
         "<code>shadowinv film</code>.",
         examples=["pack.toml"],
     )
+
+
+def film_layers(doses: FilmDoses, frame: about.Frame, name: str) -> LayerData:
+    """Describe an image of each film's fluence, with the metadata that an inversion needs.
+
+    Films without usable pixels are omitted; in others, unusable pixels are zero. Only the first
+    image is visible.
+    """
+    layers: LayerData = []
+    for k, used in enumerate(doses.usable):
+        if not used.any():
+            continue
+        image = np.where(used, doses.fluence[k], 0.0)
+        layer = shot_layer(
+            image,
+            f"film {k + 1}, {doses.energies[k]:.3g} MeV",
+            doses.setups[k] if doses.setups else None,
+            film_limits(image, used),
+            frame=frame,
+            setup_origin=f"{about.CAME_WITH} {name}" if doses.setups else None,
+            usable=used,
+            part=str(k + 1),
+            energies=[float(doses.energies[k])],
+        )
+        layer[1]["visible"] = not layers
+        layers.append(layer)
+    return layers
+
+
+def painted_by_hand(labels: AnyArray, doses: FilmDoses) -> BoolArray:
+    """Return the pixels of a pack's labels that the user painted."""
+    return np.asarray((labels == BY_HAND) | (doses.usable & (labels > 0)))
+
+
+@dataclass(frozen=True, eq=False)
+class PackJob(Job):
+    """Arguments of `run_film`; corrections are written to a folder, which a failed run removes."""
+
+    pack: Pack  # before any correction
+    path: str  # of the pack file
+    name: str
+    folder: Path  # to create
+    corners: Mapping[str, FloatArray] | None = None  # of all films by number
+    by_hand: BoolArray | None = None  # painted pixels, which are not used, (n, H, W)
+    # Pixel side of the upright films in pixels of each film's scan, (n,); needed with corners.
+    scales: FloatArray | None = None
+    plane: int = 0  # the film in view
+
+    def run(
+        self, on_progress: OnProgress, should_stop: ShouldStop
+    ) -> tuple[FilmDoses, BoolArray | None]:
+        """Return the doses of the corrected pack, and the painted pixels on its grid."""
+        try:
+            pack, by_hand = corrected_pack(
+                self.pack, self.folder, self.corners, self.by_hand, self.scales
+            )
+            return run_film(pack, on_progress=on_progress, should_stop=should_stop), by_hand
+        except BaseException:
+            shutil.rmtree(self.folder, ignore_errors=True)
+            raise
+
+    def layers(self, content: tuple[FilmDoses, BoolArray | None]) -> LayerData:
+        doses, by_hand = content
+        return pack_layers(
+            about.Result(doses),
+            about.frame_for(doses.dose.shape, doses.setup, pixel_size=doses.pixel_size),
+            self.name,
+            by_hand=by_hand,
+            plane=self.plane,
+            path=self.path,
+            pack=self.pack,
+            corners=self.corners,
+        )
 
 
 class FilmPack(panels.ToolPanel):
@@ -220,7 +253,7 @@ class FilmPack(panels.ToolPanel):
         self.packs = LayerPicker(
             self.viewer,
             "Fluence of a pack, from a run or from a .shadowinv file.",
-            suits=lambda layer: about.role_of(layer) == packs.FLUENCE,
+            suits=lambda layer: about.role_of(layer) == FLUENCE,
             label="Result",
         )
         self.regions = LayerPicker(
@@ -254,11 +287,6 @@ class FilmPack(panels.ToolPanel):
             "several images.",
             self._add_fit_images,
         )
-        self.write = qt.push_button(
-            "Write layers…",
-            "Save each film as an image, with a table of all films.",
-            self._write_layers,
-        )
         self.save = qt.push_button("Save…", "Save the result as a .shadowinv file.", self._save)
         self.actions = QtWidgets.QWidget()
         column = qt.column(
@@ -268,11 +296,10 @@ class FilmPack(panels.ToolPanel):
             self.regions,
             self.plot,
             qt.side_by_side((self.show_corners, 1), (self.paint, 1)),
-            qt.side_by_side((self.to_fit, 1), (self.write, 1), (self.save, 1)),
+            qt.side_by_side((self.to_fit, 1), (self.save, 1)),
         )
         column.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.add(self.file, self.keep_earlier, self.panel, self.actions)
-        self.corners = CornerEditor(self.viewer, self)
 
     def request(self) -> PackJob:
         """Return the pack of the file, or else of the result, with its corners and painted pixels.
@@ -299,31 +326,24 @@ class FilmPack(panels.ToolPanel):
 
     def _corrections(self, layer: Any, doses: FilmDoses) -> tuple[Any, ...]:
         """Return the last arguments of a job: corners, painted pixels, and the film in view."""
-        labels = self._partner(layer, packs.UNUSABLE)
-        by_hand = None if labels is None else packs.painted_by_hand(labels.data, doses)
-        corners = self.corners.corners(doses) or about.metadata_of(layer).get("corners")
+        labels = self._partner(layer, UNUSABLE)
+        by_hand = None if labels is None else painted_by_hand(labels.data, doses)
+        corners = dragged_corners(self.viewer, doses) or about.metadata_of(layer).get("corners")
         return corners, by_hand, doses.scales, plane_in_view(self.viewer, layer)
 
     def forget(self) -> None:
         self.panel.say("")
 
     def show_result(self, finished: Finished, job: PackJob) -> None:
-        self.corners.close()
+        for layer in corner_layers(self.viewer):
+            self.viewer.layers.remove(layer)
         self.results = self._last.layers_for_next(job.path or job.name)
-        if not (self.results.layers or self.keep_earlier.isChecked()):
-            self.results.adopt(self._opened(job.name))
         self.results.complete.connect(self._follow_result)
         self.results.show(finished.layer_data, fit=not self.viewer.layers)
 
-    def _opened(self, name: str) -> list[Any]:
-        """Return the layers of a pack's result that was opened from a file."""
-        roles = {kind.role for kind in packs.KINDS}
-        of_packs = [layer for layer in self.viewer.layers if about.role_of(layer) in roles]
-        return [layer for layer in of_packs if name_of_result(layer) == name]
-
     def _follow_result(self) -> None:
         for layer in self.results.layers:
-            if about.role_of(layer) == packs.FLUENCE:
+            if about.role_of(layer) == FLUENCE:
                 self.packs.layer = layer
         self._on_pack()
 
@@ -363,7 +383,7 @@ class FilmPack(panels.ToolPanel):
             return
         _, doses = self._selected()
         try:
-            region = mask_of(self.regions.layer, layer, painted_is_unusable=False)
+            region = painted_on(self.regions.layer, layer)
         except InputError as error:
             self.show_problem(str(error))
             return
@@ -379,21 +399,22 @@ class FilmPack(panels.ToolPanel):
     @qt.notify_errors
     def _show_corners(self) -> None:
         layer, doses = self._selected()
-        self.corners.show(layer, doses)
-        self.panel.say("Drag the corners. Move the slider to show other films. Then press Run.")
+        show_corners(self.viewer, layer, doses)
+        self.panel.say("Drag the corners, also those of other films. Then press Run.")
 
     @qt.notify_errors
     def _paint(self) -> None:
         layer, _ = self._selected()
-        labels = self._partner(layer, packs.UNUSABLE)
+        labels = self._partner(layer, UNUSABLE)
         if labels is None:
             raise InputError(
                 f"the unusable pixels of '{layer.name}' were deleted: press Run, or open the file "
                 "again"
             )
-        self.corners.set_visible(False)  # the scan would cover the labels
+        for each in corner_layers(self.viewer):
+            each.visible = False  # the scan would cover the labels
         labels.visible = True
-        labels.selected_label = packs.BY_HAND
+        labels.selected_label = BY_HAND
         labels.brush_size = _BRUSH_PX
         self.viewer.layers.selection.active = labels
         labels.mode = "paint"
@@ -402,22 +423,13 @@ class FilmPack(panels.ToolPanel):
     @qt.notify_errors
     def _add_fit_images(self) -> None:
         layer, doses = self._selected()
-        for kind in packs.KINDS:
+        for kind in PACK_KINDS:
             partner = self._partner(layer, kind.role)
             if partner is not None:
                 partner.visible = False
-        layer_data = packs.film_layers(doses, about.frame_of(layer), layer.name)
+        layer_data = film_layers(doses, about.frame_of(layer), layer.name)
         self.fit_images = ResultLayers(self.viewer, self)
         self.fit_images.show(layer_data, select=False)
-
-    @qt.notify_errors
-    def _write_layers(self) -> None:
-        _, doses = self._selected()
-        folder = QtWidgets.QFileDialog.getExistingDirectory(
-            self, "Folder for the images of the films"
-        )
-        if folder:
-            show_info(f"Wrote {write_layers(doses, Path(folder))[-1]}")
 
     @qt.notify_errors
     def _save(self) -> None:
@@ -426,6 +438,5 @@ class FilmPack(panels.ToolPanel):
             result: Any = about.result_of(layer)
             doses = copy_corrections(doses, self._scratch, path)
             saved = about.Result(doses, result.origins)
-            layers = about.layers_of(self.viewer, layer)
-            dataset = dataset_of_layers([each.as_layer_data_tuple() for each in layers], saved)
-            show_info(f"Wrote {write(path, dataset, overwrite=True)}")
+            written = write(path, dataset_to_save(saved, layer), overwrite=True)
+            show_info(f"Wrote {written}")

@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, FitJob, name_of_result
@@ -23,12 +21,11 @@ from napari_shadowinv._napari.widgets._image_table import (
     entries_of,
     store_entries,
 )
-from napari_shadowinv._napari.widgets._panels import ResultView
+from napari_shadowinv._napari.widgets._panels import ResultView, result_frame
 from napari_shadowinv._napari.widgets._qt import side_by_side
-from napari_shadowinv._napari.widgets._results import result_frame
 from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.fitting import Fit, point_spread
+from napari_shadowinv.fitting import Fit
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.setup import SETUPS, Setup
@@ -172,11 +169,10 @@ class FitImages(inputs.ImagePanel):
         """Refuse choices that do not match a setup, or else the shown setup."""
         fields = choices.fields
         available = inputs.fields_of(self.setup.kind if setup is None else setup.kind)
-        in_metres = choices.source_size is not None or choices.resolution is not None
-        if in_metres and setup is None and self.setup.complete_setup() is None:
+        if choices.source_size is not None or choices.resolution is not None:
             raise InputError(
-                f"{path} gives source size or resolution in m, which require a setup: select the "
-                "setup first, or give the point spread in px"
+                f"{path} gives source size or resolution in m: give psf instead, the point spread "
+                "in px"
             )
         if fields is not None and inputs.field_key(fields) not in available:
             raise InputError(
@@ -190,25 +186,21 @@ class FitImages(inputs.ImagePanel):
             self.fields.set_kind(inputs.field_key(choices.fields))
         self.choices.restore(choices.model_dump(exclude=_ELSEWHERE))
         self.options.restore(choices.options.model_dump())
-        for image in self.images.used:
-            width = self._spread(choices, image)
-            if width is not None:
-                store_entries(image, psf=width)
+        if choices.psf is not None:
+            for image in self.images.used:
+                store_entries(image, psf=choices.psf)
         self._show_beams()
-
-    def _spread(self, choices: FitChoices, image: Any) -> float | None:
-        """Return the point spread of an image in px after the steps, by a recipe."""
-        setup = self.setup.complete_setup()
-        if setup is None or (choices.source_size is None and choices.resolution is None):
-            return choices.psf
-        shot = Shot(np.zeros(image.data.shape), setup=self._base_setup(image, setup))
-        processed: Any = Recipe(steps=self.steps.steps()).move(shot).setup
-        return point_spread(processed, choices.source_size or 0.0, choices.resolution or 0.0)
 
     def request(self) -> FitJob:
         images = self._images()
         first = images[0]
         recipe = self.recipe()
+        if recipe.setup is None:
+            raise InputError(
+                "there is no setup: select the kind of beam, and enter the lengths; a fit without "
+                "lengths, by displacements relative to the first image, is for Python and the "
+                "command, as 'strength'"
+            )
         shots = self._shots(images, recipe.setup)
         steps = "; ".join(step.summary for step in recipe.steps)
         described = self.describe(first, recipe, (*images, self.masks.layer), steps=steps)
@@ -216,7 +208,7 @@ class FitImages(inputs.ImagePanel):
         name = f"{name_of_result(first).removesuffix(' fit')} fit"
         return FitJob(shots=shots, name=name, frame=result_frame(first, recipe), **described)
 
-    def _shots(self, images: Sequence[Any], setup: Setup | None) -> tuple[Shot, ...]:
+    def _shots(self, images: Sequence[Any], setup: Setup) -> tuple[Shot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
         rows = [self.images.values(image) for image in images]
         # One that is 1 for all need not be said.
@@ -225,8 +217,7 @@ class FitImages(inputs.ImagePanel):
             replace(
                 self.shot_of(image),
                 name=image.name,
-                setup=None if setup is None else self._setup_of(image, setup),
-                strength=(self.images.beam_value(image),) if setup is None else None,
+                setup=self._setup_of(image, setup),
                 brightness=row["brightness"] if is_known else None,
                 psf=row["psf"],
                 measured=self.source.layer is None or not about.is_estimate(self.source.layer),
@@ -243,7 +234,7 @@ class FitImages(inputs.ImagePanel):
             images, recipe = self._images(), self.recipe()
             shape = recipe.shape_after(images[0].data.shape)
             assert recipe.fit is not None
-            cost = fit_cost(shape, len(images), recipe.fit, recipe.instrument, FitJob.pace)
+            cost = fit_cost(shape, len(images), recipe.fit, recipe.instrument)
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
             return

@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from qtpy.QtWidgets import QCheckBox, QWidget
 
 from napari_shadowinv._napari import form as forms
@@ -24,14 +23,22 @@ from napari_shadowinv._napari.widgets._inputs import (
     ImagePanel,
     SetupPicker,
 )
-from napari_shadowinv._napari.widgets._panels import ResultView
-from napari_shadowinv._napari.widgets._results import ResultLayers, place_inputs, result_frame
-from napari_shadowinv._napari.widgets._shot_inputs import FOLDER, ShotPicker, StoreSection
-from napari_shadowinv._napari.widgets._stack_jobs import StackJob, StackView, placement_on
+from napari_shadowinv._napari.widgets._panels import (
+    ResultLayers,
+    ResultView,
+    place_inputs,
+    result_frame,
+)
+from napari_shadowinv._napari.widgets._stacks import (
+    FOLDER,
+    ShotPicker,
+    StackJob,
+    StackView,
+    StoreSection,
+    placement_on,
+)
 from napari_shadowinv._system.progress import Progress
-from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import percent
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.options import FitChoices, InversionOptions
@@ -39,10 +46,8 @@ from napari_shadowinv.pipeline import Cache
 from napari_shadowinv.pipeline.costs import inversion_cost
 from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 from napari_shadowinv.preprocessing import Crop, Estimate, Recipe, Step
-from napari_shadowinv.preprocessing.estimates import LowPassEstimate, TotalVariationEstimate
 from napari_shadowinv.shot import Shot
 
-_NOTABLE_PATTERN = 0.25
 _REFINE_TIP = (
     "Fit the forward model to the image, starting from its last inversion. The fit includes blur, "
     "gives error bars, and works beyond the first caustic. The verdict says whether the image "
@@ -306,7 +311,6 @@ class Invert(ImagePanel):
 
     def _show_estimate(self, finished: jobs.Finished, job: jobs.SourceJob) -> None:
         self._last.layers_for_next((job.image, about.SOURCE)).show(finished.layer_data)
-        self.panel.say(_pattern_warning(finished.content, job), problem=True)
 
     def on_change(self) -> None:
         """Update the preview, the estimated cost, and what is said of the result."""
@@ -342,7 +346,7 @@ class Invert(ImagePanel):
             recipe = Recipe(steps=self.all_steps())
             shape = recipe.shape_after(layers.image_of(self.image.layer).shape)
             options: Any = self.options.model()
-            cost = inversion_cost(shape, options, jobs.InversionJob.pace)
+            cost = inversion_cost(shape, options)
             self.cost.show_text(cost.text, forms.PROBLEM_STYLE if cost.exceeds_memory else "")
         except InputError:
             self.cost.setVisible(False)  # Run reports the problem
@@ -373,22 +377,3 @@ class Invert(ImagePanel):
     def _draw_crop(self) -> None:
         layers.image_of(self.image.layer)
         self.crop.layer = layers.new_shapes(self.viewer, self.image.layer, "crop", "add_rectangle")
-
-
-def _pattern_warning(source: FloatArray, job: jobs.SourceJob) -> str:
-    """Say how much of an image's pattern an estimate keeps that smooths the whole image."""
-    smooths = isinstance(job.estimate, LowPassEstimate | TotalVariationEstimate)
-    if not smooths or job.shot.source_mask is not None:
-        return ""
-    estimate, pattern = (
-        layers.block_pattern(np.asarray(each)) for each in (source, job.shot.image)
-    )
-    if estimate is None or pattern is None or not pattern.any():
-        return ""
-    share = float(np.vdot(estimate, pattern) / np.vdot(pattern, pattern))
-    if share < _NOTABLE_PATTERN:
-        return ""
-    return (
-        f"The estimate contains {percent(share)} of the pattern in the image: what of it is the "
-        "object's is missing in the field. Choose a smoother estimate, or mask the object."
-    )
