@@ -31,12 +31,11 @@ from qtpy.QtGui import QImage
 from qtpy.QtWidgets import QApplication
 
 import napari
-from napari_shadowinv import ProtonSetup, run_stack, synthetic_image
+from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import metadata_for
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.physics.phantoms import toroid
 from napari_shadowinv.physics.projection import predict_image
-from napari_shadowinv.preprocessing import Recipe
 
 HERE = Path(__file__).parent / "pictures"
 PLUGIN = "napari-shadowinv"
@@ -315,33 +314,6 @@ def night_window() -> None:
         photograph(viewer, "tutorial-night.png")
 
 
-def series_window() -> None:
-    """Eight shots of a growing toroid: the circle, its numbers over time and their growth."""
-    viewer = new_window("growing field", height=900)
-    setup, rng = ProtonSetup.example(), np.random.default_rng(0)
-    phantoms = [toroid((96, 96), setup, 15 * np.exp(0.2 * time), 14e-6) for time in range(8)]
-    shots = [rng.poisson(400 * synthetic_image(each.displacement)) for each in phantoms]
-    with tempfile.TemporaryDirectory() as scratch, chdir(scratch):
-        run_stack(np.stack(shots).astype(float), "night.shadowinv.zarr", Recipe(setup=setup))
-        viewer.open("night.shadowinv.zarr", plugin=PLUGIN)
-        widget = open_widget(viewer, "Analyse")
-        form = widget.products
-        widget.tabs.setCurrentWidget(form)
-        form.product.set_kind("region")
-        form._draw()
-        form.shapes.layer.add_ellipses(np.array([[47.5, 47.5], [26.0, 26.0]]))
-        form.shapes.layer.mode = "pan_zoom"
-        form.shots.restore({"times": "1 ns"})
-        form.panel.button.click()
-        while form.panel.running:
-            settle(0.2)
-        viewer.dims.set_current_step(0, 3)
-        field = form.result.layer
-        field.contrast_limits = (0.0, float(field.data[3].max()))
-        viewer.layers.selection.active = field
-        photograph(viewer, "napari-series.png")
-
-
 def fit_window() -> None:
     """Two films of one toroid: the widget, its verdict and the field."""
     viewer = new_window("two energies", height=860)
@@ -507,7 +479,6 @@ WINDOWS = {
     "proton": proton_windows,
     "source": source_windows,
     "night": night_window,
-    "series": series_window,
     "fit": fit_window,
     "film": film_window,
     "two-energies": two_energies_window,

@@ -57,16 +57,11 @@ def test_pradformat_opens_with_its_pixels_and_setup(viewer, shot, tmp_path):
     assert metadata_of(layer)["file"]["geometry"]["detector_pixel_size"] == 163.8e-6
 
 
-@pytest.mark.parametrize("suffix", [".mat", ".txt", ".dat", ".b16"])
+@pytest.mark.parametrize("suffix", [".mat", ".txt"])
 def test_formats_that_napari_does_not_know_need_no_choice(viewer, tmp_path, suffix):
     path, counts = tmp_path / f"shot{suffix}", np.arange(60).reshape(6, 10)
     if suffix == ".mat":
         savemat(path, {"image": counts.astype(np.float64)})
-    elif suffix == ".b16":
-        header = np.zeros(12, "<u4")
-        header[:4] = np.frombuffer(b"PCO-", "<u4")[0], 48 + counts.size * 2, 48, 10
-        header[4] = 6
-        path.write_bytes(header.tobytes() + counts.astype("<u2").tobytes())
     else:
         np.savetxt(path, counts)
     (layer,) = viewer.open(path, plugin=None)  # raises where several plugins could
@@ -133,15 +128,6 @@ def test_only_the_first_shot_is_read(viewer, run, monkeypatch):
     assert names == ["shot1.tif", "shot2.tif", "shot10.tif"]
 
 
-def test_pages_of_a_tiff_are_a_lazy_stack(viewer, tmp_path):
-    planes = np.random.default_rng(0).uniform(1, 9, (3, 12, 17)).astype(np.float32)
-    tifffile.imwrite(tmp_path / "film.tif", planes, photometric="minisblack")
-    (layer,) = add_layers(viewer, read_paths(str(tmp_path / "film.tif")))
-    assert (layer.name, role_of(layer)) == ("film", "shot")
-    assert layer.data.chunksize == (1, 12, 17)
-    np.testing.assert_array_equal(layer.data, planes)
-
-
 def test_a_stray_file_is_dark_and_gives_a_warning(run):
     (run / "shot0.tif").write_bytes(b"nonsense")  # the first does not end the show
     tifffile.imwrite(run / "shot3.tif", np.ones((5, 5), np.float32))
@@ -182,8 +168,6 @@ def test_a_result_of_the_command_line_opens_whole(viewer, solved, proton_setup, 
 
 BAD = {
     "cut.shadowinv": (b"\x89HDF\r\n\x1a\n" + b"\0" * 40, "damaged, incomplete"),
-    "empty.mat": (b"", "is empty"),
-    "cut.spe": (b"\x01" * 4200, "SPE"),
     "words.txt": (b"# x\n1 2\n3 four\n", "words.txt"),
 }
 
@@ -356,20 +340,6 @@ def test_arrows_of_a_store_follow_in_a_window(make_napari_viewer, store, solved,
     np.testing.assert_allclose(layers["arrows"].data[:, :, 1:], rays(solved, 0.5))
 
 
-def test_shots_that_are_marked_as_pending_are_not_looked_at(store, solved):
-    import xarray as xr
-
-    with xr.open_zarr(store, consolidated=False) as run:
-        marks = xr.Dataset({"status": ("shot", np.array([0, 0, 1], np.int8))}, attrs=run.attrs)
-    marks.to_zarr(store, mode="a", consolidated=False)
-    keywords = keywords_of(store)
-    strongest = np.hypot(*solved.displacement).max()
-    setup = setup_of(keywords["field"])
-    assert isinstance(setup, ProtonSetup)
-    factor = np.hypot(*setup.path_integrated_b([1.0, 0.0])) * 1e6  # half is below 1 mT·m
-    assert keywords["field"]["contrast_limits"][1] == pytest.approx(0.5 * factor * strongest)
-
-
 def test_a_damaged_store_is_one_sentence(store):
     shutil.rmtree(store / "displacement")
     (store / "zarr.json").unlink()
@@ -419,15 +389,6 @@ def test_images_of_an_hdf5_file_are_layers(viewer, tmp_path):
         (layer,) = viewer.open(f"{place}::/{inside}", plugin=PLUGIN)
         assert layer.name == inside
         np.testing.assert_array_equal(layer.data, expected)
-
-
-def test_images_of_a_matlab_file_are_layers(viewer, tmp_path):
-    beam, shots = np.arange(20.0).reshape(4, 5), np.arange(60.0).reshape(4, 5, 3)
-    savemat(tmp_path / "run.mat", {"beam": beam, "shots": shots, "time": 3.0})
-    layers = {layer.name: layer.data for layer in viewer.open(tmp_path / "run.mat", plugin=PLUGIN)}
-    np.testing.assert_array_equal(layers["beam"], beam)
-    np.testing.assert_array_equal(layers["shots"], np.moveaxis(shots, -1, 0))
-    assert len(layers) == 2
 
 
 def test_images_that_are_not_opened_are_counted(tmp_path):

@@ -1,4 +1,4 @@
-"""What this plugin knows of a layer: its metadata, a plain dict under `KEY`, and its place.
+"""Metadata of this plugin's layers, a plain dict under `KEY`, and their place.
 
 - the place of a plane, and of derived ones: `Frame`; layers on the pixels of an image:
   `matrix_between`, `mapped`, `pixel_mapper`, `labels_on`, `source_on` (which never resamples)
@@ -192,7 +192,6 @@ KINDS = (
         shown_of="shot",
     ),
     Kind("significance", "significance", "|d|/σ", "1", "significance", shown_of="shot"),
-    Kind("structures", "structures", "structures above 2 σ", "1", type="labels", shown_of="shot"),
     Kind("caustic", "caustic", "caustics", type="labels", main=True),
     Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
     Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),

@@ -23,7 +23,7 @@ from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import of_each_setup
 from napari_shadowinv.physics.setup import deflector_titles
-from napari_shadowinv.physics.significance import Structures, significance
+from napari_shadowinv.physics.significance import significance
 from napari_shadowinv.physics.units import (
     ShownField,
     intensity_limits,
@@ -44,9 +44,7 @@ FullLayerData = tuple[Any, dict[str, Any], str]
 LayerData = list[FullLayerData]
 Limits = tuple[float, float]
 
-# Both stand out from all colours of the field's map.
 _CAUSTIC_COLOUR = "#5dff5d"
-_STRUCTURE_COLOUR = "#ff3d7f"
 _ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
 
 _FIELD_VARIABLES = ("displacement", "potential")
@@ -161,21 +159,20 @@ def field_layers(result: Result[RetrievedField], frame: Frame, name: str = "") -
     """Describe the layers of a field without images."""
     content, dataset = result.content, result.content.dataset
     field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]].assign(
-        significance_variables(content.displacement, content.displacement_std, content.structures)
+        significance_variables(content.displacement, content.displacement_std)
     )
     return dataset_layers(View(field, content.setup), frame, name, {"result": result, "name": name})
 
 
 def significance_variables(
-    displacement: FloatArray, std: FloatArray | None, structures: Structures | None
+    displacement: FloatArray, std: FloatArray | None
 ) -> dict[str, tuple[tuple[str, ...], AnyArray]]:
-    """Return the map |d|/σ and the structures in it as variables; none without errors."""
-    if std is None or structures is None:
+    """Return σ and the map |d|/σ as variables; none without errors."""
+    if std is None:
         return {}
     return {
         "displacement_uncertainty": (("component", "y", "x"), std),
         "significance": (("y", "x"), significance(displacement, std)),
-        "structures": (("y", "x"), structures.labels),
     }
 
 
@@ -187,7 +184,7 @@ def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> La
     std = per_pixel_of(content.errors)
     dataset = xr.Dataset(
         {name: (dims, content.variable(name)) for name, (dims, _, _) in VARIABLES.items()}
-    ).assign(significance_variables(content.displacement, std, content.structures))
+    ).assign(significance_variables(content.displacement, std))
     facts = {"result": result, "name": name, "level": content.headline.level}
     layer_data = dataset_layers(View(dataset, content.setup), frame, name, facts)
     for _, keywords, _ in layer_data:
@@ -224,8 +221,7 @@ def _fitted_fields(fit: Fit, frame: Frame, name: str, facts: dict[str, Any]) -> 
         }
         if fit.mask.shape[1:] == field.potential.shape:
             variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
-        std, structures = per_pixel_of(field.errors), fit.structures(field)
-        variables |= significance_variables(field.displacement, std, structures)
+        variables |= significance_variables(field.displacement, per_pixel_of(field.errors))
         more = facts | {"displacement": field.displacement} | ({"part": field.name} if m else {})
         title = name if len(fit.fields) == 1 else f"{name} {field.name}"
         view = View(xr.Dataset(variables), fit.setup, deflector=deflector_titles()[field.name])
@@ -483,18 +479,8 @@ def _field(view: View, role: str) -> tuple[Any, Limits, dict[str, str]]:
 
 
 def _labels(view: View, kind: Kind) -> Content:
-    if kind.role == "structures":
-        look = {"colormap": label_colours(_STRUCTURE_COLOUR), "opacity": 1.0}
-        return outline(view.dataset["structures"].data), {}, look
     look = {"colormap": label_colours(_CAUSTIC_COLOUR), "opacity": 0.5}
     return view.dataset["caustic"].data.astype(np.uint8), {}, look
-
-
-def outline(labels: AnyArray) -> AnyArray:
-    """Return the pixels of labelled regions with a neighbour outside; the map stays visible."""
-    from scipy.ndimage import binary_erosion
-
-    return np.where(binary_erosion(labels > 0, border_value=1), 0, labels)
 
 
 def label_colours(*colours: str) -> Any:

@@ -97,8 +97,6 @@ def missing_layers(viewer: Any, layer: Any) -> LayerData:
 
     `layer` belongs to it.
     """
-    from napari_shadowinv._napari.result_files import store_layers
-
     facts, frame = about.metadata_of(layer), frame_of(layer)
     result, store = facts.get("result"), facts.get("store")
     if result is not None:

@@ -1,18 +1,16 @@
 """The window that simulates an object before its shot: `Simulate`.
 
-- the object: a phantom, a 3-D field in a file (`GridFile`), or the field of a layer
+- the object: a phantom, or the field of a layer
 - its image: `ForwardJob`; a plan of shots of it: `PlanJob`
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv._napari import form as forms
@@ -28,14 +26,11 @@ from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of
 from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors, push_button
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
-from napari_shadowinv._system.validation import CheckedModel, validate
+from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.field_grids import read_field_grid
 from napari_shadowinv.options import Instrument
-from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
 from napari_shadowinv.physics.setup import Setup, deflector_titles
-from napari_shadowinv.physics.trace_options import GridView
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.experiment import plan_experiment
 from napari_shadowinv.pipeline.experiment_object import (
@@ -51,35 +46,14 @@ from napari_shadowinv.pipeline.prediction import Prediction, predict
 from napari_shadowinv.plotting import draw_errors
 
 _IMAGE, _PLAN = "image", "plan"  # tasks
-_GRID, _LAYER = "grid", "layer"  # objects that are no phantoms
+_LAYER = "layer"  # an object that is no phantom
 _SHAPE = 200, 200
 _SIZE = " x ".join(map(str, _SHAPE))
 _PLOT_HEIGHT_PX = 260
 _FIELDS = ("field", "field y", "field x", "potential")  # roles
 
 
-class _File(CheckedModel):
-    file: Path = Field(
-        title="File",
-        description="openPMD file (HDF5), or NetCDF 4 file with Bx, By, Bz or Ex, Ey, Ez; "
-        "particles are traced through it.",
-    )
-
-
-class GridFile(GridView, _File):
-    """A 3-D field in a file, and the direction from which it is seen."""
-
-    def field(self) -> FieldGrid:
-        """Read the field, in the frame of the beam."""
-        return self.apply(read_field_grid(self.file))
-
-    @property
-    def title(self) -> str:
-        """Name of the file without its ending."""
-        return self.file.stem
-
-
-SimulatedObject = PhantomRecipe | GridFile | PlannedObject
+SimulatedObject = PhantomRecipe | PlannedObject
 
 
 def is_field(layer: Any) -> bool:
@@ -92,7 +66,7 @@ class ForwardJob(Job):
     """A prediction of the image of an object."""
 
     object: SimulatedObject
-    shape: tuple[int, int] = _SHAPE  # of the image of a phantom, or of a field in a file
+    shape: tuple[int, int] = _SHAPE  # of the image of a phantom
     setup: Setup | None = None
     deflector: str | None = None
     source: ArrayLike | None = None  # None for a uniform beam
@@ -105,7 +79,7 @@ class ForwardJob(Job):
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Prediction:
         Reporter(on_progress, should_stop)("field", 0, None)
         return predict(
-            self.object.field() if isinstance(self.object, GridFile) else self.object,
+            self.object,
             self.setup,
             self.shape,
             source=None if self.source is None else plane_of(self.source, "the source"),
@@ -142,9 +116,7 @@ class PlanJob(Job):
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> ExperimentPlan:
         choices = {"shape": self.shape, "instrument": self.instrument, "options": self.options}
         keywords: Any = {**choices, "on_progress": on_progress, "should_stop": should_stop}
-        Reporter(on_progress, should_stop)("field", 0, None)
-        target = self.object.field() if isinstance(self.object, GridFile) else self.object
-        return plan_experiment(target, self.setups or None, **keywords)
+        return plan_experiment(self.object, self.setups or None, **keywords)
 
     def layers(self, plan: ExperimentPlan) -> LayerData:
         """Describe the image of the first draw."""
@@ -181,7 +153,6 @@ class Simulate(panels.ToolPanel):
             "Object",
             {
                 **forms.kinds_of(PHANTOMS),
-                _GRID: ("a 3-D field from a file", GridFile),
                 _LAYER: ("a result", forms.labelled("Layer", self.field)),
             },
             "Object that deflects the beam.",
@@ -263,7 +234,7 @@ class Simulate(panels.ToolPanel):
         )
 
     def _object(self) -> SimulatedObject:
-        """Return the phantom, the file or the layer's field, or raise an `InputError`."""
+        """Return the phantom or the layer's field, or raise an `InputError`."""
         if self.object.kind != _LAYER:
             chosen: Any = self.object.model()
             return chosen
@@ -344,8 +315,6 @@ class Simulate(panels.ToolPanel):
         self._follow_layer()
         phantom = PHANTOMS.get(self.object.kind)
         probe = "" if phantom is None else phantom.probe
-        if self.object.kind == _GRID:
-            probe = "proton"
         if self._ready and probe:
             self.setup.choose_kind(probe)
 

@@ -1,4 +1,4 @@
-"""*Analyse*: products of a result or of a store of shots, and layers along a line."""
+"""*Analyse*: products of a result, and layers along a line."""
 
 import csv
 
@@ -8,27 +8,20 @@ from qtpy.QtWidgets import QFileDialog
 
 from helpers.forms import enter
 from helpers.reports import texts_of
-from napari_shadowinv import ProtonSetup, run_stack
+from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import metadata_for
 from napari_shadowinv._napari.layers import add_to_viewer
-from napari_shadowinv._napari.widgets._products import shape_fields
-from napari_shadowinv._napari.widgets.analyse import Analyse
+from napari_shadowinv._napari.widgets.analyse import Analyse, shape_fields
 from napari_shadowinv.analysis import (
     PRODUCTS,
     EnclosedCurrent,
-    Region,
     analyse,
-    analyse_shots,
-    products_in,
 )
-from napari_shadowinv.inversion import Inversion, invert
-from napari_shadowinv.io import read_dataset, read_stack
+from napari_shadowinv.inversion import invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import toroid
-from napari_shadowinv.preprocessing import Recipe
 
 SETUP = ProtonSetup.example()
-RATE, SHOTS = 0.2, 4  # 1/ns, number
 
 
 def image_of(side, peak, radius):
@@ -41,29 +34,11 @@ def inversion():
     return invert(image, source=np.full(image.shape, 400.0))
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory):
-    """A toroid that grows by `RATE`, a shot each ns."""
-    out = tmp_path_factory.mktemp("series") / "night.shadowinv.zarr"
-    images = [300 * image_of(32, 20 * np.exp(RATE * time), 6e-6) for time in range(SHOTS)]
-    run_stack(np.stack(images), out, Recipe(setup=SETUP))
-    return out
-
-
 @pytest.fixture
 def form(viewer, opened, inversion):
     add_to_viewer(viewer, inversion, SETUP, name="ring")
     form = opened(Analyse).products
     enter(form.bands.entries["samples"], 20)
-    return form
-
-
-@pytest.fixture
-def series(viewer, opened, store):
-    """The form with the store, a region and a circle."""
-    viewer.open(str(store), plugin="napari-shadowinv")
-    form = opened(Analyse).products
-    draw(form, "region", "ellipse", [[15.5, 15.5], [10.0, 10.0]])
     return form
 
 
@@ -92,14 +67,6 @@ def measure(run):
         return form.measured[-1]
 
     return measured
-
-
-def answer_with(monkeypatch, *names):
-    """Answer the dialogs for a file, one after the other."""
-    answers = iter(names)
-    monkeypatch.setattr(
-        QFileDialog, "getSaveFileName", lambda *_, **__: tuple(map(str, next(answers)))
-    )
 
 
 def test_round_ellipse_becomes_a_circle_and_others_a_polygon():
@@ -164,106 +131,19 @@ def test_map_becomes_a_layer_on_its_result(form, viewer, measure):
     assert form.plot.isHidden()
 
 
-def test_products_are_exported_and_saved_with_the_result(
-    form, measure, tmp_path, monkeypatch, inversion
-):
+def test_products_are_exported(form, measure, tmp_path, monkeypatch):
     select(form, "contrast")
-    for _ in range(2):
-        measure(form)
-    names = ["contrast", "contrast_2"]
-    assert [each.name for each in form.measured] == names
-    answer_with(monkeypatch, (tmp_path / "products.csv", ""), (tmp_path / "both.shadowinv", ""))
+    assert not form.export.isEnabled()
+    measure(form)
+    answers = iter([(tmp_path / "products.csv", ""), (tmp_path / "both", "PDF (*.pdf)")])
+    monkeypatch.setattr(
+        QFileDialog, "getSaveFileName", lambda *_, **__: tuple(map(str, next(answers)))
+    )
     form.export.click()
     rows = list(csv.reader((tmp_path / "products.csv").open(encoding="utf-8")))
-    assert {row[0] for row in rows[1:]} == set(names)
-    form.save.click()
-    dataset = read_dataset(tmp_path / "both.shadowinv")
-    assert [each.name for each in products_in(dataset)] == names
-    again = Inversion.from_dataset(dataset)
-    np.testing.assert_array_equal(again.potential, inversion.potential)
-    assert again.setup == SETUP
-
-
-def test_series_of_a_store_is_that_of_python(series, measure, store, tmp_path, monkeypatch):
-    assert series.shots.isVisibleTo(series)
-    enter(series.shots.entries["times"], "1 ns")
-    measured = measure(series)
-    region, times = Region(center=(15.5, 15.5), radius=10), 1e-9 * np.arange(SHOTS)
-    (expected,) = analyse_shots(read_stack(store), region, times)
-    for name, quantity in expected.quantities.items():
-        np.testing.assert_allclose(measured[name].value, quantity.value, rtol=1e-12)
-    rows = texts_of(series.report)
-    assert {fact.title: rows[fact.title] for fact in expected.facts} == {
-        fact.title: fact.text for fact in expected.facts
-    }
-    assert float(rows["Growth of rms"].split()[0]) == pytest.approx(RATE, rel=0.05)
-    assert "95 %" in rows["Growth of rms"]
-    answer_with(monkeypatch, (tmp_path / "growth.csv", ""), (tmp_path / "growth", "PDF (*.pdf)"))
-    series.export.click()
-    table = list(csv.DictReader((tmp_path / "growth.csv").open(encoding="utf-8")))
-    places = [float(row["place"]) for row in table if row["quantity"] == "rms"]
-    np.testing.assert_allclose(places, times)
-    series.picture.click()
-    assert (tmp_path / "growth.pdf").read_bytes().startswith(b"%PDF")
-    assert not series.save.isEnabled()
-
-
-def test_numbers_and_centroid_are_drawn_over_time(series, measure):
-    enter(series.shots.entries["times"], "0, 1 ns, 2 ns, 4 ns")
-    measured = measure(series)
-    numbers, places = series.plot.figure.axes
-    assert places.get_xlabel() == "time (ns)"
-    assert places.get_ylabel() == "µm"
-    lines = {line.get_label(): line for axes in (numbers, places) for line in axes.lines}
-    assert {"peak", "rms", "centroid_y", "centroid_x"} <= lines.keys()
-    np.testing.assert_allclose(lines["rms"].get_xdata(), [0, 1, 2, 4])
-    np.testing.assert_allclose(lines["rms"].get_ydata(), measured["rms"].value)
-    middle = 1e6 * 15.5 * SETUP.object_pixel_size
-    np.testing.assert_allclose(lines["centroid_y"].get_ydata(), middle, rtol=0.02)
-
-
-def test_shots_are_chosen_and_numbered_without_times(series, measure):
-    enter(series.shots.entries["shots"], "1:4:2")
-    measured = measure(series)
-    np.testing.assert_array_equal(measured.coordinates["shot"].values, [1, 3])
-    assert "per shot" in texts_of(series.report)["Growth of rms"]
-    ticks = series.plot.figure.axes[-1].get_xticks()
-    np.testing.assert_array_equal(ticks, np.round(ticks))
-
-
-MISTAKES = [  # product, shots, times, message
-    ("region", "", "1,2", "Times is '1,2', expected the time between two shots in s, or a"),
-    ("region", "", "soon", "Times is 'soon': expected a number in s"),
-    ("region", "9", "", "Shots are '9': expected numbers from 0 to 3"),
-    ("current-density", "", "", "The current density has no single number to follow"),
-]
-
-
-def test_mistake_with_a_store_is_a_sentence(series, refused):
-    for product, shots, times, message in MISTAKES:
-        series.product.set_kind(product)
-        enter(series.shots.entries["shots"], shots)
-        enter(series.shots.entries["times"], times)
-        refused(series, message)
-    assert series.measured == []
-
-
-def test_cancelled_series_leaves_no_result(series, cancelled, held):
-    cancelled(series)
-    assert series.measured == []
-
-
-def test_single_result_has_no_times(series, viewer, measure, inversion):
-    enter(series.shots.entries["times"], "1 ns")
-    measure(series)
-    added = add_to_viewer(viewer, inversion, SETUP, name="single")
-    series.result.layer = next(layer for layer in added if layer in series.result.offered)
-    assert not series.shots.isVisibleTo(series)
-    enter(series.bands.entries["samples"], 20)
-    measure(series)
-    (measured,) = series.measured  # those of the store are forgotten
-    assert not measured.is_series
-    assert series.save.isEnabled()
+    assert {row[0] for row in rows[1:]} == {"contrast"}
+    form.picture.click()
+    assert (tmp_path / "both.pdf").read_bytes().startswith(b"%PDF")
 
 
 LINE = np.array([[10.0, 5.0], [10.0, 45.0]])

@@ -43,21 +43,6 @@ def mean_fluences(doses, rows=np.s_[:], columns=np.s_[:]):
     return np.nanmean(used, axis=(1, 2))
 
 
-def test_the_spectrum_follows_the_region(evaluated, pack_doses, wait):
-    tool = evaluated
-    tool._draw_region()
-    scale = tool.packs.layer.scale[1:]
-    assert tool.regions.layer.name == "region – trio"
-
-    region = tool.regions.layer
-    np.testing.assert_allclose(region.scale, scale)
-    region.add_rectangles([[19.6, 29.6], [49.4, 59.4]])
-    for rows, columns in ((np.s_[20:50], np.s_[30:60]), (np.s_[30:60], np.s_[50:80])):
-        means = mean_fluences(pack_doses, rows, columns)
-        wait(lambda: np.allclose(tool.spectrum.fluence, means))  # noqa: B023
-        region.data = [region.data[0] + [10, 20]]
-
-
 def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, run, wait):
     tool = evaluated
     layer_of(viewer, "unusable").data[0, 40:44, 50:55] = BY_HAND

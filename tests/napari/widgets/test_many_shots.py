@@ -11,19 +11,15 @@ from helpers.jobs import run_job
 from helpers.layers import layer_of
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
-from napari_shadowinv._napari.jobs import SourceJob
 from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
 from napari_shadowinv._napari.widgets._stacks import StackJob
 from napari_shadowinv._napari.widgets.invert import Invert
-from napari_shadowinv.errors import InversionCancelled
-from napari_shadowinv.inversion import compilation
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, read_stack
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, toroid
-from napari_shadowinv.pipeline import run
 from napari_shadowinv.pipeline.run_options import RunOptions
-from napari_shadowinv.preprocessing import BackgroundFilter, PolynomialEstimate, Recipe
+from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import _worker
 
@@ -321,51 +317,6 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     assert (StackStore(out).statuses() == DONE).sum() == 5
     tool.panel.button.click()
     rest(tool)
-
-
-def stack_job(shots, folder, recipe):
-    return StackJob(shots=Shot(shots), out=folder / "a.shadowinv.zarr", recipe=recipe)
-
-
-def test_a_stack_tells_that_it_compiles(stack, tmp_path, monkeypatch):
-    monkeypatch.setattr(compilation, "is_compiled", lambda: False)
-    progress = []
-    job = stack_job(stack[:1], tmp_path, Recipe(options=InversionOptions(**FEW)))
-    status = job.run(progress.append, lambda: False)
-    assert list(dict.fromkeys(report.stage for report in progress)) == ["prepare", "shots"]
-    assert any(report.message.startswith("compiling, ") for report in progress)
-    assert status.text == "1 of 1 done"
-
-
-LARGE = np.random.default_rng(0).normal(100, 5, (1024, 1024))
-SLOW = PolynomialEstimate(degree=10)
-
-
-def running(recipe):
-    return lambda hear, stop: run(recipe, LARGE, on_progress=hear, should_stop=stop)
-
-
-@pytest.mark.parametrize(
-    "job",
-    [
-        lambda tmp_path: SourceJob(SLOW, Shot(LARGE), None, {}).run,
-        lambda tmp_path: running(Recipe(source=SLOW)),
-        lambda tmp_path: running(Recipe(steps=(BackgroundFilter(degree=10),))),
-        lambda tmp_path: stack_job(LARGE[None], tmp_path, Recipe(source=SLOW)).run,
-    ],
-    ids=["source", "shot", "step", "stack"],
-)
-def test_a_megapixel_ends_at_the_look_that_asks(job, tmp_path):
-    looks = []
-
-    def should_stop():
-        looks.append(len(looks) >= 8)  # in the middle of the estimate or filter
-        return looks[-1]
-
-    with pytest.raises(InversionCancelled):
-        job(tmp_path)(lambda _: None, should_stop)
-    assert looks.count(False) == 8
-    assert looks.count(True) <= 2  # a stack's own, and its worker's
 
 
 def test_a_shot_is_looked_at_before_the_books_count_it(stack, out):

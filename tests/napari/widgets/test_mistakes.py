@@ -119,11 +119,6 @@ def of_an_object(tool, viewer, folder):
         tool.energies.setText(energies)
         tool.side.setText(size)
         yield words
-    tool.side.setText("")
-    tool.object.set_kind("grid")
-    yield "ptions: 'File' is missing"
-    tool.object.form.restore({"file": str(folder / "cube.nc"), "beam": "x", "right": "y"})
-    yield "cube.nc does not exist: expected an openPMD file or a NetCDF 4 file"
 
 
 def of_a_product(tool, viewer, solved):

@@ -20,8 +20,8 @@ from napari_shadowinv._napari.layer_metadata import (
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.viewer_sync import error_text
-from napari_shadowinv._napari.widgets._image_table import ImageTable, beam_column
 from napari_shadowinv._napari.widgets._inputs import SetupPicker, fields_of
+from napari_shadowinv._napari.widgets.fit_images import ImageTable, beam_column
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.physics.setup import setup_from_dict

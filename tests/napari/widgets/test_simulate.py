@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 import tifffile
-import xarray as xr
 
 from helpers.forms import enter
 from helpers.jobs import run_job
 from helpers.layers import by_role
 from helpers.reports import texts_of
-from napari_shadowinv import InputError, Instrument, OpticalSetup, ProtonSetup, trace
+from napari_shadowinv import OpticalSetup, ProtonSetup
 from napari_shadowinv._napari.layer_metadata import (
     Frame,
     Result,
@@ -19,15 +18,13 @@ from napari_shadowinv._napari.layer_metadata import (
     unit_of,
 )
 from napari_shadowinv._napari.layers import add_layers, add_to_viewer, fit_layers
-from napari_shadowinv._napari.simulate import ForwardJob, GridFile, Simulate
+from napari_shadowinv._napari.simulate import ForwardJob, Simulate
 from napari_shadowinv._napari.widgets.invert import Invert
-from napari_shadowinv.io import read_field_grid
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantom_models import BlobRecipe
 from napari_shadowinv.physics.phantoms import coaxial_line, four_toroids, wakefield
 from napari_shadowinv.physics.projection import predict_image
 from napari_shadowinv.physics.setup import deflector_titles
-from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
 from napari_shadowinv.pipeline.experiment_object import object_of_displacement
 
 
@@ -193,52 +190,3 @@ def test_a_plan_shows_its_verdict_and_the_first_image(tool, image):
     assert role_of(layer) == "shot"
     assert layer.data.mean() == pytest.approx(3000, rel=0.01)
     assert not tool.plot.isHidden()
-
-
-@pytest.fixture
-def cube(tmp_path):
-    """A ring of B about the axis x, away from the middle of its frame."""
-    z, y, x = np.meshgrid(*[np.linspace(-4e-5, 4e-5, 20)] * 3, indexing="ij")
-    bell = 8e6 * np.exp(-(x**2 + y**2 + z**2) / (2 * 1.2e-5**2))
-    values = {"Bx": bell * 0, "By": -z * bell, "Bz": y * bell}
-    magnetic = {name: (("z", "y", "x"), value, {"units": "T"}) for name, value in values.items()}
-    places = {"z": 1e-3 + z[:, 0, 0], "y": y[0, :, 0], "x": x[0, 0]}
-    axes = {name: (name, line, {"units": "m"}) for name, line in places.items()}
-    path = tmp_path / "cube.nc"
-    xr.Dataset(magnetic, axes).to_netcdf(path, engine="h5netcdf")
-    return path
-
-
-@pytest.fixture
-def traced(tool, cube):
-    """The widget with the field of the file, seen along x."""
-    tool.object.set_kind("grid")
-    tool.object.form.restore({"file": str(cube), "beam": "x", "right": "y", "centre": True})
-    tool.side.setText("")
-    return tool
-
-
-def test_a_3d_field_of_a_file_is_traced(cube):
-    file = GridFile(file=cube, beam="x", right="y", centre=True)
-    with pytest.raises(InputError, match="there is no setup"):
-        run_job(ForwardJob(file, shape=(40, 50)))
-    traced = run_job(ForwardJob(file, shape=(40, 50), setup=ProtonSetup.example()))
-    grid = read_field_grid(cube).turned("x", "y").centred()
-    np.testing.assert_array_equal(traced.image, trace(grid, ProtonSetup.example(), (40, 50)).image)
-
-
-def test_a_3d_field_is_planned_as_in_python(traced, cube, image, refused):
-    layer = image(traced)
-    grid = read_field_grid(cube).turned("x", "y").centred()
-    expected = plan_experiment(
-        grid,
-        ProtonSetup.example(),
-        instrument=Instrument(beam_rms=0.0),
-        options=ExperimentOptions(draws=3, counts=3000.0),
-    )
-    np.testing.assert_array_equal(layer.data, expected.images[0])
-    assert layer.name == "cube, planned"
-    texts = texts_of(traced.report)
-    assert texts["Error made"] == next(f.text for f in expected.facts if f.title == "Error made")
-    traced.setup.set_kind("none")
-    refused(traced, "There is no setup: expected one of charged particles")

@@ -1,7 +1,7 @@
 """Files of a tool: recipes of its controls, and results to save or to repeat.
 
 - recipes, as for the commands: `RecipeButton`
-- a result to save: `result_to_save`, `save_as`; its other layers: `add_missing_layers`
+- a result to save: `result_to_save`, `save_as`
 """
 
 from __future__ import annotations
@@ -22,12 +22,10 @@ from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import (
     dataset_to_save,
     layers_of_result,
-    missing_layers,
     shot_of_store,
 )
 from napari_shadowinv._napari.viewer_sync import plane_in_view
 from napari_shadowinv._napari.widgets._layers import new_mask
-from napari_shadowinv._napari.widgets._panels import ResultLayers
 from napari_shadowinv._napari.widgets._qt import ask_file, filter_of, notify_errors
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import BoolArray
@@ -106,12 +104,13 @@ class RecipeButton(QPushButton):
         super().__init__("Recipe")
         self._tool = tool
         self.setToolTip(
-            "<qt>Load or save steps, source, masks, setup and options as one TOML file, which also "
-            f"works with <code>shadowinv {tool.command} --recipe</code>.</qt>"
+            "<qt>Save steps, source, masks, setup and options as one TOML file, which also works "
+            f"with <code>shadowinv {tool.command} --recipe</code>.</qt>"
         )
         self.setSizePolicy(QSizePolicy.Policy.Fixed, QSizePolicy.Policy.Fixed)
         menu = QMenu(self)
-        menu.addAction("Load recipe…").triggered.connect(lambda: self._ask_and_load())
+        if tool.command == "invert":
+            menu.addAction("Load recipe…").triggered.connect(lambda: self._ask_and_load())
         menu.addAction("Save…").triggered.connect(lambda: self._ask_and_save())
         if tool.command == "invert":
             menu.addAction("Copy as Python").triggered.connect(lambda: self.copy(_python_of))
@@ -282,18 +281,6 @@ def save_as(parent: Any, content: Savable, say: Callable[[str], Any]) -> None:
     text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"
     say(text)
     show_info(text)
-
-
-def add_missing_layers(viewer: Any, results: ResultLayers) -> None:
-    """Add the other layers of the shown result, hidden, also to later results of the same shot."""
-    layer = shown_result(viewer, results.layers)
-    missing = missing_layers(viewer, layer)
-    if not missing:
-        show_info("All layers of the result are in the layer list")
-    elif layer in results.layers:
-        results.extend(missing)
-    else:
-        ResultLayers(viewer, results).show(missing, select=False)
 
 
 def field_of(layers: Iterable[Any]) -> list[Any]:

@@ -35,7 +35,7 @@ from napari_shadowinv.options import (
     Instrument,
 )
 from napari_shadowinv.physics.beam import geometry_text, setup_cautions, text_in_unit, unit_in_title
-from napari_shadowinv.physics.setup import SETUPS, Setup, deflector_titles
+from napari_shadowinv.physics.setup import SETUPS, Setup
 from napari_shadowinv.pipeline.files import complete_setup
 from napari_shadowinv.shot import Shot
 
@@ -361,17 +361,13 @@ class SourcePicker(layers.LayerPicker):
             raise InputError("no source file is selected: choose one, or choose another source")
         return model or (None if self.kind == UNKNOWN else preprocessing.MeasuredSource())
 
-    def show(self, source: Any, beam: str = "known") -> None:
-        """Show the source of a recipe; None for uniform, unless the beam is unknown."""
-        if beam == "unknown":
-            self.set_kind(UNKNOWN)
-        elif isinstance(source, preprocessing.Estimate):
+    def show(self, source: Any) -> None:
+        """Show the source of a recipe; None for uniform."""
+        if isinstance(source, preprocessing.Estimate):
             name = source.name()
             self.restore(name, {name: source.values()})
         elif source is None:
             self.set_kind(UNIFORM)
-        elif FILE not in self._kinds:
-            self.layer = self.layer or self.likely_layer
         elif source.file is None:
             self.set_kind(SUPPLIED)
         else:
@@ -436,12 +432,6 @@ class SourcePicker(layers.LayerPicker):
         """Select the source supplied with an image, or a likely one; else the chosen one."""
         self._image, self._takes_supplied = image, True
         self.fill()
-
-    @property
-    def likely_layer(self) -> Any | None:
-        """The layer that is probably the image's beam, perhaps an estimate, or None."""
-        image = self._image
-        return None if image is None else layers.likely_beam(image, self.offered, estimates=True)
 
     def _remember(self, choice: Any) -> None:
         # The source supplied with a shot is not that of the next one.
@@ -525,10 +515,6 @@ class ImagePanel(ToolPanel):
         """Return the recipe of the controls, without masks and layers; or raise an `InputError`."""
         raise NotImplementedError
 
-    def show_recipe(self, recipe: preprocessing.Recipe, path: Path) -> None:
-        """Show a recipe but for its masks; change nothing unless all of it is usable."""
-        raise NotImplementedError
-
     def compare(self) -> None:
         """Say so if the result shown is of other choices."""
         if self._ready:
@@ -554,13 +540,6 @@ class ImagePanel(ToolPanel):
         if source is None or not about.is_estimate(source) or instrument.beam_rms is not None:
             return instrument
         return Instrument(**instrument.stated, beam_rms=ASSUMED_BEAM.rms)
-
-    def show_inputs(self, recipe: preprocessing.Recipe, path: Path) -> None:
-        """Show steps, setup and instrument of a recipe."""
-        self.steps.show_steps(recipe.steps)
-        self.instrument.restore(recipe.instrument.stated)
-        if recipe.setup is not None:
-            self.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
 
     def shot_of(self, layer: Any) -> Shot:
         """Return an image with its source and mask."""
@@ -607,7 +586,3 @@ def fields_of(kind: str) -> forms.Kinds:
     together = BOTH.join(choices)
     choices.setdefault(together, (together, None))
     return choices
-
-
-def field_key(fields: Sequence[str]) -> str:
-    return BOTH.join(key for key in deflector_titles() if key in fields)

@@ -280,7 +280,7 @@ _BEAM_NAME = re.compile(
 _DARK_NAME = re.compile(r"(?<![a-z])darks?(?![a-z])")
 
 
-def likely_beam(image: Any, offered: Sequence[Any], *, estimates: bool = False) -> Any | None:
+def likely_beam(image: Any, offered: Sequence[Any]) -> Any | None:
     """Return the only offered layer that may be an image's beam, by its size, name and structure.
 
     An image of a result has the result's own. Without a name, the beam is the smoother of two
@@ -294,7 +294,7 @@ def likely_beam(image: Any, offered: Sequence[Any], *, estimates: bool = False) 
         for layer in offered
         if layer is not image
         and not (about.belongs_to_result(layer) or layer.rgb)
-        and (estimates or not about.is_estimate(layer))
+        and not about.is_estimate(layer)
         and layer.ndim == 2
         and layer.data.shape == tuple(data_of(image).shape[-2:])
         and not _has_word(layer, _DARK_NAME)

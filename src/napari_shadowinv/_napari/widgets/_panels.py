@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from napari.utils.notifications import show_warning
+from napari.utils.notifications import show_info, show_warning
 from qtpy import QtWidgets
 from qtpy.QtCore import QObject, Signal
 from qtpy.QtWidgets import QCheckBox
@@ -24,6 +24,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, FitJob, ImageJob, Job, Refinement
 from napari_shadowinv._napari.layer_metadata import Result, kind_of, main_layers, result_of
 from napari_shadowinv._napari.layers import FullLayerData, LayerData, add_layers
+from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv._napari.run import Outcome, Run
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._napari.widgets import _files as files
@@ -249,7 +250,16 @@ class ResultView(QtWidgets.QWidget):
 
     @qt.notify_errors
     def add_layers(self) -> None:
-        files.add_missing_layers(self._tool.viewer, self._tool.results)
+        """Add the other layers of the shown result, hidden, also to later ones of the same shot."""
+        viewer, results = self._tool.viewer, self._tool.results
+        layer = files.shown_result(viewer, results.layers)
+        missing = missing_layers(viewer, layer)
+        if not missing:
+            show_info("All layers of the result are in the layer list")
+        elif layer in results.layers:
+            results.extend(missing)
+        else:
+            ResultLayers(viewer, results).show(missing, select=False)
 
     def show_fit(self, job: FitJob, finished: Finished) -> ResultLayers:
         """Show the layers, verdict and report of a fit; return its layers."""

@@ -1,21 +1,50 @@
-"""The widget that measures layers along a line, and products of a result: `Analyse`."""
+"""The widget that measures layers along a line, and products of a result: `Analyse`.
+
+- the form of the products, with their job: `ProductForm`, `ProductJob`
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from napari.utils.notifications import show_info
+from pydantic import Field, create_model
 from qtpy import QtWidgets
 from qtpy.QtCore import QSignalBlocker, Qt
 
 from napari_shadowinv._napari import form as forms
-from napari_shadowinv._napari.layer_metadata import kind_of, pixel_mapper, role_of, unit_of
-from napari_shadowinv._napari.widgets import _products as products
+from napari_shadowinv._napari import layer_metadata as about
+from napari_shadowinv._napari.jobs import Finished, Job, name_of_result
+from napari_shadowinv._napari.layer_metadata import (
+    kind_of,
+    mapped,
+    matrix_between,
+    pixel_mapper,
+    role_of,
+    unit_of,
+)
+from napari_shadowinv._napari.layers import LayerData, add_layers
+from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes, shown_plane
+from napari_shadowinv._napari.widgets._panels import ReportView, ToolPanel
+from napari_shadowinv._system.arrays import PLANE
+from napari_shadowinv._system.progress import OnProgress, ShouldStop
+from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.analysis import (
+    FIELD_UNITS,
+    PRODUCTS,
+    Product,
+    ProductResult,
+    analyse,
+    product_from_dict,
+    products_table,
+)
 from napari_shadowinv.analysis.paths import (
     Profile,
     interpolate,
@@ -25,7 +54,10 @@ from napari_shadowinv.analysis.paths import (
     table_text,
 )
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.io.formats import FIGURE_SUFFIXES
 from napari_shadowinv.physics.beam import number_in_unit
+from napari_shadowinv.physics.units import prefix_for
+from napari_shadowinv.plotting import draw_curves, products_figure, save_figure
 
 _REDRAW_MS = 40  # while the line moves
 _MAX_NAME_LENGTH = 34
@@ -85,7 +117,7 @@ class Analyse(qt.Docked):
         title = QtWidgets.QLabel("Layers to plot")
         controls = (self.lines, title, self.layers, width)
         results = (self.hint, self.plot, self.measures, self.export, self.problem)
-        page, self.products = QtWidgets.QWidget(), products.ProductForm(self.viewer)
+        page, self.products = QtWidgets.QWidget(), ProductForm(self.viewer)
         self.products.setMinimumWidth(0)  # that of the window counts
         self.tabs = QtWidgets.QTabWidget()
         self.tabs.addTab(page, "Layers along a line")
@@ -138,7 +170,7 @@ class Analyse(qt.Docked):
         shapes, layers = self.lines.layer, self.checked()
         line = None
         if shapes is not None:
-            line = products.selected_shape(shapes, lambda kind: kind in products.OPEN_SHAPES)
+            line = selected_shape(shapes, lambda kind: kind in OPEN_SHAPES)
         self.profiles, problem = [], ""
         if shapes is not None and line is not None and layers:
             vertices = np.array([shapes.data_to_world(end)[-2:] for end in shapes.data[line]])
@@ -229,7 +261,7 @@ class Analyse(qt.Docked):
 
     @qt.notify_errors
     def _export(self) -> None:
-        products.export_csv(self, "profile", self.table())
+        export_csv(self, "profile", self.table())
 
 
 def _state_of(on: bool) -> Qt.CheckState:
@@ -244,3 +276,275 @@ def strip_width(text: str, pixel: float, unit: str) -> tuple[float, str]:
             if 0 <= width < _MAX_WIDTH:
                 return factor * width, f"mean over {width:g} {in_unit}" if width else ""
     raise InputError(f"Width is '{text}', expected a number in px, or with a unit, such as 20 um")
+
+
+_ELLIPSE_CORNERS = 90
+_ROUND = 0.02  # largest difference of the axes of a circle
+_BY_SETUP = "unit of the setup"
+_MORE = "more"
+# The products that most experiments need; the others follow below *more…*.
+_USUAL = ("profile", "region", "flux", "current", "current-density", "axisymmetric")
+OPEN_SHAPES = ("line", "path")
+_PANEL_HEIGHT_PX = 210
+
+
+@dataclass(frozen=True, eq=False)
+class ProductJob(Job):
+    """The measurement of a product of a result."""
+
+    origin: about.Result[Any]
+    layer: Any  # of the result
+    product: Product
+    unit: str | None
+    samples: int
+
+    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
+        common: Any = {"unit": self.unit, "on_progress": on_progress, "should_stop": should_stop}
+        return analyse(self.origin.content, self.product, samples=self.samples, **common)
+
+    def layers(self, content: list[ProductResult]) -> LayerData:
+        """Describe the maps, on top of the result."""
+        return [
+            map_layer(measured, name, self.layer)
+            for measured in content
+            for name, variable in measured.variables.items()
+            if variable.dims == PLANE
+        ]
+
+
+def draw_groups(columns: Sequence[Any], result: ProductResult) -> None:
+    """Draw the curves of a product, in a panel for each unit, but the image's intensity."""
+    for axes, names in zip(columns, result.curve_groups, strict=True):
+        draw_curves(axes, result, names, qt.COLOURS)
+        axes.label_outer()
+
+
+class _Bands(CheckedModel):
+    """How the bands of a single result are found."""
+
+    samples: int = Field(
+        default=100, ge=20, le=2000, description="Number of samples of the field for the bands."
+    )
+
+
+class ProductForm(ToolPanel):
+    """Choose a result, a product and a shape, and measure it with its bands."""
+
+    def __init__(self, viewer: Any) -> None:
+        run = Run("Measure", "Measure the product with its bands.")
+        super().__init__(viewer, run)
+        self.measured: list[ProductResult] = []  # the last, of each part of the field
+        tip = "Layer of the result of an inversion or a fit."
+        self.result = LayerPicker(viewer, tip, suits=_has_fields, label="Result")
+        kinds = _forms_of(PRODUCTS)
+        usual = {name: kinds.pop(name) for name in _USUAL}
+        self.more_products = forms.ModelPicker("", kinds)
+        self.product = forms.ModelPicker("Product", {**usual, _MORE: ("more…", self.more_products)})
+        tip = "Shapes layer with the line or outline. Of several, the selected is used."
+        self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",), label="Shape")
+        self.shapes.add_button("✎", "Draw a new shape for the product.", self._draw)
+        self.unit = forms.combo_box("Unit of the field, which chooses the field, too.")
+        self.bands = forms.ModelForm(_Bands)
+        self.plot, self.report = qt.Plot(_PANEL_HEIGHT_PX, fixed=True), ReportView()
+        self.export = qt.push_button("Export CSV…", "Save the numbers and curves.", self._export)
+        self.picture = qt.push_button(
+            "Save figure…", "Save a figure of the curves and maps.", self._save_figure
+        )
+        self.add(
+            self.result,
+            self.product,
+            self.shapes,
+            forms.labelled("Unit", self.unit.native),
+            self.bands,
+            self.panel,
+            self.plot,
+            self.report,
+            qt.side_by_side((self.export, 1), (self.picture, 1)),
+        )
+        self.result.picked.connect(self._on_result)
+        for picker in (self.product, self.more_products):
+            picker.changed.connect(lambda: self.shapes.setVisible(_is_drawn(self.kind)))
+        self._on_result()
+        self.forget()
+
+    @property
+    def _picker(self) -> forms.ModelPicker:
+        return self.more_products if self.product.kind == _MORE else self.product
+
+    @property
+    def kind(self) -> type[Product]:
+        return PRODUCTS[self._picker.kind]
+
+    def _on_result(self) -> None:
+        """Offer the units of the result's fields."""
+        layer = self.result.layer
+        result = None if layer is None else about.result_of(layer)
+        setup = None if result is None else result.content.setup
+        fields = {"displacement"} if setup is None else {each.name for each in setup.si_fields}
+        symbols = [s for s, unit in FIELD_UNITS.items() if unit.field in fields | {"displacement"}]
+        self.unit.choices = (_BY_SETUP, *symbols)
+
+    def request(self) -> ProductJob:
+        """Return what is to be measured, or raise an `InputError`."""
+        layer = self.result.layer
+        if layer is None:
+            raise InputError(
+                "there is no result to measure: run 'Invert' or 'Fit several images', or open a "
+                ".shadowinv file; of a store, save the result of a shot, or use shadowinv analyse"
+            )
+        choices: Any = self._picker.model()
+        values = {**choices.model_dump(exclude_unset=True), "product": self.kind.name()}
+        if _is_drawn(self.kind):
+            values |= self._outline(layer)
+        symbol = self.unit.value
+        product, unit = product_from_dict(values), None if symbol == _BY_SETUP else symbol
+        origin: Any = about.result_of(layer)
+        bands: Any = self.bands.model()
+        return ProductJob(origin, layer, product, unit, bands.samples)
+
+    def _outline(self, layer: Any) -> dict[str, Any]:
+        """Return the fields of a product that the selected shape stands for, in px."""
+        shapes = self.shapes.layer
+        if shapes is None or not len(shapes.data):
+            raise InputError(
+                f"there is no shape for the {self.kind.title}: press ✎ and draw one on the image"
+            )
+        is_closed = "center" in self.kind.model_fields
+        index = selected_shape(
+            shapes,
+            lambda kind: is_closed != (kind in OPEN_SHAPES) or (is_closed and kind == "path"),
+        )
+        if index is None:
+            expected = "a closed shape, such as an ellipse" if is_closed else "a line or a path"
+            raise InputError(
+                f"'{shapes.name}' has no shape for the {self.kind.title}, expected {expected}: "
+                "press ✎ and draw one"
+            )
+        corners = mapped(matrix_between(shapes, layer), shapes.data[index])
+        values = shape_fields(shapes.shape_type[index], corners)
+        if not values.keys() <= self.kind.model_fields.keys():
+            raise InputError(
+                f"the shape for the {self.kind.title} is no circle: press ✎ and draw an ellipse "
+                "with the Shift key held down"
+            )
+        return values
+
+    def choose(self, layer: Any) -> None:
+        """Select the result that a layer belongs to, or raise an `InputError`."""
+        together = [] if layer is None else about.layers_of(self.viewer, layer)
+        of_result = [each for each in together if each in self.result.offered]
+        if not of_result:
+            raise InputError(
+                "no result is selected: select a layer of an inversion or a fit; of a store, save "
+                "the result of a shot, or use shadowinv analyse"
+            )
+        self.result.layer = layer if layer in of_result else of_result[-1]
+
+    def forget(self) -> None:
+        self.measured = []
+        for widget in (self.report, self.plot):
+            widget.setVisible(False)
+        for button in (self.export, self.picture):
+            button.setEnabled(False)
+
+    def show_result(self, finished: Finished, job: ProductJob) -> None:
+        self.measured = finished.content
+        measured = self.measured[-1]
+        rows = [(fact.title, fact.text) for fact in measured.facts]
+        self.report.show_rows([*rows, *(("Note", sentence) for sentence in measured.limits)])
+        panels = len(measured.curve_groups)
+        self.plot.setVisible(panels > 0)
+        if panels:
+            self.plot.setFixedHeight(_PANEL_HEIGHT_PX * panels)
+            self.plot.show_drawing(lambda axes: draw_groups(axes, measured), panels)
+        for button in (self.export, self.picture):
+            button.setEnabled(True)
+        add_layers(self.viewer, finished.layer_data)
+
+    @qt.notify_errors
+    def _draw(self) -> None:
+        layer = self.result.layer
+        if layer is None:
+            raise InputError("there is no result to draw on: run 'Invert' first")
+        mode = "add_ellipse" if "center" in self.kind.model_fields else "add_line"
+        self.shapes.layer = new_shapes(self.viewer, layer, self.kind.name(), mode)
+
+    @qt.notify_errors
+    def _export(self) -> None:
+        export_csv(self, "products", products_table(self.measured))
+
+    @qt.notify_errors
+    def _save_figure(self) -> None:
+        formats = ";;".join(qt.filter_of(end[1:].upper(), [end]) for end in FIGURE_SUFFIXES)
+        if path := qt.ask_file(self, "Save figure", "products", formats):
+            figure = products_figure(self.measured)
+            show_info(f"Wrote {save_figure(path, figure, overwrite=True)}")
+
+
+def _is_drawn(kind: type[Product]) -> bool:
+    """Whether a product needs a line or an outline."""
+    return not {"path", "center"}.isdisjoint(kind.model_fields)
+
+
+def _forms_of(products: Mapping[str, type[Product]]) -> forms.Kinds:
+    """Return titles and models of products for a picker, without the fields of shapes."""
+    kinds: forms.Kinds = {}
+    for name, kind in products.items():
+        of_shape = {"label"} | ({"radius"} if "center" in kind.model_fields else set())
+        fields: Any = {}
+        for key, field in kind.parameters().items():
+            extra: Any = field.json_schema_extra or {}
+            if key not in of_shape and "metavar" not in extra and "hidden" not in extra:
+                fields[key] = field.annotation, field
+        title = f"{kind.title[:1].upper()}{kind.title[1:]}"
+        kinds[name] = title, create_model(kind.title, __base__=CheckedModel, **fields)
+    return kinds
+
+
+def _has_fields(layer: Any) -> bool:
+    return about.result_of(layer) is not None
+
+
+def export_csv(parent: QtWidgets.QWidget, stem: str, text: str) -> None:
+    """Ask for a file, offering a name, and write a table."""
+    if path := qt.ask_file(parent, "Export CSV", stem, qt.TABLES):
+        qt.write_text(path, text)
+        show_info(f"Wrote {path}")
+
+
+def selected_shape(shapes: Any, suits: Callable[[str], bool]) -> int | None:
+    """Return the index of the selected shape of a suitable type, or else of the last one."""
+    suitable = [index for index, kind in enumerate(shapes.shape_type) if suits(kind)]
+    selected = [index for index in suitable if index in shapes.selected_data]
+    return next(reversed(selected or suitable), None)
+
+
+def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:
+    """Return the fields of a product for a shape of napari with corners (n, 2) in px.
+
+    An ellipse has the corners of the rectangle around it. One that is round becomes a circle.
+    """
+    if shape_type != "ellipse":
+        return {"path": [tuple(map(float, corner)) for corner in corners]}
+    center = corners.mean(axis=0)
+    axes = (corners[1] - corners[0]) / 2, (corners[3] - corners[0]) / 2
+    radii = np.hypot(*np.transpose(axes))
+    if abs(radii[0] - radii[1]) <= _ROUND * max(radii):
+        return {"center": tuple(map(float, center)), "radius": float(radii.mean())}
+    angles = np.linspace(0, 2 * np.pi, _ELLIPSE_CORNERS, endpoint=False)[:, None]
+    points = center + np.cos(angles) * axes[0] + np.sin(angles) * axes[1]
+    return {"path": [tuple(map(float, point)) for point in points]}
+
+
+_MAP = about.Kind("product", "", "{title} ({unit})", colormap="signed", visible=True)
+
+
+def map_layer(measured: ProductResult, name: str, layer: Any) -> Any:
+    """Describe the layer of a map, on top of a layer of its result."""
+    values = measured[name].value
+    largest = float(np.nanpercentile(np.abs(values), 99.8)) or 1.0
+    factor, prefix = prefix_for(largest)
+    unit = f"{prefix}{measured.variables[name].unit}"
+    look = {"contrast_limits": (-factor * largest, factor * largest)}
+    words, name = {"title": measured.title, "unit": unit}, name_of_result(layer)
+    return _MAP.layer(factor * values, name, about.frame_of(layer), None, look, words=words)

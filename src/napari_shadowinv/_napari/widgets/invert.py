@@ -164,6 +164,7 @@ class Invert(ImagePanel):
         return steps if crop is None else (crop, *steps)
 
     def show_recipe(self, recipe: Recipe, path: Path) -> None:
+        """Show a recipe but for its masks; change nothing unless all of it is usable."""
         image: Any = self.chosen_image()
         crop, steps = None, recipe.steps
         can_crop = image is not None and not self.image.is_stack
@@ -171,7 +172,10 @@ class Invert(ImagePanel):
             height, width = image.data.shape[-2:]
             crop, steps = steps[0].slices((height, width)), steps[1:]
         source = self.source.usable(recipe.source, image, path)
-        self.show_inputs(recipe.model_copy(update={"steps": steps}), path)
+        self.steps.show_steps(steps)
+        self.instrument.restore(recipe.instrument.stated)
+        if recipe.setup is not None:
+            self.setup.load(recipe.setup.model_dump(exclude_none=True), str(path))
         self.source.show(source)
         self.options.restore(recipe.options.model_dump())
         self.crop.layer = None if crop is None else layers.new_crop(self.viewer, image, crop)
