@@ -104,7 +104,7 @@ def walk(viewer: Any, setup: Path) -> list[str]:
     tool: Any = next(iter(viewer.window.dock_widgets.values()))
     wait_for(tool.isVisible)
     settle(0.5)
-    load = tool.setup.files.load_button
+    load = tool.setup.load_button
     tool.area.ensureWidgetVisible(load)  # by the wheel
     QTimer.singleShot(1500, lambda: mouse.answer(setup))
     mouse.click(load, "button Load setup…")

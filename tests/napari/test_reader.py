@@ -16,7 +16,7 @@ from napari_shadowinv import FileFormatError, ProtonSetup, write
 from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, role_of, setup_of
 from napari_shadowinv._napari.layers import add_layers, sample_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
-from napari_shadowinv._napari.result_files import follow_shots, missing_layers
+from napari_shadowinv._napari.result_files import follow_arrows, missing_layers
 from napari_shadowinv._napari.widgets._layers import cautions_of
 
 PLUGIN = "napari-shadowinv"
@@ -306,7 +306,7 @@ def rays(solved, factor=1.0):
 def test_arrows_follow_the_shot_in_view(viewer, store, solved):
     arrows = by_role(viewer.open(store, plugin=PLUGIN))["arrows"]
     assert (arrows.data[:, 0, 0] == 1).all()  # the first that is done
-    follow_shots(viewer, arrows)
+    follow_arrows(viewer)
     length = arrows.length
     for shot, expected in ((2, rays(solved, 0.5)), (1, rays(solved))):
         viewer.dims.set_point(0, shot)

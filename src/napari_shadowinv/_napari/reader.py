@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from napari_shadowinv._napari.layer_metadata import main_layers, metadata_of, result_of, role_of
+from napari_shadowinv._napari.layer_metadata import main_layers, result_of
 from napari_shadowinv._napari.viewer_sync import (
     connect_viewer,
     notify_errors,
@@ -123,7 +123,7 @@ def _read_content(path: Path, array: str) -> list[Any]:
 def _show_in_window(layers: Sequence[Any]) -> None:
     """In a window, show an opened result with its bars, and select its field."""
     from napari_shadowinv._napari.layers import present
-    from napari_shadowinv._napari.result_files import follow_shots, viewer_in_window
+    from napari_shadowinv._napari.result_files import follow_arrows, viewer_in_window
 
     viewer = viewer_in_window()
     if viewer is None:
@@ -131,9 +131,7 @@ def _show_in_window(layers: Sequence[Any]) -> None:
 
     def show(added: list[Any]) -> None:
         present_layers = [layer for layer in added if layer in viewer.layers]
-        for layer in present_layers:
-            if role_of(layer) == "arrows" and "store" in metadata_of(layer):
-                follow_shots(viewer, layer)
+        follow_arrows(viewer)
         present(viewer, present_layers)
 
     connect_viewer(viewer)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import sys
+import weakref
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -39,7 +40,7 @@ from napari_shadowinv._napari.layers import (
     sample_arrows,
     widen_limits,
 )
-from napari_shadowinv._napari.viewer_sync import connect
+from napari_shadowinv._napari.viewer_sync import connect, connect_layers, without_proxy
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
@@ -268,50 +269,42 @@ def _shot_names(dataset: xarray.Dataset) -> list[str]:
     return [str(shot) for shot in range(dataset.sizes["shot"])]
 
 
-def follow_shots(viewer: Any, layer: Any) -> Callable[[], None]:
-    """Show the arrows of the shot in view, as they cannot be lazy; return how to reload them."""
-    displacement = _displacement(layer)
-    current: list[int] = []
+_followed: weakref.WeakSet[Any] = weakref.WeakSet()  # lists of layers
+# By layer: its facts, the displacement in its store, and the shot that its arrows show.
+_shown_arrows: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
 
-    def shot_in_view() -> int:
-        return round(float(layer.world_to_data(viewer.dims.point[-layer.ndim :])[0]))
 
-    def read() -> None:
-        shot = shot_in_view()
-        if not layer.visible or not 0 <= shot < len(displacement):
-            return
-        current[:] = [shot]
-        try:
-            plane = displacement[shot].values
-        except OSError:
-            return  # the field, from the same chunk, reports it
-        data, _ = sample_arrows(plane)
+def follow_arrows(viewer: Any) -> None:
+    """Show the arrows of the shot in view, now and from now on; they cannot be lazy."""
+    show_arrows(viewer)
+    layers = without_proxy(viewer.layers)
+    if layers not in _followed:
+        _followed.add(layers)
+        connect(viewer.dims, "current_step", lambda _: show_arrows(viewer))
+        connect_layers(viewer.layers, "visible", lambda _: show_arrows(viewer))
+
+
+def show_arrows(viewer: Any) -> None:
+    """Read the arrows of the shot in view where they are seen."""
+    for layer in viewer.layers:
+        is_of_store = about.role_of(layer) == "arrows" and "store" in metadata_of(layer)
+        if is_of_store and layer.visible:
+            _read_arrows(layer, viewer.dims.point)
+
+
+def _read_arrows(layer: Any, point: Any) -> None:
+    facts = metadata_of(layer)
+    known, displacement, before = _shown_arrows.get(layer, (None, None, None))
+    if known is not facts:  # the store has grown
+        displacement, before = _open(Path(facts["store"]))["displacement"], None
+    shot = round(float(layer.world_to_data(point[-layer.ndim :])[0]))
+    if shot == before or not 0 <= shot < len(displacement):
+        return
+    _shown_arrows[layer] = facts, displacement, shot
+    with suppress(OSError):  # the field, from the same chunk, reports it
+        data, _ = sample_arrows(displacement[shot].values)
         layer.data = arrows_in_shot(data, shot)
         layer.features = {"displacement": np.hypot(*data[:, 1].T)}
-
-    def reload() -> None:
-        nonlocal displacement
-        displacement = _displacement(layer)
-        read()
-
-    def follow(_: Any = None) -> None:
-        if current != [shot_in_view()]:
-            read()
-
-    def leave(event: Any) -> None:
-        if event.value is layer:
-            connections.close()
-
-    connections = ExitStack()
-    connections.callback(connect(viewer.dims, "current_step", follow))
-    connections.callback(connect(viewer.layers, "removed", leave))
-    connect(layer, "visible", follow)
-    follow()
-    return reload
-
-
-def _displacement(layer: Any) -> xarray.DataArray:
-    return _open(Path(metadata_of(layer)["store"]))["displacement"]
 
 
 def viewer_in_window() -> Any | None:

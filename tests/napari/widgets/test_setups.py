@@ -8,7 +8,6 @@ from napari.layers import Image
 
 from helpers.forms import enter
 from helpers.image_files import save_pradformat
-from helpers.reports import texts_of
 from napari_shadowinv import InputError, ProtonSetup
 from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
@@ -190,11 +189,8 @@ def test_a_forward_model_takes_the_setup_of_a_potential_and_gives_it_back(
     assert opened(Invert).setup.setup() == entered
 
 
-def test_the_form_shows_geometry_and_doubts_which_the_report_need_not_repeat(
-    viewer, opened, plain, run, picker
-):
+def test_the_form_shows_geometry_and_doubts(viewer, opened, plain, picker):
     tool, paper = opened(Invert), ProtonSetup.example()
-    tool.options.restore({"n_sites": 200})
     for setup, view in ((picker, "pixel 1.5 µm"), (tool.setup, "90 × 72 µm")):
         setup.show_setup(paper.model_dump())
         assert setup.geometry_label.text().startswith(f"{view} at the object, M = 16.4")
@@ -205,9 +201,6 @@ def test_the_form_shows_geometry_and_doubts_which_the_report_need_not_repeat(
     swapped = {"source_object_distance": 1.0, "object_image_distance": 0.01}
     tool.setup.show_setup({**paper.model_dump(), **swapped})
     assert "the magnification is 1.01" in doubt.text()
-    run(tool)
-    assert tool.verdict.text()
-    assert doubt.text() not in texts_of(tool.report).values()
 
 
 def test_an_error_calls_the_fields_of_a_setup_by_their_labels():

@@ -204,8 +204,7 @@ class ToolPanel(qt.Docked):
 class ResultView(QtWidgets.QWidget):
     """Verdict and report of a result.
 
-    It follows the results of selected layers if their `content` is of one of these kinds; `said`
-    returns warnings that stand elsewhere.
+    It follows the results of selected layers if their `content` is of one of these kinds.
     """
 
     def __init__(
@@ -214,10 +213,9 @@ class ResultView(QtWidgets.QWidget):
         last: LastResults,
         content: type | tuple[type, ...],
         save_tip: str,
-        said: Callable[[], str] = str,
     ) -> None:
         super().__init__()
-        self._tool, self._last, self._content, self._said = tool, last, content, said
+        self._tool, self._last, self._content = tool, last, content
         self._result: Result[Any] | None = None
         self._recipe: Recipe | None = None  # that was run for the result, if it is the form's
         self.changes = forms.WrappingLabel()
@@ -302,9 +300,9 @@ class ResultView(QtWidgets.QWidget):
 
     def _show(self, result: Result[Any], facts: Sequence[Fact] | None = None) -> Headline:
         self._result, content, origins = result, result.content, result.origins.items()
-        facts, said = facts or content.facts, self._said()
+        facts = facts or content.facts
         self.verdict.show_headline(content.headline)
-        warnings = [row for row in warning_rows(facts) if row not in origins and row[1] not in said]
+        warnings = [row for row in warning_rows(facts) if row not in origins]
         rows, details = (fact_rows(facts, details=flag) for flag in (False, True))
         self.report.show_rows([*warnings, *origins, *rows], details)
         return content.headline

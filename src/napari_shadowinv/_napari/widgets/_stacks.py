@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +25,7 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import ImageJob
 from napari_shadowinv._napari.layer_metadata import kind_of, layer_key, main_layers, role_of
 from napari_shadowinv._napari.layers import LayerData
-from napari_shadowinv._napari.result_files import follow_shots, shot_rows, store_layers
+from napari_shadowinv._napari.result_files import follow_arrows, shot_rows, store_layers
 from napari_shadowinv._napari.run import Outcome
 from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _panels as panels
@@ -328,8 +328,6 @@ class StackView(QWidget):
         self._failed, self._newest = 0, 0
         self._resets_view, self._moves = False, False
         self._shown: LayerData = []  # all layers of the store as it was
-        self._arrows: Any = None
-        self._read_arrows: Callable[[], None] | None = None
         self._refresh_timer = qt.timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
         self._report_timer = qt.timer(self, _REFRESH_INTERVAL_MS, self.show_report, once=True)
         self.failures_title, self.failures = QLabel("Failed shots"), panels.ReportView()
@@ -406,13 +404,7 @@ class StackView(QWidget):
             self._newest = max(self._newest, min(self.job.newest, self._last))
             if self._moves:
                 self._viewer.dims.set_current_step(self._viewer.dims.ndim - 3, self._newest)
-        layers = self.results.layers
-        arrows = next((layer for layer in layers if role_of(layer) == "arrows"), None)
-        if arrows is not self._arrows:
-            self._arrows = arrows
-            self._read_arrows = None if arrows is None else follow_shots(self._viewer, arrows)
-        if self._read_arrows is not None:
-            self._read_arrows()
+        follow_arrows(self._viewer)
 
     @property
     def _last(self) -> int:

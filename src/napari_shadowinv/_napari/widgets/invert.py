@@ -106,8 +106,7 @@ class Invert(ImagePanel):
         refine = self.refine_form, self.refine_button
         self.refine_section = forms.section("Refine the result", *refine)
         self._refined = ResultLayers(self.viewer, self)
-        kinds, said = (Inversion, Fit), self.setup.warning_label.text
-        self.view = ResultView(self, self._last, kinds, _SAVE_TIP, said)
+        self.view = ResultView(self, self._last, (Inversion, Fit), _SAVE_TIP)
         self.verdict, self.report = self.view.verdict, self.view.report
         self.stack_view = StackView(self.viewer, self.report)
         self.show_source = qt.push_button(
