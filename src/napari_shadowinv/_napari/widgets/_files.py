@@ -52,11 +52,9 @@ from napari_shadowinv.preprocessing import MeasuredSource, Recipe
 
 @dataclass(eq=False)
 class _Repetition(Job):
-    """A result to repeat, with the files that are open, and the place of its layers."""
+    """A result to repeat, the folder of its files, and the place of its layers."""
 
     result: about.Result[Any]
-    images: list[Path] | None
-    source: Path | None
     folder: Path
     frame: about.Frame
     name: str
@@ -68,25 +66,14 @@ class _Repetition(Job):
         if result is None:
             raise InputError("select a layer of the result to repeat")
         provenance = result.content.provenance
+        names = () if provenance is None else [origin.file for origin in provenance.images]
         paths = [about.metadata_of(each).get("path") or each.source.path for each in viewer.layers]
-        by_name = {Path(path).name: Path(path) for path in paths if path}
-        origins = () if provenance is None else provenance.images
-        images = [by_name[origin.file] for origin in origins if origin.file in by_name]
-        measured = [origin.source.file for origin in origins if origin.source is not None]
-        files = [Path(layer.source.path)] if layer.source.path else images
-        return cls(
-            result,
-            images if images and len(images) == len(origins) else None,
-            by_name.get(measured[0]) if measured else None,
-            files[0].parent if files else Path(),
-            about.frame_of(layer),
-            f"{name_of_result(layer)} repeated",
-        )
+        opened = [path for path in paths if path and Path(path).name in names]
+        folder = Path(next(iter(opened), layer.source.path or "")).parent
+        return cls(result, folder, about.frame_of(layer), f"{name_of_result(layer)} repeated")
 
     def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> Rerun:  # type: ignore[override]
-        inputs = collect_rerun(
-            self.result.content, self.images, source=self.source, folder=self.folder
-        )
+        inputs = collect_rerun(self.result.content, folder=self.folder)
         return inputs.run(on_progress, should_stop)
 
     def add_to(self, viewer: Any, again: Rerun) -> None:
