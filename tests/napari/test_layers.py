@@ -34,7 +34,7 @@ def test_all_of_a_result_is_there_on_request(viewer, solved, proton_setup):
     layers = by_role(add_to_viewer(viewer, solved, proton_setup, name="shot 7", all_layers=True))
     assert list(layers) == [
         "image", "reprojection", "residual", "potential", "field y", "field x",
-        "direction", "field", "caustic", "field arrows", "arrows", "sites",
+        "direction", "field", "caustic", "arrows", "sites",
     ]  # fmt: skip
     assert {role for role, layer in layers.items() if layer.visible} == {"field", "arrows"}
     assert all(layer.name.endswith(" – shot 7") for layer in viewer.layers)
@@ -264,7 +264,7 @@ def test_a_file_of_the_command_shows_all_of_a_fit(viewer, two_fields, tmp_path, 
     layers = more(viewer, layers)
     in_each = ["potential", "field y", "field x", "direction", "field", "uncertainty", "arrows"]
     in_each += ["significance"]
-    of_fields = ["field arrows", *(f"{role}{part}" for role in in_each for part in ("", " E"))]
+    of_fields = [f"{role}{part}" for role in in_each for part in ("", " E")]
     of_images = ["reprojection", "residual"]
     assert set(layers) == {*of_fields, *of_images, "image 1", "image 2"}
     assert {slot for slot, layer in layers.items() if layer.visible} == {"field", "arrows"}

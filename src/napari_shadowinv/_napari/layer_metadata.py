@@ -193,7 +193,6 @@ KINDS = (
     ),
     Kind("significance", "significance", "|d|/σ", "1", "significance", shown_of="shot"),
     Kind("caustic", "caustic", "caustics", type="labels", main=True),
-    Kind("field arrows", "displacement", "{arrows}", type="vectors", shown_of="shot"),
     Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
     Kind("sites", "sites", "sites{share}", colormap="field", type="points", shown_of="shot"),
 )

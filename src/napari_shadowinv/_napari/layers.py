@@ -45,7 +45,7 @@ LayerData = list[FullLayerData]
 Limits = tuple[float, float]
 
 _CAUSTIC_COLOUR = "#5dff5d"
-_ARROW_COLOURS = {"arrows": "#00c8ff", "field arrows": "#ffffff"}
+_ARROW_COLOUR = "#00c8ff"
 
 _FIELD_VARIABLES = ("displacement", "potential")
 _MASKED_VARIABLES = (
@@ -103,8 +103,8 @@ def add_to_viewer(
     name : str
         Name of the shot; the layers' names end with it.
     all_layers : bool
-        Also add the hidden layers: image, source, re-projection, potential, components, field
-        arrows and sites.
+        Also add the hidden layers: image, source, re-projection, potential, components, direction
+        and sites.
     **keywords
         ``scale``, ``translate``, ``units`` (in axis order y, x): placement of the image in the
         world instead of the setup's, such as the placement of the layer it was cropped from.
@@ -306,9 +306,7 @@ def pack_layers(
             look: dict[str, Any] = {"colormap": label_colours("#5dff5d", "#00c8ff"), "opacity": 0.5}
         else:
             data = getattr(doses, kind.variable)
-            limits = [
-                film_limits(film, used) for film, used in zip(data, doses.usable, strict=True)
-            ]
+            limits = list(map(film_limits, data, doses.usable))
             more |= {"limits": limits, "plane": plane}
             look = {"contrast_limits": limits[plane]}
         layers.append(kind.layer(data, name, frame, doses.setup, look, stack_axis="layer", **more))
@@ -352,8 +350,6 @@ class View:
         excluded = "stack" if self.shot is None else "shot"
         if kind.shown_of == excluded or not self.along_shots(kind.variable):
             return False
-        if kind.role == "field arrows":
-            return bool(self.field.arrows)
         return kind.role != "source" or bool(np.ptp(self.plane("source")))
 
     def along_shots(self, variable: str) -> bool:
@@ -494,23 +490,20 @@ def label_colours(*colours: str) -> Any:
 
 def _arrows(view: View, kind: Kind) -> Content:
     """Return arrows on a grid, few enough to be distinguishable."""
-    is_field = kind.role == "field arrows"
-    vectors = view.field.vectors if is_field else view.plane("displacement")
-    data, spacing = sample_arrows(np.nan_to_num(vectors))
+    data, spacing = sample_arrows(np.nan_to_num(view.plane("displacement")))
     lengths = np.hypot(*data[:, 1].T)
     # Most arrows stay within their cell of the grid; the longest cross two cells at most.
     typical_length = max(np.percentile(lengths, 95), 0.5 * lengths.max()) if len(lengths) else 0.0
     look = {
-        "features": {"field" if is_field else "displacement": lengths},
+        "features": {"displacement": lengths},
         "vector_style": "arrow",
-        "edge_color": _ARROW_COLOURS[kind.role],
+        "edge_color": _ARROW_COLOUR,
         "edge_width": spacing / 9,
         # The data keep their unit; only the drawing is scaled.
         "length": float(0.95 * spacing / typical_length) if typical_length else 1.0,
         "opacity": 0.75,
     }
-    words = {"unit": view.field.unit, "arrows": view.field.arrows} if is_field else {}
-    return data if view.shot is None else arrows_in_shot(data, view.shot), words, look
+    return data if view.shot is None else arrows_in_shot(data, view.shot), {}, look
 
 
 def sample_arrows(field: FloatArray) -> tuple[FloatArray, float]:

@@ -126,7 +126,6 @@ class MainField:
     title: str
     symbol: str
     components: tuple[str, str]  # symbols along y and x
-    arrows: str = ""  # title of its own arrows; empty where they would point along the displacement
 
 
 @dataclass(frozen=True)

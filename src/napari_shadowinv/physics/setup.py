@@ -117,13 +117,11 @@ class ProtonSetup(BeamSetup):
             for symbol, unit, kind in (("b", "T m", "magnetic"), ("e", "V", "electric"))
         ),
     )
-    # A magnetic field is at right angles to the displacement: it has arrows of its own.
     main_field: ClassVar = MainField(
         "path_integrated_b",
         "Path-integrated field",
         "|∫B×dz|",
         ("∫By dz", "∫Bx dz"),
-        arrows="∫B dz arrows",
     )
     other_fields: ClassVar = {
         "electric field": MainField(

@@ -146,7 +146,6 @@ class ShownField:
     symbol: str
     unit: str
     components: tuple[str, str]  # their symbols
-    arrows: str = ""  # title of its arrows; empty where they would point along the displacement
 
     @property
     def magnitude(self) -> FloatArray:
@@ -220,7 +219,7 @@ def shown_fields(
     factor, prefix = prefix_for(max(float(np.nanmax(np.hypot(*field))) for field in fields))
     unit = prefix + unit.replace(" ", "·")
     return [
-        ShownField(field * factor, main.title, main.symbol, unit, main.components, main.arrows)
+        ShownField(field * factor, main.title, main.symbol, unit, main.components)
         for field in fields
     ]
 

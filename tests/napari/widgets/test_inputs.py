@@ -1,5 +1,6 @@
 """What a run is made of, layers, sources and masks, and what is said of it."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -257,16 +258,18 @@ def boxes(tool):
     return tool.image.layer.name, tool.source.kind if source is None else source.name
 
 
-@pytest.mark.parametrize("window_first", [True, False])
-@pytest.mark.parametrize("beam_first", [True, False])
-@pytest.mark.parametrize(
-    ("shot", "beam"),
-    [
-        ("tim_0034", "beam"), ("b", "a"), ("shot_012", "shot_013"), ("x-ray", "x-ray_ref"),
-        ("img12", "ReferenceImage"), ("Image", "Image [1]"), ("refraction", "BG_1"),
-        ("s7", "flat-field"), ("2026-05-01", "2026-05-01 blank"), ("p", "backgrounds"),
-    ],
-)  # fmt: skip
+PAIRS = [
+    ("tim_0034", "beam"), ("b", "a"), ("shot_012", "shot_013"), ("x-ray", "x-ray_ref"),
+    ("img12", "ReferenceImage"), ("Image", "Image [1]"), ("refraction", "BG_1"),
+    ("s7", "flat-field"), ("2026-05-01", "2026-05-01 blank"), ("p", "backgrounds"),
+]  # fmt: skip
+ORDERS = list(itertools.product((True, False), repeat=2))
+# By name, by structure alone and in a series in all orders; the other names in one of them.
+CASES = [(*pair, *order) for pair in PAIRS[:3] for order in ORDERS]
+CASES += [(*pair, *ORDERS[number % 4]) for number, pair in enumerate(PAIRS[3:])]
+
+
+@pytest.mark.parametrize(("shot", "beam", "beam_first", "window_first"), CASES)
 def test_a_pair_fills_both_boxes(viewer, opened, shot, beam, beam_first, window_first):
     tool = opened(Invert) if window_first else None
     images = {shot: OBJECT, beam: BEAM}

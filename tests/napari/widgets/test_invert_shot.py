@@ -340,8 +340,7 @@ def test_more_layers_adds_those_that_are_missing(tool, viewer, run, rest, proton
     rest(tool)
     added = {role_of(layer) for layer in viewer.layers} - set(few)
     assert added == {
-        "image", "reprojection", "potential", "field y", "field x", "direction", "field arrows",
-        "sites",
+        "image", "reprojection", "potential", "field y", "field x", "direction", "sites"
     }  # fmt: skip
     visible = {role_of(layer) for layer in viewer.layers if layer.visible}
     assert visible == {None, "field", "arrows"}
