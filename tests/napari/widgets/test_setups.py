@@ -214,19 +214,13 @@ def test_an_error_calls_the_fields_of_a_setup_by_their_labels():
     assert (type(sent), str(sent)) == (InputError, str(caught.value))
 
 
-@pytest.mark.parametrize("is_by_us", [True, False])
-def test_sizes_in_the_file_complete_a_setup(tmp_path, picker, is_by_us):
-    """Napari itself knows nothing of them."""
+def test_sizes_in_the_file_complete_a_setup(tmp_path, picker):
     path = tmp_path / "shot.h5"
     save_pradformat(path, np.ones((8, 9)), pixel_width=2.5e-05, object_image_dist=0.1)
     geometry = read_shot(path).metadata["geometry"]
     assert geometry["detector_pixel_size"] == 2.5e-5
-    layer = Image(np.ones((8, 9)), name="shot")
-    if is_by_us:
-        layer.metadata["napari-shadowinv"] = {"file": {"geometry": geometry}}
-    else:
-        layer._source = layer.source.model_copy(update={"path": str(path)})
-    picker.follow(layer)
+    metadata = metadata_for("shot", "", file={"geometry": geometry})
+    picker.follow(Image(np.ones((8, 9)), name="shot", metadata=metadata))
     # A setup file needs not repeat it, and is not overruled.
     entries = {"kind": "proton", "energy": 14.7, "source_object_distance": 0.01}
     picker.load(entries, "setup.toml")

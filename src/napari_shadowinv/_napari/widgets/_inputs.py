@@ -26,7 +26,7 @@ from napari_shadowinv._napari.widgets._layers import LAYER
 from napari_shadowinv._napari.widgets._panels import ResultView, ToolPanel, place_together
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io import read_shot, read_toml
+from napari_shadowinv.io import read_toml
 from napari_shadowinv.options import (
     ASSUMED_BEAM,
     BEAM_SOURCES,
@@ -280,14 +280,8 @@ class SetupPicker(forms.ModelPicker):
         self.warning_label.show_text("\n".join(caution.text for caution in cautions))
 
     def _file_geometry(self) -> dict[str, Any]:
-        """Return the part of a setup in the image's file, also of an image that napari opened."""
-        if self._layer is None:
-            return {}
-        metadata = about.metadata_of(self._layer).get("file")
-        path = self._layer.source.path
-        if metadata is None and path is not None and self._layer.ndim == 2:
-            with suppress(InputError, OSError):
-                metadata = read_shot(path).metadata
+        """Return the part of a setup in the image's file."""
+        metadata = {} if self._layer is None else about.metadata_of(self._layer).get("file")
         return dict((metadata or {}).get("geometry", {}))
 
     @qt.notify_errors
