@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.shifted_pair import shifted_pair
-from napari_shadowinv import InputError, InversionOptions, add_to_viewer, invert
+from napari_shadowinv import InputError, invert
 from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
@@ -94,30 +94,12 @@ def test_a_wrong_layer_is_one_sentence(viewer, shot):
         points: "'Points' is of type Points: select a grey image",
         colours: "'colours' is a colour image: select a grey image",
     }
-    inversion = {
-        None: "no layer is selected: select a layer of an inversion",
-        add_shot(viewer, shot): "'shot' shows no result: select a layer of an inversion",
-    }
-    takes_grey = commands.invert_uniform, commands.high_pass, commands.estimate_source
-    for command, refusals in (*((each, grey) for each in takes_grey), (commands.refine, inversion)):
-        for layer, words in refusals.items():
+    for command in (commands.invert_uniform, commands.high_pass, commands.estimate_source):
+        for layer, words in grey.items():
             with pytest.raises(InputError, match=words):
                 command(layer)
-
-
-def test_an_inversion_is_refined_from_any_of_its_layers(viewer, shot, proton_setup):
-    inversion = invert(shot, options=InversionOptions(n_sites=500))
-    layers = add_to_viewer(viewer, inversion, proton_setup, name="shot", translate=(30.0, 60.0))
-    arrows = next(layer for layer in layers if role_of(layer) == "arrows")
-    by_role = {
-        role_of(entries): (data, entries) for data, entries, _ in commands.refine(arrows, viewer)
-    }
-    data, keywords = by_role["field"]
-    field = proton_setup.path_integrated_b(inversion.displacement)
-    assert data.max() == pytest.approx(1e6 * np.hypot(*field).max(), rel=0.1)
-    assert " – shot refined" in keywords["name"]
-    assert keywords["translate"] == (30.0, 60.0)
-    assert "uncertainty" in by_role
+    with pytest.raises(InputError, match="there is no window: choose this in a menu"):
+        commands.refine(colours, viewer)
 
 
 def outline(viewer, layer, low, high):

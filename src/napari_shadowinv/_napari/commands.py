@@ -81,22 +81,6 @@ def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> results.La
     return main_layers(job.work(lambda _: None, should_stop).layer_data)
 
 
-@viewer_sync.notify_errors(otherwise=list)
-def refine(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> list[napari.types.LayerDataTuple]:
-    """Fit the forward model to the image of the selected inversion, in *Invert*."""
-    if layer is None:
-        raise InputError("no layer is selected: select a layer of an inversion's result")
-    from napari_shadowinv._napari.jobs import name_of_result, refinement
-
-    job = refinement(layer, layer, name_of_result(layer), psf=0.0)
-    if viewer is None or not viewer_sync.in_event_loop():
-        return list(job.work(lambda _: None, lambda: False).layer_data)
-    _open_widget(viewer, "Invert").refine(layer)
-    return []
-
-
 @_in_thread("Removing hot pixels from", about.may_be_source)
 def remove_hot_pixels(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
     """Replace pixels that stand out of the noise by the median of their neighbours."""
@@ -193,6 +177,7 @@ def _opens(title: str, show: Callable[[Any, Any], None]) -> Callable[..., None]:
     return viewer_sync.notify_errors(otherwise=lambda: None)(command)
 
 
+refine = _opens("Invert", lambda tool, layer: tool.refine(layer))
 plot_along_line = _opens("Analyse", lambda tool, layer: tool.plot_layer(layer))
 measure_products = _opens("Analyse", lambda tool, layer: tool.measure_layer(layer))
 predict_image = _opens("Simulate", lambda tool, layer: tool.start_from(layer))
