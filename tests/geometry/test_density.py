@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
-from helpers.polygons import over_pixels, shoelace
+from helpers.polygons import over_pixels
 from napari_shadowinv.geometry.density import Density, walk_edge
 
 
@@ -38,13 +38,6 @@ def test_moments_of_convex_polygons_equal_clipping_every_pixel(seed):
     shifted = moments + 0.5 * mass
     np.testing.assert_allclose(got[1:3], shifted, atol=1e-10)
     np.testing.assert_allclose(got[3], inertia + moments.sum() + 0.5 * mass, atol=1e-9)
-
-
-def test_moments_in_a_uniform_image_equal_the_shoelace_formulae():
-    polygon = convex_polygon(np.random.default_rng(1), (0, 0), (19, 29))
-    area, moments, inertia = shoelace(polygon + 0.5)
-    got = integrate(polygon, Density.from_image(np.ones((20, 30))))
-    np.testing.assert_allclose(got, [area, *moments, inertia], rtol=1e-12)
 
 
 def test_flux_is_the_intensity_times_the_length_in_each_pixel():

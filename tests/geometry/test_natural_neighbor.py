@@ -27,14 +27,6 @@ def test_shares_are_the_areas_taken_from_each_voronoi_cell():
         assert got == pytest.approx(expected, abs=1e-10)
 
 
-def test_planes_are_met_exactly():
-    sites = np.random.default_rng(1).random((400, 2)) * 10
-    queries = np.random.default_rng(2).random((300, 2)) * 6 + 2
-    np.testing.assert_allclose(
-        natural_neighbor(RegularTriangulation(sites), sites, queries), queries, atol=1e-11
-    )
-
-
 def test_values_are_met_at_the_sites_and_in_the_middle_of_a_grid():
     y, x = np.mgrid[0:5.0, 0:5.0]
     sites = np.column_stack([y.ravel(), x.ravel()])
