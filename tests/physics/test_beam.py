@@ -84,13 +84,6 @@ def test_lengths_and_energies_get_the_prefix_of_their_size() -> None:
     assert text_in_unit(1.65e25, "m⁻³") == "1.65e+25 m⁻³"
 
 
-def test_wavelength_and_collimated_beam_are_read_from_text() -> None:
-    light = {"wavelength": "532 nm", "object_image_distance": "0.3", "pixel_size": "12 µm"}
-    setup = OpticalSetup(**light, source_object_distance="inf")
-    assert (setup.wavelength, setup.object_image_distance) == (532e-9, 0.3)
-    assert math.isinf(setup.source_object_distance)
-
-
 @pytest.mark.parametrize(
     ("field", "text", "says"),
     [

@@ -12,8 +12,7 @@ from shapely import LinearRing, Polygon, box
 from helpers.toroid import toroid_displacement, toroid_image
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
-from napari_shadowinv.physics.phantoms import ellipse_pair, toroid
-from napari_shadowinv.physics.setup import ProtonSetup
+from napari_shadowinv.physics.phantoms import ellipse_pair
 
 Array = NDArray[np.float64]
 
@@ -32,11 +31,6 @@ def random_source(shape: tuple[int, int]) -> Array:
     return np.random.default_rng(1).uniform(0, 3, shape)
 
 
-def test_no_displacement_returns_the_source() -> None:
-    source = random_source((7, 9))
-    np.testing.assert_allclose(synthetic_image(np.zeros((2, 7, 9)), source), source, atol=1e-13)
-
-
 @pytest.mark.parametrize("rays_per_pixel", [1, 4, 7, 16, 25])
 def test_flux_is_conserved_through_folds(rays_per_pixel: int) -> None:
     shape = (60, 80)
@@ -50,25 +44,7 @@ def test_flux_is_conserved_through_folds(rays_per_pixel: int) -> None:
     assert image.sum() == pytest.approx(source.sum(), rel=1e-12)
 
 
-def test_whole_pixel_shift_moves_the_source_exactly() -> None:
-    source = random_source((12, 10))
-    field = np.zeros((2, 12, 10))
-    field[0], field[1] = 3, -2
-    expected = np.zeros_like(source)
-    expected[3:, :-2] = source[:-3, 2:]
-    np.testing.assert_allclose(synthetic_image(field, source), expected, atol=1e-12)
-
-
-def test_half_pixel_shift_shares_each_pixel_between_two() -> None:
-    source = random_source((6, 10))
-    field = np.zeros((2, 6, 10))
-    field[1] = 0.5
-    expected = source / 2
-    expected[:, 1:] += source[:, :-1] / 2
-    np.testing.assert_allclose(synthetic_image(field, source), expected, atol=1e-12)
-
-
-@pytest.mark.parametrize("shift", [(-0.3, -0.45), (0.3, 0.45), (-1.7, 2.2)])
+@pytest.mark.parametrize("shift", [(0, 0), (3, -2), (0, 0.5), (-0.3, -0.45), (-1.7, 2.2)])
 def test_any_shift_shares_each_pixel_by_areas(shift: tuple[float, float]) -> None:
     """The image of a shifted pixel overlaps four pixels; the part outside is lost."""
     source = random_source((8, 9))
@@ -82,16 +58,6 @@ def test_any_shift_shares_each_pixel_by_areas(shift: tuple[float, float]) -> Non
             expected, whole_pixels + 1, axis
         )
     np.testing.assert_allclose(synthetic_image(field, source), expected[5:-5, 5:-5], atol=1e-12)
-
-
-def test_rough_fields_lose_no_flux() -> None:
-    source = random_source((60, 60))
-    source[:20] = source[-20:] = 0
-    source[:, :20] = source[:, -20:] = 0
-    field = np.random.default_rng(0).normal(scale=2.0, size=(2, 60, 60))
-    image = synthetic_image(field, source)
-    assert image.min() >= 0
-    assert image.sum() == pytest.approx(source.sum(), rel=1e-12)
 
 
 @pytest.mark.parametrize("roughness", [0.1, 0.6, 3.0])
@@ -121,13 +87,6 @@ def test_each_pixel_gets_the_overlap_of_the_landed_tiles(roughness: float) -> No
     np.testing.assert_allclose(image, expected, atol=1e-9)
 
 
-def test_flux_that_leaves_is_lost() -> None:
-    field = np.full((2, 6, 6), 1e9)
-    assert synthetic_image(field).sum() == 0
-    field[:] = 3.0
-    assert synthetic_image(field).sum() == pytest.approx(9, abs=1e-12)
-
-
 def test_uniform_stretch_thins_the_image_and_ends_sharply() -> None:
     y, x = grid((40, 40))
     field = 0.5 * np.stack([y - 19.5, x - 19.5])
@@ -146,28 +105,6 @@ def test_shear_and_rotation_divide_by_the_determinant() -> None:
     determinant = 1.3 * 1.1 + 0.4 * 0.2
     image = synthetic_image(field, rays_per_pixel=9)
     np.testing.assert_allclose(image[15:35, 15:35], 1 / determinant, rtol=1e-11)
-
-
-def test_point_reflection_turns_the_source_around() -> None:
-    y, x = grid((9, 11))
-    source = random_source((9, 11))
-    field = np.stack([8 - 2 * y, 10 - 2 * x])
-    np.testing.assert_allclose(synthetic_image(field, source), source[::-1, ::-1], atol=1e-11)
-
-
-def test_swapping_axes_swaps_the_image() -> None:
-    field = folding_field((50, 70))
-    source = random_source((50, 70))
-    swapped = synthetic_image(field[::-1].transpose(0, 2, 1), source.T)
-    np.testing.assert_allclose(swapped.T, synthetic_image(field, source), atol=1e-10)
-
-
-def test_image_is_linear_in_the_source() -> None:
-    field = folding_field((40, 40))
-    first_source, second_source = random_source((40, 40)), np.ones((40, 40))
-    together = synthetic_image(field, 2 * first_source + second_source)
-    apart = 2 * synthetic_image(field, first_source) + synthetic_image(field, second_source)
-    np.testing.assert_allclose(together, apart, atol=1e-11)
 
 
 @pytest.mark.parametrize(("rays_per_pixel", "tolerance"), [(16, 0.02), (400, 0.001)])
@@ -190,51 +127,6 @@ def test_everything_on_one_point() -> None:
     image = synthetic_image(np.stack([7.2 - y, 3.1 - x]))
     assert image[7, 3] == pytest.approx(144, rel=1e-9)
     assert image.sum() == pytest.approx(144, rel=1e-12)
-
-
-def test_everything_on_one_line() -> None:
-    y, x = grid((10, 12))
-    image = synthetic_image(np.stack([np.zeros_like(y), 4.2 - x]))
-    np.testing.assert_allclose(image[:, 4], 12, rtol=1e-9)
-    assert image.sum() == pytest.approx(120, rel=1e-12)
-
-
-def exact_toroid_image(peak_displacement: float, sigma: float, size: int) -> Array:
-    """Pixel averages of 1/det for the toroid's map, inverted along the radius."""
-    nodes, weights = np.polynomial.legendre.leggauss(5)
-    position = ((np.arange(size) - (size - 1) / 2)[:, None] + nodes / 2).ravel()
-    radius = np.hypot(position[:, None], position[None, :])
-    low, high = np.zeros_like(radius), radius.copy()
-
-    def shape(r: Array) -> Array:
-        return peak_displacement / sigma * np.exp(0.5 - r**2 / (2 * sigma**2))
-
-    for _ in range(45):
-        middle = (low + high) / 2
-        short = middle * (1 + shape(middle)) < radius
-        low, high = np.where(short, middle, low), np.where(short, high, middle)
-    along = 1 + shape(low) * (1 - (low / sigma) ** 2)
-    intensity = 1 / (along * (1 + shape(low)))
-    blocks = intensity.reshape(size, 5, size, 5)
-    average: Array = np.einsum("iajb,a,b->ij", blocks, weights / 2, weights / 2)
-    return average
-
-
-@pytest.mark.parametrize(
-    ("rays_per_pixel", "largest", "typical"), [(4, 3e-3, 3e-4), (16, 6e-4, 6e-5)]
-)
-def test_intensity_is_one_over_the_jacobian(
-    rays_per_pixel: int, largest: float, typical: float
-) -> None:
-    """The paper's toroid at 97 MG µm, intensity between 0.2 and 1.7."""
-    setup = ProtonSetup.example()
-    field = toroid((200, 200), setup, 97, 30e-6).displacement
-    peak = abs(float(setup.displacement_from_path_integrated_b([97.0, 0.0], "MG um")[1]))
-    error = synthetic_image(field, rays_per_pixel=rays_per_pixel) - exact_toroid_image(
-        peak, 20.0, 200
-    )
-    assert np.abs(error).max() < largest
-    assert np.sqrt(np.mean(error**2)) < typical
 
 
 def test_cubic_displacement_is_exact_up_to_the_border() -> None:

@@ -64,12 +64,6 @@ def test_collimated_beam_does_not_magnify(optical: OpticalSetup) -> None:
     assert optical.object_pixel_size == 5e-6
 
 
-def test_magnification_tends_to_one_as_the_source_recedes(proton: ProtonSetup) -> None:
-    far = proton.model_copy(update={"source_object_distance": 1e9})
-    assert not far.is_collimated
-    assert far.magnification == pytest.approx(1, abs=1e-10)
-
-
 def test_detector_pixels_are_smaller_in_the_object_plane(proton: ProtonSetup) -> None:
     on_detector = proton.pixel_size * proton.magnification
     by_detector = ProtonSetup(
@@ -98,13 +92,10 @@ def test_round_trips_of_angle_and_potential(setup: Setup) -> None:
     np.testing.assert_allclose(setup.normalized_potential(setup.potential(values)), values)
 
 
-def test_momentum_of_the_papers_protons(proton: ProtonSetup) -> None:
+def test_momentum_and_velocity_of_the_papers_protons(proton: ProtonSetup) -> None:
     momentum = proton.momentum * LIGHT_SPEED / ELECTRONVOLT / 1e6
     assert momentum == pytest.approx(math.sqrt(14.7**2 + 2 * 14.7 * 938.27209), rel=1e-8)
     assert momentum == pytest.approx(166.74, abs=0.01)
-
-
-def test_velocity_of_the_papers_protons(proton: ProtonSetup) -> None:
     gamma = 1 + 14.7 / 938.27209
     assert proton.velocity / LIGHT_SPEED == pytest.approx(math.sqrt(1 - gamma**-2), rel=1e-8)
 
@@ -117,17 +108,6 @@ def test_momentum_has_classical_and_ultrarelativistic_limits(proton: ProtonSetup
     assert fast.momentum == pytest.approx(1e12 * ELECTRONVOLT / LIGHT_SPEED, rel=1e-6)
     assert fast.velocity == pytest.approx(LIGHT_SPEED, rel=1e-9)
     assert fast.velocity <= LIGHT_SPEED
-
-
-def test_known_uniform_magnetic_field(proton: ProtonSetup) -> None:
-    """1 T over 1 mm along +y bends a proton that flies along +z to -x, by q B L / p."""
-    field = np.zeros((2, 3, 3))
-    field[0] = 1e-3
-    displacement = proton.displacement_from_path_integrated_b(field)
-    angle = proton.deflection_angle(displacement)
-    momentum = 166.74e6 * ELECTRONVOLT / LIGHT_SPEED
-    np.testing.assert_allclose(angle[1], -ELECTRONVOLT * 1e-3 / momentum, rtol=1e-4)
-    np.testing.assert_array_equal(angle[0], 0)
 
 
 def test_magnetic_force_is_velocity_cross_field(proton: ProtonSetup) -> None:
@@ -194,14 +174,6 @@ def test_slow_particles_follow_the_papers_electric_formula() -> None:
     setup = ProtonSetup(**{**PROTON, "energy": 1e-3})
     angle = setup.deflection_angle([1.0, 0.0])[0]
     assert setup.path_integrated_e([1.0, 0.0])[0] == pytest.approx(2 * 1e3 * angle, rel=1e-5)
-
-
-def test_electric_and_magnetic_force_balance(proton: ProtonSetup) -> None:
-    """E = v B: a field that deflects as much as another is v times as large."""
-    displacement = np.array([0.0, 2.0])
-    electric = proton.path_integrated_e(displacement)[1]
-    magnetic = -proton.path_integrated_b(displacement)[0]
-    assert electric / magnetic == pytest.approx(proton.velocity)
 
 
 def test_critical_density_at_810_nm(optical: OpticalSetup) -> None:
