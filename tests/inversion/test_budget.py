@@ -86,8 +86,7 @@ def repeats():
 
 
 # The paper's structures, at strengths at which few rays come near to crossing.
-STRUCTURES = {"four_toroids": 0.25, "cosine_ellipses": 0.5, "focusing_pair": 0.5}
-STRUCTURES |= {"opposite_pair": 0.5}
+STRUCTURES = {"cosine_ellipses": 0.5, "opposite_pair": 0.5}
 
 
 EVERY_IMAGE = [*PHANTOMS, *STRUCTURES, "coaxial_line"]
@@ -140,7 +139,7 @@ def test_noise_is_the_scatter_of_repeats(repeats, every_image, noise):
 
 @pytest.mark.parametrize(
     ("every_image", "noise"),
-    [("focusing", gaussian), ("strong", counting), ("pair", counting)],
+    [("focusing", gaussian), ("strong", counting)],
     indirect=["every_image"],
 )
 def test_noise_at_the_peak_is_the_scatter_there(repeats, every_image, noise):
@@ -163,20 +162,6 @@ def test_parts_of_samples_that_miss_their_total_are_described():
     assert "measure next" not in rows
     assert budget.times(3.0).total.rms == pytest.approx(0.6)
     assert dataclasses.replace(budget, beam=total).times(3.0).beam == pytest.approx((0.6, 0.6))
-
-
-def test_given_noise_is_used_and_scales(image):
-    noise_errors = {
-        name: invert(7 * image, options=InversionOptions(n_sites=600, **choices)).errors.noise.rms
-        for name, choices in {
-            "weak": {"noise_level": 0.07},
-            "strong": {"noise_level": 0.21},
-            "counts": {"units_per_quantum": 0.01},
-        }.items()
-    }
-    assert noise_errors["strong"] == pytest.approx(3 * noise_errors["weak"])
-    # On average a pixel of 7 units scatters by √(0.01 · 7) = 0.26; most are near the mean.
-    assert noise_errors["counts"] == pytest.approx(noise_errors["weak"] * 0.2646 / 0.07, rel=0.25)
 
 
 @pytest.mark.parametrize(
@@ -227,14 +212,6 @@ def test_the_error_by_an_unmeasured_beam_is_that_by_other_beams(each_image):
     assert unchanged.errors.beam.rms > 10 * unchanged.errors.noise.rms
 
 
-def test_a_recorded_beam_has_a_sensitivity_and_no_error(image):
-    recorded = invert(image, source=np.ones(image.shape)).errors
-    assert recorded.beam is None
-    plan = plan_sites(np.ones(image.shape), measured=False)
-    assumed = invert(image, plan=plan).errors
-    assert assumed.beam == pytest.approx(np.multiply(5, recorded.beam_sensitivity), rel=1e-6)
-
-
 def smooth_beam(shape, variation, seed, length=0.25):
     """Return a beam that varies over a share of the shorter side."""
     white = np.random.default_rng(seed).normal(size=[3 * side for side in shape])
@@ -264,8 +241,7 @@ def test_the_total_holds_the_error_by_another_beam(source):
         assert np.sqrt((ratio**2).mean()) == pytest.approx(1, rel=0.4)
 
 
-@pytest.mark.parametrize("side", [64, 96, 128])
-@pytest.mark.parametrize("variation", [0.0, 0.04])
+@pytest.mark.parametrize(("side", "variation"), [(64, 0.04), (96, 0.0), (128, 0.04)])
 def test_the_difference_outside_an_object_is_that_of_the_beams(side, variation):
     blob = phantoms.gaussian_blob((side, side), -0.006 * side**2, 0.1 * side)
     differences = []
@@ -517,14 +493,6 @@ def test_correlated_noise_is_the_scatter_of_repeats(repeats, blur):
     assert np.median(lengths) == pytest.approx(blur, rel=0.3)
 
 
-@pytest.mark.parametrize("blur", [0.7, 1.0])
-def test_the_typical_noise_is_that_of_a_pixel_where_it_is_correlated(blur):
-    noise = gaussian_filter(np.random.default_rng(3).normal(size=(160, 160)), blur, mode="wrap")
-    image = 1 + 0.05 * noise / noise.std()
-    typical = ImageNoise(prepare(image, None, InversionOptions()).in_units()).typical
-    assert typical == pytest.approx(0.05, rel=0.1)
-
-
 def test_stated_counts_are_those_before_a_blur():
     noise = gaussian_filter(np.random.default_rng(3).normal(size=(160, 160)), 1.0, mode="wrap")
     prepared = prepare(1 + 0.05 * noise / noise.std(), None, InversionOptions()).in_units()
@@ -544,14 +512,6 @@ def test_noise_correlated_over_many_pixels_is_named(blur):
     for image in (white, clean):
         cautions = invert(image, options=options).report.cautions
         assert "correlated-noise" not in [caution.code for caution in cautions]
-
-
-@pytest.mark.parametrize("noise", [gaussian, counting])
-def test_white_noise_is_not_called_correlated(every_image, noise):
-    for seed in range(10):
-        shot = noise(every_image, np.random.default_rng(seed))
-        prepared = prepare(shot, None, InversionOptions(negative="clip")).in_units()
-        assert ImageNoise(prepared).clumping == 1
 
 
 def test_noise_error_does_not_depend_on_the_unit_of_the_image(image):
@@ -698,15 +658,14 @@ def test_a_reference_of_another_exposure_is_assumed_uneven_and_a_given_uniform_o
     assert invert(image, source=np.full((40, 40), 400.0)).errors.beam is None
 
 
-@pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("is_masked", [True, False])
-def test_behind_an_obstacle_is_in_no_total_and_its_edge_in_the_peak(seed, is_masked):
+def test_behind_an_obstacle_is_in_no_total_and_its_edge_in_the_peak(is_masked):
     setup = ProtonSetup.example()
     phantom, behind = phantoms.coaxial_line((200, 200), setup)
     source = np.where(behind, 0.0, 400.0)
     expected = synthetic_image(phantom.displacement, source)
     mask = (source > 0) | (expected > 0) if is_masked else None
-    image = np.random.default_rng(seed).poisson(expected).astype(float)
+    image = np.random.default_rng(1).poisson(expected).astype(float)
     exact = {"beam_rms": 0, "registration": 0}
     inversion = invert(image, source=source, mask=mask, instrument=exact)
     np.testing.assert_array_equal(inversion.lit, inversion.mask & ~behind)

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, shift, zoom
+from scipy.ndimage import gaussian_filter, shift
 
 from napari_shadowinv import InputError, Instrument, InversionOptions, OpticalSetup, invert
-from napari_shadowinv.instrument.effects import EFFECTS
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
@@ -138,39 +137,15 @@ def test_the_effect_of_an_absorbing_object_is_that_of_smooth_transmissions():
     assert effect.rms == pytest.approx(np.sqrt(np.mean(np.square(changes))), rel=0.35)
 
 
-def test_an_exact_instrument_changes_nothing():
-    image = lens(0.006)
-    source = np.ones(image.shape)
-    plain = invert(image, source=source, options=OPTIONS)
-    exact = invert(image, source=source, options=OPTIONS, instrument=Instrument())
-    np.testing.assert_array_equal(plain.displacement, exact.displacement)
-    assert plain.errors == exact.errors
-    assert set(plain.errors.effects) == {"solver"}
-
-
 def test_a_stated_instrument_changes_the_errors_alone():
     image = lens(0.006)
     plain = invert(image, options=OPTIONS)
+    exact = invert(image, options=OPTIONS, instrument=Instrument())
+    assert plain.errors == exact.errors
+    assert set(plain.errors.effects) == {"solver"}
     stated = invert(image, options=OPTIONS, instrument={"background": 0.1, "beam_rms": 0.02})
     np.testing.assert_array_equal(plain.displacement, stated.displacement)
     assert plain.errors.total.rms > stated.errors.total.rms  # the beam was assumed with 5 %
-
-
-def test_errors_are_proportional_to_what_is_stated():
-    image = lens(0.006)
-    source = uneven_source()
-    for each in EFFECTS:
-        if each.is_even:  # grows with the square
-            continue
-        small, large = (
-            invert(image, source=source, options=OPTIONS, instrument={each.key: size})
-            for size in (0.01, 0.03)
-        )
-        effects = [
-            next(e for name, e in result.errors.effects.items() if name.startswith(each.key))
-            for result in (small, large)
-        ]
-        np.testing.assert_allclose(effects[1], 3 * np.array(effects[0]), rtol=1e-9)
 
 
 def test_every_budget_states_the_sensitivities():
@@ -225,20 +200,6 @@ def test_masked_pixels_have_no_background():
     assert stated.errors.effects["background, 5 %"].rms == pytest.approx(
         rms(change) / np.sqrt(mask.mean()), rel=0.15
     )
-
-
-def test_a_larger_image_has_the_same_relative_effects():
-    image = lens(0.006)
-    large = zoom(image, 2, order=3)
-    instrument = Instrument(background=0.05, gamma=0.05)
-    shares = [
-        [e.rms / inversion.errors.rms for e in list(inversion.errors.effects.values())[:2]]
-        for inversion in (
-            invert(each, source=np.ones(each.shape), instrument=instrument)
-            for each in (image, large)
-        )
-    ]
-    np.testing.assert_allclose(shares[0], shares[1], rtol=0.1)
 
 
 @pytest.mark.parametrize(

@@ -89,31 +89,6 @@ def test_the_image_itself_is_refused_as_its_source(scale):
         invert(shot, plan=plan)
 
 
-@pytest.mark.parametrize(
-    ("turn", "turn_vectors"),
-    [
-        (lambda a: a[::-1], lambda d: d[:, ::-1] * np.array([-1, 1])[:, None, None]),
-        (lambda a: a[:, ::-1], lambda d: d[:, :, ::-1] * np.array([1, -1])[:, None, None]),
-        (np.transpose, lambda d: d[::-1].transpose(0, 2, 1)),
-    ],
-    ids=["flip y", "flip x", "transpose"],
-)
-def test_flips_and_transpose_commute_with_the_inversion(image, turn, turn_vectors):
-    """The sites differ, so fields agree to the discretisation, not to rounding."""
-    straight = invert(image)
-    turned = invert(turn(image))
-    assert relative_error(turned.displacement, turn_vectors(straight.displacement)) < 0.012
-
-
-def test_translation_moves_the_field_by_as_much():
-    blob = {"amplitude": 40.0, "sigma": (6.0, 8.0)}
-    unmoved = gaussian_blob((70, 80), center=(30.0, 35.0), **blob)
-    moved = gaussian_blob((70, 80), center=(35.0, 42.0), **blob)
-    first = invert(synthetic_image(unmoved.displacement)).displacement
-    second = invert(synthetic_image(moved.displacement)).displacement
-    assert relative_error(second[:, 5:, 7:], first[:, :-5, :-7]) < 0.012
-
-
 def test_displacement_is_minus_the_gradient_of_the_potential(image):
     inversion = invert(image)
     gradient = np.array(np.gradient(inversion.potential))
@@ -434,7 +409,6 @@ def test_bad_input_is_one_clear_sentence(given, says):
         # In eight realisations, noise raises this low peak by 2.1 to 5.5 %.
         (noisy_toroid_image, 24, 6, 12),
         (toroid_image, 97, 0.3, 0.3),
-        (noisy_toroid_image, 97, 3, 4),
         (toroid_image, 194, 0.5, 1.6),
         (noisy_toroid_image, 194, 1, 2.6),
     ],
@@ -475,9 +449,9 @@ def _lens(shape=(48, 60)):
     return 1 + 2 * np.exp(-(((y - 20) / 6) ** 2) - ((x - 33) / 8) ** 2)
 
 
-@pytest.mark.parametrize("boundary", ["closed", "free"])
 @pytest.mark.parametrize(
-    ("of_image", "of_source"), [(1e300, 1), (1e-300, 1), (1, 1e300), (7, 1e-300)]
+    ("boundary", "of_image", "of_source"),
+    [("closed", 1e300, 1), ("free", 1e-300, 1), ("free", 1, 1e300), ("closed", 7, 1e-300)],
 )
 def test_units_of_image_and_source_change_nothing(boundary, of_image, of_source):
     options = InversionOptions(boundary=boundary)
