@@ -10,7 +10,6 @@ import pytest
 
 from helpers.exact_fields import SETUP, field_of
 from napari_shadowinv.analysis import (
-    FIELD_UNITS,
     EnclosedCurrent,
     Flux,
     LineProfile,
@@ -81,15 +80,6 @@ def test_a_saved_inversion_has_the_same_bands(inversion: Inversion):
     np.testing.assert_array_equal(before["magnitude"].samples, of_file["magnitude"].samples)
 
 
-def test_bands_follow_the_stated_noise(inversion: Inversion):
-    def spread(level: float) -> float:
-        options = inversion.options.model_copy(update={"noise_level": level})
-        (result,) = analyse(replace(inversion, options=options), LINE, samples=40)
-        return float(result["normal"].std.mean())
-
-    assert spread(80.0) > 2 * spread(20.0)
-
-
 def test_discretisation_and_instrument_are_among_the_causes(inversion: Inversion):
     instrument = inversion.instrument.model_copy(update={"background": 0.05, "energy": 0.1})
     (result,) = analyse(
@@ -99,15 +89,6 @@ def test_discretisation_and_instrument_are_among_the_causes(inversion: Inversion
     assert {"background, 5 %", "discretisation", "energy, 10 %"} <= set(result.causes)
     # ∫B dz is proportional to the momentum, which is to the root of the energy.
     assert result["current"].std / abs(result["current"].value) > 0.045
-
-
-def test_results_do_not_depend_on_threads(inversion: Inversion):
-    options = inversion.options.model_copy(update={"threads": 1})
-    first, second = (
-        analyse(each, LINE, samples=20)[0]
-        for each in (inversion, replace(inversion, options=options))
-    )
-    np.testing.assert_array_equal(first["along"].samples, second["along"].samples)
 
 
 def test_products_together_are_those_alone(inversion: Inversion):
@@ -140,13 +121,6 @@ def test_a_fit_has_the_bands_of_its_samples(fitted: Fit):
     assert "3 samples" in str(flux.facts)
     with pytest.raises(InputError, match="'E'"):
         analyse(fitted, LINE, deflector="E")
-
-
-def test_a_fit_without_samples_has_no_bands(fitted: Fit):
-    (field,) = fitted.fields
-    bare = replace(fitted, fields=(replace(field, samples=None),))
-    (flux,) = analyse(bare, Flux(path=[(10, 10), (10, 30)]))
-    assert not flux.has_bands
 
 
 @pytest.mark.parametrize(
@@ -318,14 +292,6 @@ def test_text_describes_the_same_products():
     assert product_from_text("profile 31.5,10 31.5,53 width=3") == LINE
     corners = product_from_text("region rectangle=1,2 3,4")
     assert corners == Region(rectangle=((1, 2), (3, 4)))
-
-
-def test_each_unit_belongs_to_one_field():
-    fields = {unit.field for unit in FIELD_UNITS.values()}
-    for field in fields:
-        sizes = [unit.size for unit in FIELD_UNITS.values() if unit.field == field]
-        assert sizes[0] == 1  # the SI unit is first
-        assert len(fields) == 6
 
 
 def test_masked_pixels_under_a_line_are_reported(ring: Phantom):

@@ -72,18 +72,6 @@ def test_operator_agrees_with_pyabel():
     np.testing.assert_allclose(from_deflection, theirs, atol=2e-3)
 
 
-def test_covariance_is_that_of_many_noisy_profiles():
-    matrix = deflection_matrix(40)
-    inverse = inverse_matrix(matrix, 10.0)
-    place = np.arange(40)
-    covariance = 0.01 * np.exp(-abs(place[:, None] - place) / 5)
-    rng = np.random.default_rng(0)
-    noise = rng.multivariate_normal(np.zeros(40), covariance, 4000)
-    scatter = np.cov(noise @ inverse.T, rowvar=False)
-    expected = inverse @ covariance @ inverse.T
-    np.testing.assert_allclose(np.diag(scatter), np.diag(expected), rtol=0.15)
-
-
 def test_smoothing_grows_with_noise():
     rng = np.random.default_rng(1)
     matrix = deflection_matrix(60)

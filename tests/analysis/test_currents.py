@@ -19,7 +19,7 @@ from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.result import RetrievedField
-from napari_shadowinv.physics.phantoms import Phantom, gaussian_blob, toroid
+from napari_shadowinv.physics.phantoms import gaussian_blob, toroid
 
 PIXEL = SETUP.object_pixel_size
 
@@ -95,47 +95,10 @@ def test_fluxes_of_joined_lines_add_up(exact: RetrievedField):
     assert number(exact, Flux(path=[c, a])) == pytest.approx(-sum(parts))
 
 
-def test_currents_of_halves_add_up(exact: RetrievedField):
-    whole = number(exact, EnclosedCurrent(rectangle=((20, 25), (70, 65))))
-    left = number(exact, EnclosedCurrent(rectangle=((20, 25), (70, 40))))
-    right = number(exact, EnclosedCurrent(path=[(20, 40), (70, 40), (70, 65), (20, 65)]))
-    assert left + right == pytest.approx(whole, rel=1e-4)
-
-
 def test_current_does_not_depend_on_the_sense_of_its_outline(exact: RetrievedField):
     corners = [(20.0, 25.0), (22.0, 70.0), (75.0, 60.0), (60.0, 30.0)]
     first, second = (number(exact, EnclosedCurrent(path=c)) for c in (corners, corners[::-1]))
     assert first == pytest.approx(second)
-
-
-@pytest.mark.parametrize("turns", [1, 2, 3])
-def test_current_turns_with_its_field(turns: int, ellipses: Phantom):
-    def turned(point: tuple[float, float]) -> tuple[float, float]:
-        """Turn a point as `np.rot90` turns the image."""
-        y, x = point
-        height, width = ellipses.potential.shape
-        for _ in range(turns):
-            y, x, height, width = width - 1 - x, y, width, height
-        return y, x
-
-    down, right = (np.rot90(plane, turns) for plane in ellipses.displacement)
-    for _ in range(turns):
-        down, right = -right, down
-    field = field_of(Phantom(np.rot90(ellipses.potential, turns), np.stack([down, right])))
-    corners = [(20.0, 25.0), (22.0, 70.0), (75.0, 60.0)]
-    before = number(field_of(ellipses), EnclosedCurrent(path=corners))
-    after = number(field, EnclosedCurrent(path=[turned(corner) for corner in corners]))
-    assert after == pytest.approx(before)
-
-
-def test_current_keeps_its_sign_in_a_mirror(ellipses: Phantom):
-    # B is mirrored as an axial vector: ∫j_z dz stays, as the deflection is mirrored like a vector.
-    down, right = ellipses.displacement[:, :, ::-1]
-    field = field_of(Phantom(ellipses.potential[:, ::-1], np.stack([down, -right])))
-    circle = {"center": (40.0, 45.0), "radius": 20.0}
-    before = number(field_of(ellipses), EnclosedCurrent(**circle))
-    mirrored = {"center": (40.0, 109.0 - 45.0), "radius": 20.0}
-    assert number(field, EnclosedCurrent(**mirrored)) == pytest.approx(before)
 
 
 def test_flux_across_a_closed_line_is_refused(exact: RetrievedField):

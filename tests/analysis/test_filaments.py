@@ -164,11 +164,6 @@ def test_autocorrelation_ignores_masked_pixels():
     assert correlation[middle[0] + 10, middle[1]] == pytest.approx(-1.0, abs=0.06)
 
 
-def test_structure_larger_than_the_image_is_warned_of():
-    product = measured(*filaments([(0.0, 0.0)], 0.0, 300.0, 1e5), angle=0)
-    assert np.isnan(product["radius"].value) or in_pixels(product, "radius") > 30
-
-
 def test_filaments_of_no_field_are_refused():
     with pytest.raises(InputError, match="zero everywhere"):
         measured(np.zeros((SIDE, SIDE)), np.zeros((2, SIDE, SIDE)))

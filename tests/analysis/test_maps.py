@@ -119,15 +119,6 @@ def test_chosen_width_is_nearly_the_best(noise: float):
     assert error(width) < 1.15 * best
 
 
-def test_more_noise_asks_for_a_wider_smoothing():
-    y, x = offsets(96)
-    truth = np.exp(-(y**2 + x**2) / (2 * 9.0**2))
-    draws = np.random.default_rng(3).normal(size=(4, 96, 96))
-    widths = [chosen_width(truth + s * draws[0], s * draws[1:], 1.0) for s in (0.01, 0.1, 1.0)]
-    assert widths == sorted(widths)
-    assert widths[0] < widths[-1]
-
-
 def test_smoothing_of_an_inversion_follows_its_noise(inversion: Inversion):
     (density,) = analyse(inversion, CurrentDensity(), setup=SETUP, samples=20)
     spacing = (64 * 64 / len(inversion.cells.sites)) ** 0.5

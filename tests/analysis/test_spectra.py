@@ -10,12 +10,11 @@ import pytest
 from helpers.exact_fields import SETUP
 from helpers.turbulence import solenoidal_field
 from napari_shadowinv import OpticalSetup, invert, synthetic_image
-from napari_shadowinv._system.progress import Progress, Reporter
+from napari_shadowinv._system.progress import Progress
 from napari_shadowinv.analysis import TurbulenceSpectrum, analyse
 from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis.power_spectra import (
     fit_exponent,
-    measure_response,
     random_displacement,
     ring_spectrum,
     window_weights,
@@ -231,17 +230,6 @@ def test_masked_pixels_do_not_change_the_slope_much(cubes):
         rings = slice(4, 24)
         slopes.append(fit_exponent(spectrum.k[rings], spectrum.power[rings], spectrum.modes[rings]))
     assert slopes[1] == pytest.approx(slopes[0], abs=0.25)
-
-
-def test_response_is_the_same_for_the_same_seed(shot):
-    inversion, _ = shot
-    weights = window_weights(all_of(96), 0.125)
-    spectrum = ring_spectrum(inversion.potential, weights)
-    first, second = (
-        measure_response(spectrum, weights, 576, phantoms=1, seed=4, report=Reporter()).ratio
-        for _ in range(2)
-    )
-    np.testing.assert_array_equal(first, second)
 
 
 def test_random_fields_report_and_stop_on_request(shot):

@@ -128,20 +128,6 @@ def test_films_see_all_protons_that_reach_them(truth: Truth) -> None:
         assert bare.dose(k)[45, 60] == pytest.approx(all_energies * per_area, rel=3e-3)
 
 
-def test_more_rays_and_energies_give_the_same_doses(
-    truth: Truth, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    options = {"layers": 2, "shape": SHAPE, "seed": 4, "b_peak": 1.5, "e_peak": 1.0}
-    more = simulate(tmp_path / "strata", strata=24, **options)
-    doses = [truth.dose(k) for k in range(2)]
-    monkeypatch.setattr(simulated_pack, "RAYS", 5)
-    finer = replace(truth, scene=replace(truth.scene))
-    more = replace(more, scene=replace(truth.scene))
-    for k, usual in enumerate(doses):
-        np.testing.assert_allclose(finer.dose(k), usual, rtol=2e-3)
-        np.testing.assert_allclose(more.dose(k), usual, rtol=3e-3)
-
-
 def test_a_film_lies_where_its_corners_are(tmp_path: Path) -> None:
     """Its area, its middle and its moments of inertia on the scan are those of the rectangle."""
     options = {"handwriting": False, "notch": False, "noise": False, "protons": 0.0}

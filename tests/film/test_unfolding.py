@@ -223,15 +223,6 @@ def test_fluence_of_a_pixel_grows_with_its_dose_where_a_film_is_bridged(
     np.testing.assert_allclose(fluence / factors, fluence[:, :1] * np.ones(3), rtol=1e-6)
 
 
-def test_twice_the_dose_is_twice_the_fluence(response: ResponseMatrix) -> None:
-    doses = (
-        np.random.default_rng(2).uniform(5, 10, (8, *SHAPE)) * np.arange(9, 1, -1)[:, None, None]
-    )
-    errors = np.full(doses.shape, 0.02)
-    spectra, doubled = unfold(doses, errors, response), unfold(2 * doses, errors, response)
-    np.testing.assert_allclose(doubled.fluence, 2 * spectra.fluence, rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("doses", "message"),
     [
