@@ -128,15 +128,14 @@ def test_strong_rays_first_or_weak_ones_makes_no_difference(
     assert distance(backwards, forwards) < 0.04
 
 
-@pytest.mark.parametrize("noise", ["proportional", "poisson", "pixels"])
+@pytest.mark.parametrize("noise", ["proportional", "pixels"])
 def test_the_drawn_residual_is_as_even_as_the_noise(noise: str) -> None:
     """The variance is 1 in the dark and in the bright half, as far as so many pixels show it."""
     beam = 400 * np.exp(np.linspace(-1.5, 1.5, SIZE[1])) * np.ones(SIZE)  # 20 times as bright
     clean = np.stack(images_of(WEAK, beam=lambda y, x: 400 * np.exp(3 * x / (SIZE[1] - 1) - 1.5)))
     rng = np.random.default_rng(5)
-    deviations = {"proportional": 0.05 * clean, "pixels": 0.01 * clean**1.2}.get(noise)
-    chance = rng.normal(size=clean.shape)
-    images = rng.poisson(clean) if deviations is None else clean + deviations * chance
+    deviations = {"proportional": 0.05 * clean, "pixels": 0.01 * clean**1.2}[noise]
+    images = clean + deviations * rng.normal(size=clean.shape)
     stated: Any = deviations if noise == "pixels" else noise
     result = fit(shots_of(images, strength=STRENGTHS, source=beam, noise=stated), options=PLAIN)
     assert result.noise is not None
@@ -152,22 +151,6 @@ def test_the_drawn_residual_is_as_even_as_the_noise(noise: str) -> None:
 
 def uneven_beam(y: FloatArray, x: FloatArray, share: float = 0.2) -> FloatArray:
     return np.asarray(1 + share * np.cos(y / 15) * np.sin(x / 18))
-
-
-def test_two_energies_tell_an_unknown_beam_from_the_field() -> None:
-    result = fit(
-        shots_of(
-            noisy(images_of(RING_AND_SPOT, beam=uneven_beam), NOISE),
-            strength=STRENGTHS,
-            source="unknown",
-            noise=NOISE,
-        ),
-        options=FitOptions(samples=0, threads=1),
-    )
-    assert distance(result.fields[0].displacement, on_pixels(RING_AND_SPOT, SIZE)) < 0.05
-    assert result.verdict is Verdict.DETERMINED
-    error = result.source / uneven_beam(*np.indices(SIZE).astype(float)) - 1
-    assert np.sqrt((error**2).mean()) < 0.02
 
 
 def test_two_energies_correct_an_assumed_beam() -> None:
@@ -201,15 +184,6 @@ def test_three_energies_tell_a_magnetic_field_from_an_electric_one() -> None:
     assert result.setups == tuple(setups)
 
 
-def test_one_image_tells_a_weak_field() -> None:
-    image = noisy([counted(WEAK, SIZE)], 0.02)[0]
-    result = fit(shots_of(image, noise=0.02), options=PLAIN)
-    assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
-    assert result.verdict is Verdict.DETERMINED
-    assert result.folded == 0
-    assert result.images.shape == (1, *SIZE)
-
-
 def test_one_image_does_not_tell_an_unknown_beam_from_the_field() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
     options = HASTY.model_copy(update={"ambiguous": True})
@@ -231,23 +205,14 @@ def test_an_object_that_has_moved_between_the_images_is_told(
     assert result.chi2[1] > 2
 
 
-@pytest.mark.usefixtures("no_causes")
-def test_energies_that_hardly_differ_tell_no_more_than_one_image() -> None:
-    """Where rays cross over much of the image, that is too little."""
-    strong = bump(3.2, 8, (23, 27))
-    images = [counted(lambda y, x: s * strong(y, x), SIZE) for s in (1, 0.97)]  # noqa: B023
-    result = fit(shots_of(noisy(images, 0.1), strength=[1, 0.97], noise=0.1), options=PLAIN)
-    assert result.folded > 0.15
-    assert result.verdict is Verdict.AMBIGUOUS
-    assert "one image does not show" in result.explanation
-
-
 def test_a_start_at_the_truth_is_taken() -> None:
     image = noisy([counted(WEAK, SIZE)], 0.02)
     y, x = np.indices(SIZE) - np.array([22, 29])[:, None, None]
     truth = 0.4 * 8**2 * np.exp(-(y**2 + x**2) / 2 / 8**2)
     result = fit(Shot(image[0], start=truth, noise=0.02), options=PLAIN)
     assert distance(result.fields[0].displacement, on_pixels(WEAK, SIZE)) < 0.04
+    assert result.verdict is Verdict.DETERMINED
+    assert result.folded == 0
     for wrong in (truth[1:], np.full(SIZE, np.nan)):
         with pytest.raises(InputError, match="start has shape"):
             fit(Shot(image[0], start=wrong, noise=0.02), options=PLAIN)
@@ -305,26 +270,15 @@ def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
 
 
 @pytest.mark.usefixtures("no_causes")
-@pytest.mark.parametrize("column", [0, 60])
-def test_an_object_cut_by_either_end_of_a_filled_side_is_reported(column: int) -> None:
+def test_an_object_cut_by_the_end_of_a_filled_side_is_reported() -> None:
     """61 px are filled to 64, all on the right."""
     size = (40, 61)
-    cut = bump(0.7, 8, (20, column))
+    cut = bump(0.7, 8, (20, 60))
     images = [counted(lambda y, x: s * cut(y, x), size) for s in (1, 0.7)]  # noqa: B023
     options = PLAIN.model_copy(update={"samples": 2})
     result = fit(shots_of(noisy(images, 0.02), strength=[1, 0.7], noise=0.02), options=options)
     assert result.verdict is Verdict.EDGE
     assert "larger field of view" in result.explanation
-
-
-@pytest.mark.usefixtures("no_causes")
-def test_without_samples_the_edge_is_not_computed() -> None:
-    """There is no other error that an error by the edge has to exceed."""
-    cut = bump(0.7, 8, (0, 30))
-    images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
-    result = fit(shots_of(noisy(images, 0.02), strength=[1, 0.7], noise=0.02), options=HASTY)
-    assert result.verdict is not Verdict.EDGE
-    assert result.errors is None
 
 
 def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:
@@ -344,6 +298,8 @@ def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:
     )
     assert result.verdict is Verdict.DETERMINED
     assert distance(result.fields[0].displacement, on_pixels(ring, size)) < 0.02
+    source, shape = result.source[0], beam(*np.indices(size).astype(float))
+    assert (source / source.mean() / shape * shape.mean()).std() < 0.02
 
 
 def test_nothing_is_taken_twice() -> None:

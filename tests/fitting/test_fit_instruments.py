@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from helpers.fit_images import bump, counted, distance, noisy, on_pixels, together
-from napari_shadowinv import synthetic_image
 from napari_shadowinv._system.progress import Progress
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InversionCancelled
@@ -125,17 +124,6 @@ def test_a_shifted_image_is_brought_back(shots: list[FloatArray]) -> None:
 
 
 @pytest.mark.usefixtures("no_causes")
-def test_an_image_is_shifted_no_further_than_it_may_be(shots: list[FloatArray]) -> None:
-    images = noisy([shots[0], shot(1, frame=(1.2, 1, 0, -2.0, 0, 1))], NOISE)
-    options = FitOptions(
-        samples=0, max_iterations=30, spacing=0.25, align="shift", align_spread=1e-3
-    )
-    result = fit(shots_of(images, strength=STRENGTHS, noise=NOISE), options=options)
-    assert np.abs(result.frames[1][[0, 3]]).max() < 0.5
-    assert result.verdict == Verdict.MISFIT
-
-
-@pytest.mark.usefixtures("no_causes")
 def test_a_turned_and_magnified_image_is_brought_back() -> None:
     """Two objects apart tell how one image is turned, which a round one does not."""
     pair = together(bump(3.0, 4.5, (18, 36)), bump(-1.4, 5, (31, 17)))
@@ -187,13 +175,6 @@ def test_answers_to_few_counts_are_compared_by_what_is_expected() -> None:
     assert result.basins[0].objective == pytest.approx(by_deviation.basins[0].objective, rel=0.03)
 
 
-def test_sides_may_be_odd_and_unlike() -> None:
-    size = (47, 61)
-    result = fitted(noisy([shot(0, size), shot(1, size)], NOISE))
-    assert result.fields[0].displacement.shape == (2, *size)
-    assert error(result) < 0.03
-
-
 def test_units_of_the_images_do_not_matter(shots: list[FloatArray]) -> None:
     """Not even by rounding, if one is a power of two of the other."""
     images = noisy(shots, NOISE)
@@ -237,9 +218,9 @@ def test_fiducials_hold_the_field_where_noise_does_not() -> None:
 @pytest.mark.parametrize(
     "instrument", [None, Instrument(beam_rms=0.0, beam_between=0.05)], ids=["exact", "own beams"]
 )
-def test_neither_threads_nor_a_second_time_change_a_bit(
-    shots: list[FloatArray], instrument: Instrument | None
-) -> None:
+def test_neither_threads_nor_a_second_time_change_a_bit(instrument: Instrument | None) -> None:
+    ring = bump(1.5, 4.5, (15, 19))
+    shots = [counted(lambda y, x, a=a: a * ring(y, x), (32, 40)) for a in STRENGTHS]
     images = noisy(shots, NOISE)
     runs = []
     for threads in (1, 3):
@@ -256,20 +237,6 @@ def test_neither_threads_nor_a_second_time_change_a_bit(
     np.testing.assert_array_equal(first.reprojection, second.reprojection)
     assert first.errors.sensitivities == second.errors.sensitivities
     assert first.explanation == second.explanation
-
-
-@pytest.mark.parametrize("after", [1, 20])
-def test_a_fit_ends_at_once_when_asked(shots: list[FloatArray], after: int) -> None:
-    calls = 0
-
-    def should_stop() -> bool:
-        nonlocal calls
-        calls += 1
-        return calls >= after
-
-    with pytest.raises(InversionCancelled):
-        fit(shots_of(noisy(shots, NOISE), strength=STRENGTHS, noise=NOISE), should_stop=should_stop)
-    assert calls == after
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -313,23 +280,3 @@ def test_each_step_is_told_with_its_stage_and_objective() -> None:
     stages = [news.step for news in reports if news.stage == "fit"]  # the bar never goes back
     assert stages == sorted(stages)
     assert set(stages) == {0, 1, 2}
-
-
-def test_a_beam_assumed_uniform_is_fitted_as_an_unknown_one() -> None:
-    """Held in the search, its unevenness would make the field rough, which follows noise."""
-    size, strengths = (64, 64), [1.0, 2.22]
-    ring = bump(2.5, 7, (29, 31))
-    y, x = np.mgrid[-1:1:64j, -1:1:64j]
-    beam = np.exp(0.14 * np.sin(1.9 * x + 0.4) * np.cos(1.4 * y - 0.5) + 0.06 * x)
-    images = [
-        synthetic_image(strength * on_pixels(ring, size), 400 * beam) for strength in strengths
-    ]
-    counts = [np.random.default_rng(k).poisson(image) for k, image in enumerate(images, 5)]
-    options = FitOptions(samples=0, threads=1)
-    assumed, unknown = (
-        fit(shots_of(counts, strength=strengths, source=source, noise="poisson"), options=options)
-        for source in (None, "unknown")
-    )
-    # The smoothness is estimated by random fields: seeds differ by 0.002.
-    np.testing.assert_allclose(assumed.chi2, unknown.chi2, atol=0.02)
-    assert assumed.verdict is unknown.verdict is Verdict.DETERMINED

@@ -181,17 +181,6 @@ def test_the_value_alone_is_that_with_the_gradient(scene: Scene) -> None:
     assert scene.value(unknowns, counts) == scene.value_and_gradient(unknowns, counts)[0]
 
 
-def test_the_hessian_is_symmetric_and_positive(scene: Scene) -> None:
-    unknowns = some(scene)
-    counts = scene.ray_counts(unknowns)
-    first, second = random_like(unknowns, 5), random_like(unknowns, 6)
-    linear = scene.linear(unknowns, counts)
-    of_one, of_other = (hessian_times(linear, way) for way in (first, second))
-    size = np.sqrt(along(first, of_one) * along(second, of_other))
-    assert abs(along(second, of_one) - along(first, of_other)) < 1e-12 * size
-    assert along(first, of_one) > 0
-
-
 @pytest.mark.parametrize("everything", [True, False])
 @pytest.mark.parametrize("threads", [1, 2])
 def test_normal_products_of_sharp_images_are_pulled_pushes(
@@ -247,16 +236,6 @@ def test_an_image_is_made_by_the_sum_of_the_fields_at_its_strengths(scene: Scene
         scene.potentials(unknowns),
         [0.92 * (first + second), 0.536 * first + 0.31 * second],
     )
-
-
-def test_nothing_in_the_way_leaves_the_beams(scene: Scene) -> None:
-    plain = replace(scene, psf=[0.0, 0.0])
-    nothing = plain.nothing()
-    images = plain.model(nothing, plain.ray_counts(nothing))
-    np.testing.assert_allclose(images, plain.beam(nothing), rtol=3e-3)
-    inside = slice(PAD, -PAD)
-    np.testing.assert_array_equal(plain.beam(nothing), plain.beams[:, inside, inside])
-    np.testing.assert_array_equal(nothing.frames, [at_rest()] * 2)
 
 
 def test_gains_and_beam_multiply_the_image(scene: Scene) -> None:

@@ -105,10 +105,9 @@ def test_a_point_spread_wider_than_stated_is_found() -> None:
 
 
 def test_an_instrument_without_numbers_changes_no_bit(assumed: Fit) -> None:
-    for instrument in (None, Instrument(energy=0.05)):
-        other = fitted(shots(), instrument, options=HASTY)
-        np.testing.assert_array_equal(other.fields[0].displacement, assumed.fields[0].displacement)
-        assert (other.verdict, other.total_error) == (assumed.verdict, assumed.total_error)
+    other = fitted(shots(), Instrument(energy=0.05), options=HASTY)
+    np.testing.assert_array_equal(other.fields[0].displacement, assumed.fields[0].displacement)
+    assert (other.verdict, other.total_error) == (assumed.verdict, assumed.total_error)
 
 
 def test_a_detector_of_which_nothing_is_stated_is_in_the_error() -> None:
@@ -158,7 +157,7 @@ def test_the_mean_of_an_inexact_beam_is_not_known(instrument: dict[str, float]) 
 
 def test_errors_have_a_part_for_all_that_is_stated() -> None:
     instrument = Instrument(beam_rms=0.02, beam_length=0.5, beam_between=0.01, background=0.02)
-    result = fitted(shots(), instrument, options=HASTY)
+    result = fitted(shots(), instrument, options=HASTY.model_copy(update={"sampling": "linear"}))
     parts = result.errors.shares
     assert parts.keys() - {"edge"} == {"noise", "beam", "background"}
     assert list(parts.values()) == sorted(parts.values(), reverse=True)
@@ -197,13 +196,6 @@ def test_fitted_samples_are_compared_with_those_to_first_order() -> None:
     assert "use the sampling 'resolve'" in caution.text
     resolved = replace(fits[1], report=replace(skewed, sampling="resolve"))
     assert not any(caution.code == "samples" for caution in resolved.cautions)
-
-
-def test_the_largest_allowed_error_decides_what_is_determined(plain: Fit) -> None:
-    for factor, is_determined in ((1.1, True), (0.9, False)):
-        options = FEW.model_copy(update={"max_error": factor * plain.total_error})
-        result = fitted(shots(), Instrument(**EXACT_BEAM), options=options)
-        assert (result.verdict is Verdict.DETERMINED) == is_determined
 
 
 def test_energy_adds_to_the_errors_of_fields_in_si_units_alone() -> None:

@@ -198,13 +198,6 @@ def test_images_are_in_units_of_their_beams() -> None:
         np.testing.assert_allclose(noise, (0.1, 0.12)[k])
 
 
-def test_without_a_source_the_beam_is_uniform_with_the_mean_of_each_image() -> None:
-    stack = images() * np.array([1, 3])[:, None, None]
-    data = given(images=stack)
-    np.testing.assert_allclose(data.units, stack.mean(axis=(1, 2)))
-    np.testing.assert_allclose(data.scene.beams, 1)
-
-
 def test_pixels_that_fill_up_blocks_and_masked_ones_do_not_count() -> None:
     mask = np.ones(SIZE, bool)
     mask[5, 6:9] = False
@@ -233,14 +226,6 @@ def test_sides_are_filled_to_lengths_with_fast_transforms(side: int, filled: int
 def test_strengths_are_relative_to_the_first_image() -> None:
     data = given(strength=[[2, 4], [1, 3]], fields=("B", "E"))
     np.testing.assert_allclose(data.scene.strengths, [[1, 1], [0.5, 0.75]])
-
-
-def test_counts_vary_by_their_root() -> None:
-    counts = np.random.default_rng(2).poisson(100, (2, *SIZE))
-    data = given(images=counts, noise="poisson")
-    assert data.counted
-    noise = data.units[:, None, None] / np.sqrt(data.scene.weights[:, :, :51])
-    np.testing.assert_allclose(noise, 10, rtol=0.1)
 
 
 def test_noise_that_is_a_share_of_each_pixel() -> None:
@@ -342,11 +327,6 @@ def test_plasma_deflects_light_with_the_square_of_the_wavelength() -> None:
 def test_fields_that_do_not_bend_the_beam_are_refused() -> None:
     with pytest.raises(InputError, match="plasma"):
         strengths_of([protons(3), protons(15)], ("plasma",))
-
-
-def test_one_image_needs_no_setup() -> None:
-    alone = given(images=images(1), strength=None)
-    np.testing.assert_array_equal(alone.scene.strengths, [[1]])
 
 
 def test_a_source_blurs_by_its_size_behind_the_object_and_the_detector_by_its_own() -> None:

@@ -37,37 +37,15 @@ def test_a_quadratic_has_its_minimum_where_the_gradient_vanishes() -> None:
     assert value == pytest.approx(-right @ exact / 2, rel=1e-10)
 
 
-def test_the_identity_is_solved_in_one_step() -> None:
-    goal = np.arange(5.0)
-
-    def objective(point: FloatArray) -> tuple[float, FloatArray]:
-        return float(((point - goal) ** 2).sum() / 2), point - goal
-
-    point, value, steps = minimise(objective, np.zeros(5), iterations=50, least_gain=1e-12)
-    np.testing.assert_allclose(point, goal, atol=1e-12)
-    assert steps == 1
-    assert value == pytest.approx(0, abs=1e-20)
-
-
 def test_a_curved_valley_is_followed_to_its_end() -> None:
+    values: list[float] = []
+    start, told = np.array([-1.2, 1.0]), values.append
     point, value, steps = minimise(
-        rosenbrock, np.array([-1.2, 1.0]), iterations=200, least_gain=1e-15
+        rosenbrock, start, iterations=200, least_gain=1e-15, after_step=told
     )
     np.testing.assert_allclose(point, 1, atol=1e-5)
     assert value < 1e-10
-    assert steps < 80
-
-
-def test_the_value_falls_with_each_step_that_is_told() -> None:
-    values: list[float] = []
-    _, value, steps = minimise(
-        rosenbrock,
-        np.array([-1.2, 1.0]),
-        iterations=200,
-        least_gain=1e-15,
-        after_step=values.append,
-    )
-    assert len(values) == steps
+    assert len(values) == steps < 80
     assert values == sorted(values, reverse=True)
     assert values[-1] == value
 
@@ -78,12 +56,6 @@ def test_it_ends_after_the_most_steps_or_where_little_is_gained() -> None:
     _, value, steps = minimise(rosenbrock, start, iterations=200, least_gain=0.5)
     assert steps < 30
     assert value < rosenbrock(start)[0]
-
-
-def test_a_start_at_the_minimum_stays() -> None:
-    point, value, steps = minimise(rosenbrock, np.ones(2), iterations=10, least_gain=1e-12)
-    np.testing.assert_array_equal(point, 1)
-    assert (value, steps) == (0, 0)
 
 
 def test_conjugate_gradients_solve_what_elimination_solves() -> None:
@@ -186,7 +158,7 @@ import numpy as np
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, solve
 
 rng, modes = np.random.default_rng(11), SoftModes()
-values = np.append(np.geomspace(1e-4, 0.3, 90), rng.uniform(0.6, 2, 20000))
+values = np.append(np.geomspace(1e-4, 0.3, 90), rng.uniform(0.6, 2, 8000))
 for right in rng.normal(size=(3, values.size)):
     options = {"tolerance": 1e-6, "iterations": 2000, "modes": modes}
     solution = solve(lambda v: values * v, right, **options)

@@ -197,27 +197,6 @@ def test_a_solved_sample_explains_its_noise_and_its_force_in_full() -> None:
         assert gain_left(full, full.change) < 0.2 * gain_left(first, first.change)
 
 
-def test_what_is_known_does_not_vary(
-    tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
-) -> None:
-    scene, unknowns, _, _ = tiny
-    sample = Posterior(scene, unknowns, np.random.default_rng(1)).draw_samples(1)[0].change
-    assert not sample.frames[0].any()
-    np.testing.assert_array_equal(sample.frames[1] != 0, scene.free_frames)
-
-
-def test_the_same_seed_draws_the_same_samples(
-    tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
-) -> None:
-    scene, unknowns, _, _ = tiny
-    first, second, third = (
-        Posterior(scene, unknowns, np.random.default_rng(seed)).draw_samples(1)[0].change.flat()
-        for seed in (2, 2, 3)
-    )
-    np.testing.assert_array_equal(first, second)
-    assert (first != third).any()
-
-
 @pytest.mark.parametrize("true", [30.0, 300.0])
 def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
     """A field drawn from the prior, images with noise: λ comes back within a factor of two."""

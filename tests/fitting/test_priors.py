@@ -59,30 +59,6 @@ def places(prior: Prior) -> tuple[FloatArray, FloatArray]:
     return tuple(np.meshgrid(y, x, indexing="ij"))  # type: ignore[return-value]
 
 
-def test_the_slope_is_that_of_the_value(prior: Prior) -> None:
-    point, change = random(prior, 0), random(prior, 1)
-    _, slope = prior.value_and_slope(point)
-    step = 1e-4
-    ahead, behind = (prior.value_and_slope(point.plus(change, s))[0] for s in (step, -step))
-    assert along(slope, change) == pytest.approx((ahead - behind) / 2 / step, rel=1e-6)
-
-
-def test_times_is_the_change_of_the_slope(prior: Prior) -> None:
-    point, change = random(prior, 2), random(prior, 3)
-    _, before = prior.value_and_slope(point)
-    _, after = prior.value_and_slope(point.plus(change))
-    np.testing.assert_allclose(
-        prior.times(change).flat(), after.flat() - before.flat(), rtol=1e-9, atol=1e-8
-    )
-
-
-def test_the_hessian_is_symmetric(prior: Prior) -> None:
-    first, second = random(prior, 4), random(prior, 5)
-    forth, back = along(second, prior.times(first)), along(first, prior.times(second))
-    assert forth == pytest.approx(back, rel=1e-11)
-    assert along(first, prior.times(first)) > 0
-
-
 def test_random_slopes_have_the_hessian_as_covariance(prior: Prior) -> None:
     """Along any way v, v·slope is normal with the variance v·Hv: mean square to 3 / √draws."""
     like, rng = nothing(prior), np.random.default_rng(6)
@@ -104,12 +80,6 @@ def test_random_slopes_have_the_hessian_as_covariance(prior: Prior) -> None:
     mixed = along(ways[0], prior.times(ways[2])) / np.sqrt(variances[0] * variances[2])
     covariance = (table[:, 0] * table[:, 2]).mean() / np.sqrt(variances[0] * variances[2])
     assert covariance == pytest.approx(mixed, abs=tolerance)
-
-
-def test_nothing_in_the_way_costs_nothing(prior: Prior) -> None:
-    value, slope = replace(prior, fiducials=None).value_and_slope(nothing(prior))
-    assert value == 0
-    assert not slope.flat().any()
 
 
 @pytest.mark.parametrize(("which", "power"), [(0, 4), (1, 6)])
@@ -179,19 +149,6 @@ def test_fiducials_cost_what_the_displacement_misses_them_by(prior: Prior) -> No
         each.value_and_slope(bowl)[0] for each in (prior, replace(prior, fiducials=None))
     )
     assert with_them - without == pytest.approx((missed**2).sum() / 2, rel=1e-9)
-
-
-def test_met_fiducials_pull_at_nothing(prior: Prior) -> None:
-    y, x = places(prior)
-    fiducials = prior.fiducials
-    assert fiducials is not None
-    tilted = nothing(prior)
-    tilted.potentials[0] = -0.7 * y + 0.2 * x
-    met = replace(prior, fiducials=fiducials._replace(displacements=np.full((2, 2), [0.7, -0.2])))
-    with_them, without = (
-        each.value_and_slope(tilted)[1] for each in (met, replace(prior, fiducials=None))
-    )
-    np.testing.assert_allclose(with_them.potentials, without.potentials, atol=1e-9)
 
 
 def test_images_that_are_hardly_shifted_are_hardly_turned(prior: Prior) -> None:

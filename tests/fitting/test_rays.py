@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
@@ -47,10 +45,6 @@ def turned() -> FloatArray:
 
 def flat(pulls: Pulls) -> FloatArray:
     return np.concatenate([part.ravel() for part in pulls])
-
-
-def slope_along(function: Callable[[float], FloatArray], pull: FloatArray, step: float) -> float:
-    return float((pull * (function(step) - function(-step))).sum() / (2 * step))
 
 
 def test_a_beam_meets_nothing_and_stays_as_it_is() -> None:
@@ -195,54 +189,6 @@ def test_a_frame_turns_about_the_middle_of_the_image() -> None:
     middle = (image * rows).sum() / image.sum(), (image * columns).sum() / image.sum()
     assert middle[0] == pytest.approx(19.5 + 1.2 * (27 - 19.5), abs=0.01)
     assert middle[1] == pytest.approx(26.5 + 0.7 * (36 - 26.5), abs=0.01)
-
-
-@pytest.mark.parametrize("strength", [WEAK, FOLDED])
-@pytest.mark.parametrize("part", ["potential", "beam", "frame"])
-def test_gradient_and_jacobian_are_those_of_the_image(strength: float, part: str) -> None:
-    rng = np.random.default_rng(0)
-    model = model_of(spacing=0.4)
-    potential, beam, frame = wavy(model, strength), model.around(uneven()), turned()
-    pull, counts = rng.normal(size=SIZE), model.ray_counts(potential)
-    none = Pulls(np.zeros(model.shape), np.zeros(beam.shape), np.zeros(6))
-    traced = TracedBeam(potential, counts, beam, frame)
-    gradient, jacobian = model.gradient(traced, pull), model.jacobian(traced)
-    for _ in range(3):
-        way = rng.normal(size=getattr(none, part).shape)
-        # A turn moves rays at the edge by many pixels.
-        way = way / 20 if part == "frame" else way
-        by = none._replace(**{part: way})
-
-        def image(step: float) -> FloatArray:
-            return model.image(
-                TracedBeam(
-                    potential + step * by.potential,  # noqa: B023
-                    counts,
-                    beam + step * by.beam,  # noqa: B023
-                    frame + step * by.frame,  # noqa: B023
-                )
-            )
-
-        slope = slope_along(image, pull, 1e-6)
-        pushed = float(pull.ravel() @ (jacobian @ flat(by)))
-        pulled = float((getattr(gradient, part) * way).sum())
-        assert pulled == pytest.approx(slope, rel=2e-5)
-        assert pushed == pytest.approx(slope, rel=2e-5)
-
-
-def test_the_gradient_is_the_jacobians_transpose_times_the_pull() -> None:
-    rng = np.random.default_rng(1)
-    model = RayModel(SIZE, 8, beyond=3)
-    potential, beam, frame = wavy(model, FOLDED), model.around(uneven()), turned()
-    counts = model.ray_counts(potential)
-    pull = rng.normal(size=model.seen)
-    traced = TracedBeam(potential, counts, beam, frame)
-    pulls, jacobian = model.gradient(traced, pull), model.jacobian(traced)
-    assert jacobian.shape == (pull.size, flat(pulls).size)
-    pulled, size = jacobian.T @ pull.ravel(), np.abs(jacobian).T @ np.abs(pull).ravel()
-    rounding = np.finfo(jacobian.dtype).eps
-    assert rounding == np.finfo(np.float32).eps
-    np.testing.assert_array_less(np.abs(pulled - flat(pulls)), 2 * rounding * size + 1e-12)
 
 
 def test_what_is_not_wanted_of_derivatives_is_zero_and_the_rest_the_same() -> None:
