@@ -1,4 +1,3 @@
-import importlib.util
 import math
 from types import SimpleNamespace
 
@@ -516,10 +515,3 @@ def test_unusable_choice_is_refused_in_a_sentence(given, sentence):
 def test_request_to_stop_ends_the_tracing():
     with pytest.raises(InversionCancelled):
         trace(toroid_grid(nodes=11), SETUP, (20, 20), should_stop=lambda: True)
-
-
-@pytest.mark.skipif(not importlib.util.find_spec("plasmapy"), reason="PlasmaPy is not installed")
-def test_deflections_agree_with_plasmapy():
-    from tracing import compare_with_plasmapy
-
-    assert compare_with_plasmapy(toroid_grid(peak=20.0), count=200) < 3e-3
