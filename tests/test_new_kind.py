@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.command_line import done, flat, shadowinv
+from helpers.command_line import done
 from napari_shadowinv import InputError, fit, invert, predict_image, run_stack
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.io import read, write
@@ -122,13 +122,6 @@ def test_table_gives_each_shot_the_quantity_of_a_new_kind(table, setups):
     with Path("shots_out.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["photon_energy (keV)"] for row in rows] == ["8.0", "12.0"]
-
-
-def test_command_fits_a_table_of_a_new_kind(table):
-    keys = ("samples=0", "max_iterations=3", "spacing=0.25")
-    quick = [f"--set=fit.options.{key}" for key in keys]
-    result = shadowinv("fit", table, "--setup", "xray.toml", "--out", "fit.shadowinv", *quick)
-    assert "8 keV" in flat(result.output), result.output
 
 
 def test_rows_know_a_new_kind(table):

@@ -45,14 +45,6 @@ def wave(n_y, n_x, shape=SHAPE):
     return np.cos(y)[:, None] * np.cos(x), float(k)
 
 
-@pytest.mark.parametrize("width", [0.7, 4.0, 30.0, 1000.0])
-def test_high_pass_and_low_pass_add_up_to_the_image(width):
-    image = random_image()
-    low = LowPassFilter(width=width).filter_image(image)
-    high = HighPassFilter(width=width).filter_image(image)
-    np.testing.assert_allclose(high + low - image.mean(), image, rtol=1e-13)
-
-
 @pytest.mark.parametrize("numbers", [(0, 4), (5, 0), (3, 7), (20, 31)])
 def test_gaussian_filters_attenuate_a_wave_by_the_textbook_factor(numbers):
     image, k = wave(*numbers)
@@ -81,15 +73,6 @@ def test_butterworth_falls_by_its_order_per_octave():
             / slow[0, 0]
         )
         assert gain == pytest.approx((1 + 8.0 ** (2 * order)) ** -0.5, rel=1e-9)
-
-
-def test_powers_of_the_two_butterworth_filters_add_up():
-    image, _ = wave(3, 4)
-    high = ButterworthFilter(cutoff=30.0, order=3).filter_image(image)[0, 0] / image[0, 0]
-    low = (
-        ButterworthFilter(cutoff=30.0, order=3, kind="low").filter_image(image)[0, 0] / image[0, 0]
-    )
-    assert high**2 + low**2 == pytest.approx(1, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", ["low pass", "high pass", "butterworth", "background"])
@@ -200,10 +183,9 @@ def test_exactly_the_broken_pixels_are_found(noise, seed):
     assert abs(clean - beam)[~untouched].max() < 0.2 * beam.max()
 
 
-@pytest.mark.parametrize("level", [1.0, 30.0, 1000.0])
-def test_a_million_sound_pixels_raise_no_false_alarm(level):
+def test_a_million_sound_pixels_raise_no_false_alarm():
     rng = np.random.default_rng(7)
-    _, hot, dead = remove_hot_pixels(rng.normal(100 * level, level, (1000, 1000)))
+    _, hot, dead = remove_hot_pixels(rng.normal(3000, 30, (1000, 1000)))
     assert not hot.any()
     assert not dead.any()
 

@@ -7,7 +7,7 @@ from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
-from napari_shadowinv.physics.phantoms import ellipse_pair, gaussian_blob
+from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
@@ -251,16 +251,6 @@ def test_a_gaussian_source_makes_the_inversion_right_where_a_uniform_one_makes_i
 def test_images_without_a_beam_and_wrong_masks_are_refused(estimate, image, mask, words):
     with pytest.raises(InputError, match=words):
         estimate(image, mask=mask)
-
-
-@ALL
-def test_the_plan_of_an_estimate_can_be_inverted(estimate):
-    truth = ellipse_pair(SHAPE).displacement
-    shot = synthetic_image(truth, gaussian_beam(constant=200.0))
-    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    source = estimate(shot, mask=np.hypot(y - 24, x - 30) > 9)
-    inversion = invert(shot, source=source, options=InversionOptions(n_sites=300))
-    assert inversion.report.converged
 
 
 class Stop:
