@@ -6,14 +6,27 @@ Peak error: largest retrieved displacement against the largest true one. L2 erro
 the difference against the norm of the truth. Beside it what the accuracy leads to without a number
 of sites: their number, the errors, what of them the error budget tells (discretisation and noise,
 r.m.s. of the displacement), and the seconds; and the linear (Poisson) inversion.
+
+    python benchmarks/accuracy.py --pixels [NAME …]
+
+Errors where a pixel is the limit, in per cent of the displacement (L2), by default, at an accuracy
+of 0.1 %, and by a site a pixel in which the brightness is constant: images of the comparison, of
+64² and 128² px, whose names contain one of these, and a ring of 7 px with noise. Rays are counted
+(`compare.images`), so the truth is not the package's.
 """
 
 from __future__ import annotations
 
 import argparse
+from functools import partial
 
 import numpy as np
 
+from compare.fields import centres
+from compare.images import Case as CountedCase
+from compare.images import cases as counted_cases
+from compare.images import make_image
+from compare.runner import relative_error
 from napari_shadowinv import Inversion, InversionOptions, invert, poisson_invert
 from reference import Case, donut_case, ellipses_case, errors, toroid_case
 
@@ -65,10 +78,50 @@ def inverted(case: Case, options: InversionOptions) -> tuple[Inversion, tuple[fl
     return found, errors(found.displacement, case.displacement), sum(found.report.seconds.values())
 
 
+def ring(n: int, width: float = 7 / 128, radius: float = 0.25) -> np.ndarray:
+    """A radial displacement of 3 px of 128 in a ring with a full width at half maximum."""
+    y, x = centres(n)
+    r = np.maximum(np.hypot(y, x), 1e-12)
+    factor = 3 / 128 * np.exp(-4 * np.log(2) * ((r - radius) / width) ** 2) / r
+    return np.stack([factor * y, factor * x])
+
+
+def pixel_row(case: CountedCase) -> str:
+    source, image, truth = make_image(case)
+    cells = [case.key]
+    for choices in ({}, {"accuracy": 0.001}, {"n_sites": image.size}):
+        options = InversionOptions(threads=1, **choices)
+        found = invert(image, source=source, options=options)
+        seconds = sum(invert(image, source=source, options=options).report.seconds.values())
+        error = relative_error(found.displacement, truth, source)
+        cells += [f"{found.report.n_sites:,}", f"{error:.3f}", f"{seconds:.2f}"]
+    return f"| {' | '.join(cells)} |"
+
+
+def show_pixels(names: list[str]) -> None:
+    """Print the table of images where a pixel is the limit."""
+    small = [case for case in counted_cases() if case.size <= 128]
+    chosen = [case for case in small if not names or any(name in case.name for name in names)]
+    chosen += [
+        CountedCase("ring", f"ring of 7 px, noise {noise:.0%},", 128, partial(ring), noise=noise)
+        for noise in (0.0, 0.01, 0.03)
+    ]
+    kinds = "by default", "at 0.1 %", "constant in pixels"
+    print("| image | " + " | ".join(f"{kind}: sites | error, % | s" for kind in kinds) + " |")
+    print(f"|{'---|' * 10}")
+    for case in chosen:
+        print(pixel_row(case), flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--n-sites", type=int, default=40_000)
-    n_sites = parser.parse_args().n_sites
+    parser.add_argument("--pixels", nargs="*", metavar="NAME")
+    arguments = parser.parse_args()
+    n_sites = arguments.n_sites
+    if arguments.pixels is not None:
+        show_pixels(arguments.pixels)
+        return
     invert(np.ones((20, 20)) + np.eye(20))  # compile, so that the seconds are the work's
     print(
         "| image | sites | peak / L2 error, % | allowed | residual | steps | s "

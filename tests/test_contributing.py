@@ -17,11 +17,11 @@ from helpers.command_line import flat
 from helpers.pages import ROOT, run_python, text_of
 from napari_shadowinv import Inversion, cli, invert, synthetic_image, write
 from napari_shadowinv.analysis import PRODUCTS, analyse
-from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.cli._terminal import EXIT_MISTAKE
 from napari_shadowinv.inversion.budget import FLUX_ERRORS
 from napari_shadowinv.io import store_columns
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.derivatives import finer_field
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.preprocessing import STEPS
 from napari_shadowinv.preprocessing.steps import Step, choices_of

@@ -20,7 +20,6 @@ from napari_shadowinv.analysis import (
     products_in,
     products_table,
 )
-from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis._field_samples import sampled_fields
 from napari_shadowinv.analysis.product import quantity_text
 from napari_shadowinv.errors import InputError
@@ -30,6 +29,7 @@ from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.options import FitOptions
+from napari_shadowinv.physics.derivatives import finer_field
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import Phantom
 from napari_shadowinv.shot import Shot

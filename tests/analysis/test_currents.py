@@ -15,10 +15,10 @@ from napari_shadowinv.analysis import (
     Flux,
     analyse,
 )
-from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.result import RetrievedField
+from napari_shadowinv.physics.derivatives import finer_field
 from napari_shadowinv.physics.phantoms import gaussian_blob, toroid
 
 PIXEL = SETUP.object_pixel_size

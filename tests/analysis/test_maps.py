@@ -16,12 +16,12 @@ from napari_shadowinv.analysis import (
     Region,
     analyse,
 )
-from napari_shadowinv.analysis._derivatives import laplacian
 from napari_shadowinv.analysis.maps import chosen_width, smooth
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert
 from napari_shadowinv.inversion.result import RetrievedField
 from napari_shadowinv.inversion.variables import dataset_from_field
+from napari_shadowinv.physics.derivatives import laplacian
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import (
     Phantom,

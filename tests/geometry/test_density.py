@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial import ConvexHull
 
 from helpers.polygons import over_pixels
-from napari_shadowinv.geometry.density import Density, walk_edge
+from napari_shadowinv.geometry.density import Density, resolve_pixels, walk_edge
+from napari_shadowinv.geometry.power_diagram import PowerDiagram
+from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
 
 def integrate(polygon, density):
@@ -69,3 +71,53 @@ def test_density_edges_through_corners_cancel_in_return(ends):
     got = integrate(triangle, density)
     np.testing.assert_allclose(abs(got[0]), abs(mass), atol=1e-12)
     np.testing.assert_allclose(np.abs(got[1:3]), np.abs(moments + 0.5 * mass), atol=1e-11)
+
+
+def blocks_of(fine, parts=3):
+    height, width = fine.shape
+    return fine.reshape(height // parts, parts, width // parts, parts)
+
+
+def test_resolved_pixels_keep_their_flux_and_stay_positive():
+    image = np.random.default_rng(0).exponential(size=(12, 17))
+    image[4:7, 5:9] = 0
+    fine = resolve_pixels(image)
+    np.testing.assert_allclose(blocks_of(fine).sum(axis=(1, 3)), image, rtol=1e-13, atol=1e-15)
+    assert (blocks_of(fine) >= image[:, None, :, None] / 18 - 1e-15).all()
+
+
+def test_the_flux_of_polynomials_up_to_degree_four_is_exact():
+    """In pixels with two more on each side; that of straight lines up to the border."""
+
+    def flux(per_pixel, degree):
+        borders = np.linspace(-8, 8, 16 * per_pixel + 1)
+        along = np.diff(borders ** (degree + 1)) / (degree + 1)
+        return 9e4 * np.diff(borders)[0] ** 2 + np.outer(along, along)
+
+    for degree in range(5):
+        inside = np.s_[:, :] if degree < 2 else np.s_[6:-6, 6:-6]
+        fine = resolve_pixels(flux(1, degree))
+        np.testing.assert_allclose(fine[inside], flux(3, degree)[inside], rtol=1e-10)
+
+
+def test_a_step_stays_a_step_two_pixels_away():
+    image = np.ones((10, 12))
+    image[:, 6:] = 50.0
+    fine = resolve_pixels(image)
+    np.testing.assert_allclose(fine[:, : 3 * 4], 1 / 9, rtol=1e-12)
+    np.testing.assert_allclose(fine[:, 3 * 8 :], 50 / 9, rtol=1e-12)
+    assert fine.min() >= 0.5 / 9
+    assert fine.max() < 1.2 * 50 / 9
+
+
+def test_masses_over_a_resolved_image_are_those_of_its_parts():
+    image = 1 + np.random.default_rng(1).random((9, 11))
+    density = Density.from_image(image).resolved()
+    assert density.shape == image.shape
+    sites = np.random.default_rng(2).uniform(0, 8, (30, 2))
+    diagram = PowerDiagram(RegularTriangulation(sites, region=density.region), density)
+    apart = Density.from_image(resolve_pixels(image))
+    triangulation = RegularTriangulation(3 * (sites + 0.5) - 0.5, region=apart.region)
+    parts = PowerDiagram(triangulation, apart, with_moments=True)
+    np.testing.assert_allclose(diagram.masses, parts.masses, rtol=1e-10)
+    assert diagram.masses.sum() == pytest.approx(image.sum())

@@ -171,7 +171,7 @@ def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, cle
     assert sum(loose.iterations) < sum(exact.iterations)
     for name in ("potential_std", "displacement_std"):
         ratio = getattr(loose, name) / getattr(exact, name)
-        assert np.median(ratio) == pytest.approx(1, abs=2e-3)
+        assert np.median(ratio) == pytest.approx(1, abs=4e-3)
         assert np.percentile(np.abs(ratio - 1), 99) < 0.03
 
 
@@ -181,19 +181,20 @@ def test_samples_start_from_the_images_weights(counts, plan):
     assert max(result.iterations) < invert(counts, plan=plan).report.iterations
 
 
-def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, plan):
-    choices = {
-        "plan": plan,
-        "noise": 0.005,
-        "options": OPTIONS.model_copy(update={"tolerance": 1e-7}),
-    }
+@pytest.mark.parametrize(("n_sites", "nonlinearity"), [(SHAPE[0] * SHAPE[1], 0.05), (None, 0.13)])
+def test_the_linear_response_to_little_noise_is_that_of_solving_again(clean, n_sites, nonlinearity):
+    """But for the finest waves, where the cells are pixels with slopes inside."""
+    options = OPTIONS.model_copy(update={"tolerance": 1e-7, "n_sites": n_sites})
+    choices = {"noise": 0.005, "options": options}
     linear = samples_of(clean, 5, **choices)
     solved = samples_of(clean, 5, **choices, method="resolve")
-    assert linear.linearity.nonlinearity < 0.05
+    assert linear.linearity.nonlinearity < nonlinearity
     assert solved.linearity is None
     for name in ("potential_std", "displacement_std"):
         linear_bars, solved_bars = getattr(linear, name), getattr(solved, name)
-        assert np.linalg.norm(linear_bars - solved_bars) < 0.05 * np.linalg.norm(solved_bars)
+        assert np.linalg.norm(linear_bars - solved_bars) < nonlinearity * np.linalg.norm(
+            solved_bars
+        )
 
 
 def test_samples_that_do_not_converge_are_counted(clean):

@@ -90,7 +90,7 @@ def test_the_image_itself_is_refused_as_its_source(scale):
 
 
 def test_displacement_is_minus_the_gradient_of_the_potential(image):
-    inversion = invert(image)
+    inversion = invert(image, options=InversionOptions(n_sites=1200))
     gradient = np.array(np.gradient(inversion.potential))
     inner = np.s_[:, 1:-1, 1:-1]
     np.testing.assert_allclose(inversion.displacement[inner], -gradient[inner], atol=1e-12)

@@ -11,7 +11,6 @@ import numpy as np
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.analysis._derivatives import finer_field
 from napari_shadowinv.analysis.frame import FIELD_UNITS, FieldFrame, FieldUnit
 from napari_shadowinv.analysis.paths import is_inside
 from napari_shadowinv.analysis.product import FieldNoise
@@ -22,6 +21,7 @@ from napari_shadowinv.inversion.budget import discretisation_share
 from napari_shadowinv.inversion.error_budget import ErrorBudget
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.beam import displacement_from_potential
+from napari_shadowinv.physics.derivatives import finer_field
 from napari_shadowinv.physics.forward import jacobian_determinant
 from napari_shadowinv.physics.poisson import potential_from_displacement
 from napari_shadowinv.physics.setup import Setup
@@ -111,6 +111,8 @@ class ResampledInversion(SampledField):
         self, potential: FloatArray, displacement: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return a field that is read out as a mean over pixels, and by differences, at points."""
+        if self.inversion.cells.are_pixels:
+            return potential, displacement
         return finer_field(potential, displacement)
 
     def evaluate(self, choose: Choose, samples: int, callbacks: Callbacks) -> Evaluation:
@@ -120,7 +122,9 @@ class ResampledInversion(SampledField):
 
         def quantities(changes: FloatArray) -> dict[str, Measure]:
             spacing = (inversion.image.size / number_of_inner_sites(inversion)) ** 0.5
-            measures.append(choose(FieldNoise(changes, spacing, Reporter(**callbacks))))
+            of_pixels = inversion.cells.are_pixels
+            noise = FieldNoise(changes, spacing, of_pixels, Reporter(**callbacks))
+            measures.append(choose(noise))
             size = measures[0](self.potential, self.displacement).size
             kind = sample_type(samples, size)
             return {"all": lambda *field: measures[0](*field).astype(kind, copy=False)}
@@ -132,7 +136,9 @@ class ResampledInversion(SampledField):
         assert errors.samples is not None
         if coarse is not None:
             share = discretisation_share(len(inversion.cells.sites) / len(coarse.cells.sites))
-            change = value - measure(coarse.potential, coarse.displacement)
+            # The coarse field is no field at points.
+            correct = finer_field if inversion.cells.are_pixels else lambda *fields: fields
+            change = value - measure(*correct(coarse.potential, coarse.displacement))
             systematic["discretisation"] = share * change
         numbers, cautions = errors.samples.quantities["all"].samples, []
         if is_noise_notable(errors):
@@ -142,9 +148,12 @@ class ResampledInversion(SampledField):
     def within_pixels(self) -> tuple[FloatArray, FloatArray]:
         """Return the field if the brightness had a slope within pixels.
 
-        An inversion takes it as constant there, and so it misses the inverse of a blur of 1/6 px²,
+        An inversion whose cells are no pixels takes it as constant there, and so it misses the
+        inverse of a blur of 1/6 px²,
         which moves light by 1/12 of the logarithm's slope.
         """
+        if self.inversion.cells.are_pixels:
+            return self.potential, self.displacement
         area = jacobian_determinant(self.displacement)
         change = np.log(np.maximum(area, LEAST_LIGHT)) / 12
         return self.potential + change, self.displacement + displacement_from_potential(change)

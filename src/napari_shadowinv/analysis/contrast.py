@@ -8,7 +8,6 @@ from typing import Literal
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.analysis._derivatives import first_derivative, second_derivative
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.maps import Smoothed, least_width, smooth
 from napari_shadowinv.analysis.product import Measurand, Values
@@ -16,6 +15,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import Fact, Level, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import number_field
+from napari_shadowinv.physics.derivatives import first_derivative, second_derivative
 
 _REGIMES = {
     "linear": "linear: the contrast of the image is the current density, and any inversion will do",

@@ -23,7 +23,6 @@ from pydantic import Field
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.analysis._derivatives import laplacian
 from napari_shadowinv.analysis.currents import source_by_flux
 from napari_shadowinv.analysis.frame import FieldFrame
 from napari_shadowinv.analysis.product import (
@@ -39,6 +38,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, percent
 from napari_shadowinv.inversion.error_bars import Quantity
 from napari_shadowinv.physics.beam import length_text
+from napari_shadowinv.physics.derivatives import laplacian
 
 ORDER = 3
 _WIDTHS_PX = (0.0, *(0.7 * 2 ** (step / 4) for step in range(23)))

@@ -197,6 +197,7 @@ def measure_response(
     weights: FloatArray,
     n_sites: int,
     *,
+    of_pixels: bool = False,
     phantoms: int,
     seed: int,
     report: Reporter,
@@ -206,12 +207,15 @@ def measure_response(
     """Measure how an inversion changes a spectrum, on random fields with that spectrum.
 
     Rays cross, and small structures are lost, the more the stronger the field. Random fields are
-    made with the measured spectrum, less its noise, imaged, inverted with as many sites, and
-    measured in the same window, (H, W). As the measured spectrum is too low where power is lost, it
-    is corrected by the response of a first field, and again by a second one's, but by no response
-    below `least`, before the response is measured on the phantoms. The reporter is called before
-    each field.
+    made with the measured spectrum, less its noise, imaged, inverted with as many sites, or with
+    those `of_pixels`, and measured in the same window, (H, W). As the measured spectrum is too low
+    where power is lost, it is corrected by the response of a first field, and again by a second
+    one's, but by no response below `least`, before the response is measured on the phantoms. The
+    reporter is called before each field.
     """
+    # An accuracy out of reach leads to sites in all pixels.
+    sites = InversionOptions(accuracy=1e-9) if of_pixels else InversionOptions(n_sites=n_sites)
+    options = sites.model_copy(update={"noise_level": 1e-3})
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0
     smooth = _mean_over_rings(spectrum.modes)
@@ -223,7 +227,7 @@ def measure_response(
         pairs = []
         for _ in range(count):
             report("response", done, total)
-            pairs.append(_phantom_spectra(spectrum.k, power, weights, n_sites, rng, report))
+            pairs.append(_phantom_spectra(spectrum.k, power, weights, options, rng, report))
             done += 1
         true = np.array([pair[0].power for pair in pairs])
         retrieved = np.array([pair[1].power for pair in pairs])
@@ -249,7 +253,7 @@ def _phantom_spectra(
     k: FloatArray,
     power: FloatArray,
     weights: FloatArray,
-    n_sites: int,
+    options: InversionOptions,
     rng: np.random.Generator,
     report: Reporter,
     margin: float = 0.15,  # around the random field, over the image's side
@@ -262,7 +266,6 @@ def _phantom_spectra(
         lambda at: np.interp(at, k, density, right=0.0), (height, width), rng
     )
     image = synthetic_image(displacement)[inner]
-    options = InversionOptions(n_sites=n_sites, noise_level=1e-3)
     source = np.ones(weights.shape)
     inversion = invert(image, source=source, options=options, should_stop=report.should_stop)
     divergence = sum(np.gradient(part, axis=axis) for axis, part in enumerate(displacement))

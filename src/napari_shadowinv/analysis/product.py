@@ -64,6 +64,7 @@ class FieldNoise:
 
     potentials: FloatArray  # (k, H, W), changes of the potential in px² by noise and instrument
     spacing: float = 0.0  # of the sites in px; 0 for a field without sites
+    of_pixels: bool = False  # whether the sites' cells of the source are the pixels
     report: Reporter = dataclasses.field(default_factory=Reporter)  # for choices that take long
 
 

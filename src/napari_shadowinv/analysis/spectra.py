@@ -276,6 +276,7 @@ class TurbulenceSpectrum(Product):
                 less_noise,
                 weights,
                 max(round(potential.size / product.resolution**2), 16),
+                of_pixels=noise is not None and noise.of_pixels,
                 phantoms=self.phantoms,
                 seed=self.phantom_seed,
                 report=Reporter() if noise is None else noise.report,

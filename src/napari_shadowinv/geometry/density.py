@@ -11,7 +11,8 @@ pixel the integrands are polynomials of degree 3 at most, for which Simpson's ru
 exact. Beyond the image the density is zero, so polygons need no clipping.
 
 - make a density of an image: `Density`
-- the same density on smaller pixels: `split_pixels`
+- the same density on smaller pixels: `split_pixels`; with slopes inside the pixels, as parts that
+  are constant: `Density.resolved`, by `resolve_pixels`
 - integrals along one edge: `walk_edge` (a numba kernel)
 """
 
@@ -25,7 +26,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
-from napari_shadowinv._typing import FloatArray
+from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.geometry.compiler import njit
 
 Triple = tuple[float, float, float]
@@ -44,10 +45,10 @@ class Density:
     # (2, h, w + 1): ∫ I and ∫ s I over each row, from 0 to the left edge of each pixel; the last
     # column holds the whole row's.
     first_sums: FloatArray
-    side: int = 1  # of the squares, in px
+    side: float = 1  # of the squares, in px
 
     @classmethod
-    def from_image(cls, image: ArrayLike, *, side: int = 1, threads: int | None = 1) -> Density:
+    def from_image(cls, image: ArrayLike, *, side: float = 1, threads: int | None = 1) -> Density:
         """Make a density of an image, shape (H / side, W / side), of squares with a side in px."""
         values = np.ascontiguousarray(image, dtype=np.float64)
         if not values.flags.writeable:  # the kernel is compiled for one type
@@ -57,6 +58,10 @@ class Density:
         rows = max(1, LIGHT_ITEMS // max(1, width))
         in_ranges(_sum_rows, height, available_threads(threads), values, sums, smallest=rows)
         return cls(values, sums, side)
+
+    def resolved(self, threads: int | None = 1) -> Density:
+        """Return the density with slopes inside its pixels."""
+        return Density.from_image(resolve_pixels(self.image), side=1 / PARTS, threads=threads)
 
     @cached_property
     def sums(self) -> FloatArray:
@@ -69,7 +74,8 @@ class Density:
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (H, W) of the image in pixels."""
-        return self.side * self.image.shape[0], self.side * self.image.shape[1]
+        height, width = self.image.shape
+        return round(self.side * height), round(self.side * width)
 
     @property
     def region(self) -> FloatArray:
@@ -105,6 +111,41 @@ def split_pixels(image: FloatArray, factor: int) -> FloatArray:
     if factor == 1:
         return image
     return np.repeat(np.repeat(image / factor**2, factor, axis=0), factor, axis=1)
+
+
+PARTS = 3  # of a resolved pixel, along each axis
+
+
+def resolve_pixels(image: FloatArray, parts: int = PARTS, *, least: float = 0.5) -> FloatArray:
+    """Divide each pixel of a positive image into parts × parts, as its surroundings suggest.
+
+    Each pixel keeps its flux. Along each axis the flux follows the polynomial of degree 4 with the
+    flux of five pixels; beyond the border the image continues as a straight line. Where a part
+    would have less than the `least` share of the pixel's mean, the pixel's parts become more alike.
+    """
+
+    def fluxes(borders: AnyArray) -> AnyArray:
+        """Return the flux of x⁰ to x⁴ between borders, one row for each interval."""
+        return np.diff(borders[:, None] ** np.arange(1, 6) / np.arange(1, 6), axis=0)
+
+    weights = fluxes(np.linspace(-0.5, 0.5, parts + 1)) @ np.linalg.inv(fluxes(np.arange(6) - 2.5))
+    fine = image
+    for axis in (0, 1):
+        along = np.moveaxis(fine, axis, 0)
+        padded = np.pad(along, ((2, 2), (0, 0)), mode="reflect", reflect_type="odd")
+        rows = np.empty((len(along), parts, along.shape[1]))
+        for part, of_pixels in enumerate(weights):
+            rows[:, part] = sum(
+                weight * padded[first : first + len(along)]
+                for first, weight in enumerate(of_pixels)
+            )
+        fine = np.moveaxis(rows.reshape(-1, along.shape[1]), 0, axis)
+    (height, width), mean = image.shape, image / parts**2
+    blocks = fine.reshape(height, parts, width, parts)
+    drop = np.maximum(mean - blocks.min(axis=(1, 3)), 1e-300)
+    kept = np.minimum(1.0, (1 - least) * mean / drop)[:, None, :, None]
+    mean = mean[:, None, :, None]
+    return np.asarray((mean + kept * (blocks - mean)).reshape(fine.shape))
 
 
 @njit(nogil=True, cache=True, inline="always")

@@ -266,7 +266,7 @@ class PowerDiagram:
         smallest = math.ceil(LIGHT_ITEMS / max(squares_per_side, 1.0))
         operands = borders, integrals
         in_ranges(walk, len(sides), self._threads, *operands, smallest=smallest, uneven=True)
-        if side > 1:
+        if side != 1:
             integrals *= side**powers
         return integrals
 

@@ -51,7 +51,7 @@ from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_ima
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.alignment import RegisteredSource, register_source
 from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_cautions
-from napari_shadowinv.transport.sites import RATIO, Levels, SitePlan, edge_flux
+from napari_shadowinv.transport.sites import RATIO, Levels, SitePlan, are_middles, edge_flux
 from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
 
 # Steps of the read-out: up to the first number the potential, then the re-projection.
@@ -319,7 +319,7 @@ def _pose(
         )
         assumed = inputs.registered.is_assumed
         budget = Budget(plan, prepared, noise, options, inputs.instrument, is_shift_assumed=assumed)
-        levels = _levels_to_solve(plan, levels, inputs.start, options)
+        levels = _levels_to_solve(plan, levels, inputs.start, options, report)
     return _Problem(inputs, plan, levels, prepared, options, noise, budget)
 
 
@@ -334,7 +334,11 @@ def _check_image(
 
 
 def _levels_to_solve(
-    plan: SitePlan, levels: Levels, start: Inversion | None, options: InversionOptions
+    plan: SitePlan,
+    levels: Levels,
+    start: Inversion | None,
+    options: InversionOptions,
+    report: Reporter,
 ) -> Levels:
     if not options.is_adaptive and not levels.is_complete:
         beam = SpreadBeam.of(plan.source, plan.mask, options)
@@ -342,6 +346,9 @@ def _levels_to_solve(
     if start is None:
         return levels
     may_differ = options.is_adaptive and not levels.is_complete
+    sites = start.cells.sites
+    if plan.pixels is not None and are_middles(sites) and len(sites) == plan.pixels.counts[-1]:
+        levels = plan.pixels.with_reporter(report)
     return _levels_from_start(start, levels, plan.margin_width, may_differ=may_differ)
 
 
@@ -372,13 +379,16 @@ def _solve(problem: _Problem, report: Reporter, seconds: dict[str, float]) -> _S
                 start=None if start is None else start.cells.weights,
                 needed=problem.needed if adaptive else None,
                 solved=solutions,
+                finest=budget.finest if adaptive and problem.plan.pixels else None,
             )
         answer = solutions[-1]
         if answer.converged:
             with measure_time("errors", seconds):
                 budget.free_target(solutions)
         fields, wait_for_errors = _read_fields(problem, solutions, report, seconds)
-        finest = adaptive and len(answer.weights) == levels.counts[-1]
+        finest = adaptive and (
+            answer.level.is_of_pixels or len(answer.weights) == levels.counts[-1]
+        )
         more = adaptive and answer.converged and not finest
         units = problem.prepared.in_units()
         if not more or not is_coarse(units, fields.reprojection, problem.noise(), options.threads):

@@ -64,6 +64,9 @@ _LEAST_NOISE = 0.1  # of the mean square, where correlation takes waves away
 
 _EDGE_PLACES = 200  # along the shorter side at most, where the error by the edge is computed
 
+# Of the noise: what slopes in the pixels change. Sites in all pixels raise the noise by 3 to 6 %.
+_LEAST_GAIN = 0.35
+
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 
 
@@ -156,18 +159,23 @@ class Budget:
         solved = _usable_levels(solutions)
         if len(solved) < 2:
             return math.inf
-        rms = float(np.sqrt(np.mean(np.sum(self._move(solved[-1]) ** 2, axis=0))))
+        rms = self._rms(solved[-1])
         squares, power = self._change(solved)
         error = float(np.sqrt(squares.mean()))
         share = share_of(error, rms)
         text = f"their discretisation error is about {share}{' of the displacement' * (rms > 0)}"
         allowed = self.options.accuracy * rms
+        if self._resolves_pixels and self._by_pixels[0] > allowed:
+            self.reason = ""
+            return math.inf
         if error <= allowed:
             self.reason = f"{text}, below the accuracy of {100 * self.options.accuracy:g} %"
             return 0.0
         # An estimate for a uniform beam; the exact value is needed only where this is large.
         image_noise = self._noise()
         noise, _ = image_noise.displacements(image_noise.typical)
+        if not self._is_noise_known:
+            noise = 0.0
         if error < _MAX_SHARE_OF_NOISE * noise:
             response = self._response(solved)
             moves, finer = self._noisy_moves(response, solved[-1].level.spacing)
@@ -178,6 +186,44 @@ class Budget:
             return 0.0
         excess = error / max(allowed, SHARE_OF_NOISE * noise)
         return float(_SAFETY * excess ** (1 / power))
+
+    def _rms(self, solution: LevelSolution) -> float:
+        return float(np.sqrt(np.mean(np.sum(self._move(solution) ** 2, axis=0))))
+
+    @cached_property
+    def _by_pixels(self) -> tuple[float, float]:
+        """Error of a field that takes pixels as constant, and an estimate of that by noise, px.
+
+        The first blurs the light by 1/6 px², and moves it by 1/12 of its logarithm's slope;
+        differences over two pixels blur the field about as much.
+        """
+        light = self._prepared.floored_image
+        light = light / light.mean()
+        squares = sum((light * slope**2).mean() for slope in np.gradient(np.log(light)))
+        variance = float((self._noise().variance(light) / light).mean())
+        noise, _ = self._noise().displacements(math.sqrt(variance))
+        return math.sqrt(max(float(squares) - variance, 0.0)) / 6, noise
+
+    @cached_property
+    def _is_noise_known(self) -> bool:
+        """Whether noise is a reason for fewer sites than a stated accuracy needs.
+
+        It is none if structure hides it, so that all that is known is a bound.
+        """
+        return not (self._noise().is_bound and "accuracy" in self.options.model_fields_set)
+
+    @cached_property
+    def _resolves_pixels(self) -> bool:
+        """Whether there is a level with a site in each pixel, and noise does not hide its gain."""
+        if self._plan.pixels is None:
+            return False
+        gain, noise = self._by_pixels
+        return not self._is_noise_known or gain > _LEAST_GAIN * noise
+
+    def finest(self) -> SiteLevel | None:
+        """Return the level with a site in each pixel if that is better than as many others."""
+        pixels = self._plan.pixels
+        return pixels[-1] if pixels is not None and self._resolves_pixels else None
 
     def errors(
         self, solutions: Sequence[LevelSolution], potential: FloatArray, displacement: FloatArray

@@ -11,12 +11,12 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import maximum_filter
 
 from napari_shadowinv._system.arrays import check_mask
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.inversion.normalise import (
     bytes_per_pixel,
@@ -55,6 +55,27 @@ class SpreadBeam(NamedTuple):
         inner = np.ascontiguousarray(self.margin.within(self.values))
         return round(n_sites * float(self.values.sum()) / float(inner.sum()))
 
+    def lit_pixels(
+        self,
+        mask: BoolArray | None,
+        options: InversionOptions,
+        *,
+        dim: float = 0.65,
+        most: float = 0.01,
+    ) -> BoolArray | None:
+        """Return the pixels with light, (H, W), of an even beam, each of which may have a site.
+
+        None if the beam jumps: more than the share `most` of the pixels are `dim` beside the
+        brightest of their neighbours. Sites that are as dense as the beam is bright suit it better.
+        """
+        used = np.ones(self.values.shape, bool)
+        if mask is not None:
+            (used if self.margin is None else self.margin.within(used))[:] = mask
+        brightest = maximum_filter(np.where(used, self.values, 0.0), 3)
+        if np.count_nonzero(used & (self.values < dim * brightest)) > most * used.sum():
+            return None
+        return np.asarray(self.values >= 0.5 * options.floor * self.values.mean())
+
 
 def plan_over(
     source: ArrayLike, options: InversionOptions, mask: ArrayLike | None, measured: bool
@@ -73,7 +94,11 @@ def plan_over(
         seed=options.seed,
         threads=options.threads,
     ).levels
-    return SitePlan(checked, levels, usable, beam.margin, beam.unit, measured)
+    pixels = None
+    if options.is_adaptive and n_sites == checked.size:
+        lit = beam.lit_pixels(usable, options)
+        pixels = None if lit is None else levels.ending_in_pixels(beam.values, lit, options.threads)
+    return SitePlan(checked, levels, usable, beam.margin, beam.unit, measured, pixels)
 
 
 def plan_of(
@@ -102,8 +127,6 @@ def plan_on(
     """Return the plan of the one level of a triangulation's sites over a source."""
     beam = SpreadBeam.of(source, mask, options)
     density = Density.from_image(beam.values, threads=options.threads)
-    diagram = PowerDiagram(triangulation, density, with_moments=True, threads=options.threads)
-    sites, shape = triangulation.sites, density.shape
-    level = SiteLevel(sites, diagram.masses, diagram.centroids, triangulation, shape, 0)
-    levels = Levels((len(sites),), lambda count, report: level)
+    level = SiteLevel.of(triangulation, density, options.threads)
+    levels = Levels((len(level.sites),), lambda count, report: level)
     return SitePlan(source, levels, mask, beam.margin, beam.unit, measured)

@@ -1,8 +1,9 @@
 """From the weights of the sites to the potential and displacement at every pixel.
 
 - by the method of the options: `read_out`
-- from the dual variables, without any integration: `read_dual` (default); as a linear map, for
-  many weights of one level, and for sums over many samples: `LinearReadout`
+- from the dual variables, without any integration: `read_dual` (default), together with the cells'
+  centroids where these are the pixels'; as a linear map, for many weights of one level, and for
+  sums over many samples: `LinearReadout`
 - by the paper's method, from the cells' centroids: `read_centroids`
 - linear response of the field to small changes of flux: `LinearResponse`
 
@@ -23,6 +24,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.arrays import block_sums
@@ -41,6 +43,7 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.derivatives import first_derivative
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import FactorisedLaplacian
 from napari_shadowinv.transport.sites import SiteLevel, SitePlan
@@ -104,9 +107,13 @@ class LinearReadout:
     def __init__(self, plan: SitePlan, level: SiteLevel, threads: int | None = None) -> None:
         n = len(level.sites)
         self._triangulation = level.triangulation
-        # One pixel more at each side; beyond the level's border the potential is its mirror image.
+        self._is_of_pixels = level.is_of_pixels
+        reach = self._reach = 3 if self._is_of_pixels else 1
+        # More pixels at each side; beyond the level's border the potential is its mirror image.
         beyond = [
-            np.clip(np.arange(-1, size + 1) + plan.margin_width, 0, padded_size - 1)
+            np.pad(np.arange(padded_size), reach, mode="symmetric")[
+                plan.margin_width : plan.margin_width + size + 2 * reach
+            ]
             for size, padded_size in zip(plan.source.shape, level.shape, strict=True)
         ]
         pixels = np.stack(np.meshgrid(*beyond, indexing="ij"), axis=-1)
@@ -118,7 +125,7 @@ class LinearReadout:
         self._weights = weights.reshape(*pixels.shape[:2], 3, 3)
         border = np.ones(plan.source.shape, bool)
         border[1:-1, 1:-1] = False
-        border = np.pad(border, 1)
+        border = np.pad(border, reach)
         columns = 3 * self._corners[border][..., None] + np.arange(3)
         mean = np.bincount(columns.ravel(), self._weights[border].ravel(), 3 * n) / border.sum()
         self._border_mean = csr_array(mean[None])
@@ -135,11 +142,24 @@ class LinearReadout:
     ) -> None:
         """Add potential and displacement, and their squares, to sums (3, H, W) in some rows."""
         stop = min(start + rows, sums.shape[1])
+        if self._is_of_pixels:
+            for sample in range(WIDTH):
+                field = self.field(values[..., sample], slice(start, stop))
+                sums[:, start:stop] += field
+                squares[:, start:stop] += field**2
+            return
         _add_rows(start, stop, self._corners, self._weights, values, sums, squares)
 
-    def field(self, values: FloatArray) -> FloatArray:
-        """Return potential and displacement, (3, H, W), of one sample's values at sites, (n, 3)."""
-        padded = np.einsum("yxkc,yxkc->yx", self._weights, values[self._corners])
+    def field(self, values: FloatArray, rows: slice = slice(None)) -> FloatArray:
+        """Return potential and displacement in some rows, (3, h, W), of values at sites, (n, 3)."""
+        if rows.stop is not None:
+            rows = slice(rows.start, rows.stop + 2 * self._reach)
+        weights, corners = self._weights[rows], self._corners[rows]
+        padded = np.einsum("yxkc,yxkc->yx", weights, values[corners])
+        if self._is_of_pixels:
+            potential = _softened(padded)
+            down, right = first_derivative(potential, 0), first_derivative(potential, 1)
+            return np.stack([potential[2:-2, 2:-2], -down[:, 2:-2], -right[2:-2]])
         return np.stack([padded, *-np.array(np.gradient(padded))])[:, 1:-1, 1:-1]
 
 
@@ -296,7 +316,38 @@ def read_out(
     if options.readout == "centroid":
         moves, integration = solution.displacement, options.integration
         return read_centroids(solution.level, moves, options.threads, integration=integration)
-    return read_dual(solution.surface, solution.level.shape, on_share)
+    fields = read_dual(solution.surface, solution.level.shape, on_share)
+    return _at_middles(fields[0], solution) if solution.level.is_of_pixels else fields
+
+
+_DARK = 0.01  # of the mean, for a pixel without light
+
+
+def _at_middles(potential: FloatArray, solution: LevelSolution) -> tuple[FloatArray, FloatArray]:
+    """Return potential and displacement at the middles of pixels that are the cells of the source.
+
+    The dual variables of sites 1 px apart are those of a potential less 1/24 of its Laplacian, and
+    the cells' centroids move by the mean of the displacement over a pixel, which adds as much.
+    Half of each is the displacement, and beside pixels without light the centroid's alone.
+    """
+    level = solution.level
+    padded = np.pad(potential, 2, mode="symmetric")  # no flux crosses the border
+    slopes = first_derivative(padded, 0)[:, 2:-2], first_derivative(padded, 1)[2:-2]
+    displacement = -np.array(slopes)
+    rows, columns = np.rint(level.sites.T).astype(np.int64)
+    is_dark = np.ones(level.shape, bool)
+    is_dark[rows, columns] = level.mass < _DARK * level.mass.mean()
+    share = np.where(binary_dilation(is_dark, iterations=2), 1.0, 0.5)[rows, columns]
+    moves = solution.displacement.T
+    displacement[:, rows, columns] += share * (moves - displacement[:, rows, columns])
+    potential = _softened(padded[1:-1, 1:-1])
+    return potential - border_mean(potential), displacement
+
+
+def _softened(dual: FloatArray) -> FloatArray:
+    """Return the potential of dual variables in all pixels, without the outermost."""
+    around = dual[:-2, 1:-1] + dual[2:, 1:-1] + dual[1:-1, :-2] + dual[1:-1, 2:]
+    return np.asarray(dual[1:-1, 1:-1] * (1 - 4 / 24) + around / 24)
 
 
 def read_dual(

@@ -63,6 +63,7 @@ from napari_shadowinv.physics.units import (
     shown_fields,
 )
 from napari_shadowinv.provenance import Provenance
+from napari_shadowinv.transport.sites import are_middles
 
 if TYPE_CHECKING:
     import xarray
@@ -160,6 +161,15 @@ class Cells:
     mass: FloatArray
     flux: FloatArray
     displacement: FloatArray
+
+    @property
+    def are_pixels(self) -> bool:
+        """Whether each cell of the source is a pixel.
+
+        Then the image has slopes inside its pixels, and the displacement is that at their centres;
+        else a pixel's brightness is constant, and the displacement is read over two pixels.
+        """
+        return are_middles(self.sites)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -49,7 +49,8 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
     accuracy: _Fraction = Field(
         default=0.01,
         description="Target discretisation error of the displacement (relative r.m.s.). Sites are "
-        "added until it is reached or falls below a fifth of the noise error. Ignored with a "
+        "added until it is reached or falls below a fifth of the noise error; in the end a site "
+        "in each pixel, with slopes of the brightness inside the pixels. Ignored with a "
         "number of sites, 'single' stages or a solver other than 'newton'.",
     )
     max_error: MaxError = 0.05

@@ -123,21 +123,22 @@ class OpenObjective(TransportObjective):
     def __init__(
         self,
         level: SiteLevel,
-        image: FloatArray,
+        image: Density,
         margin: Margin,
         decay_length: float,
         *,
         threads: int | None = None,
     ) -> None:
+        self._side = image.side
+        margin = margin.split(round(1 / image.side))
         self._pixels = margin.beam.copy()
-        margin.within(self._pixels)[:] = image
-        density = Density.from_image(self._pixels)
+        margin.within(self._pixels)[:] = image.image
+        density = Density.from_image(self._pixels, side=image.side)
         super().__init__(level.triangulation.copy(), level.mass, density, threads=threads)
         self._beyond = np.nonzero(margin.beyond)
         self._beam = margin.beam[self._beyond]
-        self._site = KDTree(level.sites).query(
-            np.stack(self._beyond, axis=1), workers=available_threads(threads)
-        )[1]
+        places = image.side * (np.stack(self._beyond, axis=1) + 0.5) - 0.5
+        self._site = KDTree(level.sites).query(places, workers=available_threads(threads))[1]
         self._gain = 0.5 / decay_length**2  # the potential is half the weight
 
     def image_for(self, weights: FloatArray) -> Density:
@@ -146,7 +147,7 @@ class OpenObjective(TransportObjective):
         # 1 + x where that is more than 1, else eˣ, which is never negative
         share = np.where(excess > 0, 1 + excess, np.exp(np.minimum(excess, 0)))
         self._pixels[self._beyond] = self._beam * share
-        return Density.from_image(self._pixels)
+        return Density.from_image(self._pixels, side=self._side)
 
     def ground(self, weights: FloatArray) -> FloatArray:
         """Return the derivative: more weight in the margin attracts more flux."""
@@ -409,7 +410,7 @@ class BlurPath:
         """Yield the weights to start from, the most promising first."""
         if not solved:
             yield np.zeros(len(level.sites))
-            pixels = split_pixels(objective.image.image, objective.image.side)
+            pixels = split_pixels(objective.image.image, round(objective.image.side))
             yield with_full_cells(objective, _same_moments(level, pixels))[0]
             return
         last = solved[-1]

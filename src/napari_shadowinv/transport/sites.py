@@ -24,7 +24,8 @@ Quasi-Monte Carlo Methods* (SIAM, 1992), chapter 3.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Iterator, MutableMapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -122,6 +123,11 @@ def edge_flux(
 RATIO = 4  # sites of a level per site of the next coarser one
 
 
+def are_middles(sites: FloatArray) -> bool:
+    """Return whether sites are the middles of pixels."""
+    return bool((sites == np.rint(sites)).all())
+
+
 @dataclass(frozen=True)
 class Mirrored:
     """Sites and the mirror images of those near the image's border, which cover the image."""
@@ -142,10 +148,26 @@ class SiteLevel:
     shape: tuple[int, int]  # (H, W) of the source
     lloyd_iterations: int
 
+    @classmethod
+    def of(
+        cls, triangulation: RegularTriangulation, source: Density, threads: int | None = None
+    ) -> SiteLevel:
+        """Return the level of a triangulation's sites, as they are, over a source."""
+        if are_middles(triangulation.sites):
+            source = source.resolved(threads)
+        diagram = PowerDiagram(triangulation, source, with_moments=True, threads=threads)
+        masses, centroids = diagram.masses, diagram.centroids
+        return cls(triangulation.sites, masses, centroids, triangulation, source.shape, 0)
+
     @property
     def spacing(self) -> float:
         """Mean distance between neighbours, sqrt(area of the image / n), in px."""
         return _spacing(self.shape, len(self.sites))
+
+    @cached_property
+    def is_of_pixels(self) -> bool:
+        """Whether the sites are the middles of pixels, whose cells of the source are the pixels."""
+        return are_middles(self.sites)
 
     @cached_property
     def mirrored(self) -> Mirrored:
@@ -186,12 +208,12 @@ class Levels(Sequence[SiteLevel]):
         self,
         counts: tuple[int, ...],
         make: Callable[[int, Reporter], SiteLevel],
-        slots: dict[int, _Slot] | None = None,
+        slots: MutableMapping[int, _Slot] | None = None,
         report: Reporter | None = None,
     ) -> None:
         self.counts = counts
         self._make = make
-        self._slots = {} if slots is None else slots
+        self._slots: MutableMapping[int, _Slot] = {} if slots is None else slots
         self._report = report or Reporter()
 
     @property
@@ -229,6 +251,26 @@ class Levels(Sequence[SiteLevel]):
         """Return the levels with fewer than `count` sites, and the level with `count`."""
         counts = (*(level_count for level_count in self.counts if level_count < count), count)
         return Levels(counts, self._make, self._slots, self._report)
+
+    def ending_in_pixels(
+        self, source: FloatArray, pixels: BoolArray, threads: int | None = None
+    ) -> Levels:
+        """Return the coarser levels, and one with a site in the middle of each of some pixels.
+
+        Source and pixels have the shape (H, W).
+        """
+        last = int(np.count_nonzero(pixels))
+
+        def make(count: int, report: Reporter) -> SiteLevel:
+            if count < last:
+                return self._make(count, report)
+            middles = np.argwhere(pixels).astype(np.float64)
+            sites = np.ascontiguousarray(middles[hilbert_order(middles)])
+            beam = Density.from_image(source, threads=threads)
+            return SiteLevel.of(RegularTriangulation(sites, region=beam.region), beam, threads)
+
+        counts = (*(count for count in self.counts if count < last), last)
+        return Levels(counts, make, ChainMap({last: _Slot()}, self._slots), self._report)
 
     def with_reporter(self, report: Reporter | None) -> Levels:
         """Return the same levels with another report for those still to be computed."""
@@ -297,6 +339,7 @@ class SitePlan:
     margin: Margin | None = None
     unit: float = 1.0  # flux of the source that the levels' masses count as 1
     measured: bool = True  # whether the source was recorded; else it is an estimate
+    pixels: Levels | None = None  # up to one with a site in each lit pixel, if the source is smooth
 
     @property
     def margin_width(self) -> int:

@@ -113,6 +113,7 @@ def solve(
     start: FloatArray | None = None,
     needed: Needed | None = None,
     solved: Sequence[LevelSolution] = (),
+    finest: Callable[[], SiteLevel | None] | None = None,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
@@ -120,7 +121,8 @@ def solve(
     level alone, if that converges. After each coarser level, `needed` returns the factor on the
     number of sites that would suffice; at 1 or less the solution ends there. Levels that are
     already `solved` are not solved again. Returns one solution for each level that was tried. If a
-    level stalls, the finest one is solved from zero weights. The last one counts.
+    level stalls, the finest one is solved from zero weights. The last one counts. `finest`, called
+    after `needed`, may return a level that is solved instead of the finest.
     """
     if target.options.stages == "single":
         levels = levels[-1:]
@@ -129,7 +131,7 @@ def solve(
         if nearby is not None:
             return [nearby]
     with levels.in_background(target.options.threads) as begin:
-        return _solve_levels(levels, target, report, needed, solved, begin)
+        return _solve_levels(levels, target, report, needed, solved, begin, finest)
 
 
 def _solve_levels(
@@ -139,6 +141,7 @@ def _solve_levels(
     needed: Needed | None,
     solved: Sequence[LevelSolution],
     begin: Callable[[Sequence[int]], None],
+    instead: Callable[[], SiteLevel | None] | None,
     *,
     limits: LevelLimits = LevelLimits(),
 ) -> list[LevelSolution]:
@@ -150,10 +153,14 @@ def _solve_levels(
     fewest = len(solutions[-1].weights) if solutions else 0
     finer = [count for count in levels.counts if count > fewest]
     times = math.inf  # as many sites are needed as there are
-    begin(finer[::-1] if needed is None else [count for count in finer if count <= limits.prepared])
+    likely = finer[:-1] if instead else finer
+    begin(
+        finer[::-1] if needed is None else [count for count in likely if count <= limits.prepared]
+    )
     while finer:
-        level = levels.at(finer.pop(0))
+        count = finer.pop(0)
         finest = not finer
+        level = (instead() if instead and finest and solutions else None) or levels.at(count)
         # The level that is expected to be enough is solved as well as it has to be in the end.
         tolerance = options.tolerance if finest or times <= RATIO else coarse
         objective = target.objective(level)
@@ -166,13 +173,18 @@ def _solve_levels(
                 if len(solutions[-1].weights) > limits.kept:
                     solutions[-1].forget_surface()
             solution = _solve_level(objective, weights, options, tolerance, report)
+        if instead and finest and level.is_of_pixels and not solution.converged:
+            instead, finer = None, [count]
+            continue
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > limits.stalled and len(levels) > 1:
-            return [*solutions, _restart(levels[-1], target, solution if finest else None, report)]
+            stalled = solution if finest else None
+            last = level if finest else levels[-1]
+            return [*solutions, _restart(last, target, stalled, report)]
         if needed is None or finest:
             continue
         times = needed(solutions)
-        if times > RATIO:
+        if times > RATIO and not (instead and len(finer) == 2 and instead()):
             begin(finer[1:2])
         elif times <= 1:
             if solution.residual <= options.tolerance:
@@ -271,15 +283,22 @@ class Target:
     ) -> Target:
         return cls(Density.from_image(image, threads=options.threads), margin, options)
 
+    @cached_property
+    def resolved(self) -> Density:
+        """The image with slopes inside its pixels."""
+        return self.density.resolved(self.options.threads)
+
     def objective(self, level: SiteLevel) -> TransportObjective:
         """Pose the problem for the sites of a level."""
+        return self._objective(level, self.resolved if level.is_of_pixels else self.density)
+
+    def _objective(self, level: SiteLevel, density: Density) -> TransportObjective:
         threads = self.options.threads
         if self.margin is not None:
             decay_length = self.options.decay_length or self.margin.width
-            image = self.density.image
-            return OpenObjective(level, image, self.margin, decay_length, threads=threads)
+            return OpenObjective(level, density, self.margin, decay_length, threads=threads)
         triangulation = level.triangulation.copy()
-        return TransportObjective(triangulation, level.mass, self.density, threads=threads)
+        return TransportObjective(triangulation, level.mass, density, threads=threads)
 
     def blurred_objective(self, level: SiteLevel, blur: float, factor: int) -> TransportObjective:
         """Pose it for pixels split by a factor along each side, then blurred by `blur` of them."""
@@ -291,7 +310,7 @@ class Target:
             target = Target(blur_to_density(pixels, blur, options.threads), margin, options)
         else:
             target = Target.of(blur_image(pixels, blur, options.threads), options, margin)
-        return target.objective(level)
+        return target._objective(level, target.density)
 
     def solve_blurred_first(
         self, level: SiteLevel, tolerance: float, report: Reporter | None
