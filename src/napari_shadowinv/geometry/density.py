@@ -143,9 +143,9 @@ def resolve_pixels(image: FloatArray, parts: int = PARTS, *, least: float = 0.5)
     (height, width), mean = image.shape, image / parts**2
     blocks = fine.reshape(height, parts, width, parts)
     drop = np.maximum(mean - blocks.min(axis=(1, 3)), 1e-300)
-    kept = np.minimum(1.0, (1 - least) * mean / drop)[:, None, :, None]
+    slopes = np.minimum(1.0, (1 - least) * mean / drop)[:, None, :, None]
     mean = mean[:, None, :, None]
-    return np.asarray((mean + kept * (blocks - mean)).reshape(fine.shape))
+    return np.asarray((mean + slopes * (blocks - mean)).reshape(fine.shape))
 
 
 @njit(nogil=True, cache=True, inline="always")

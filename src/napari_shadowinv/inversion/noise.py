@@ -449,8 +449,8 @@ class _CalmDifferences:
     def curve(self, share: float) -> tuple[FloatArray, FloatArray]:
         """Return the lags at which V can be measured, and V."""
         variances = np.array([self.variance(lag, share) for lag in self.limits.lags])
-        known = np.isfinite(variances)
-        return np.array(self.limits.lags, dtype=np.float64)[known], variances[known]
+        measured = np.isfinite(variances)
+        return np.array(self.limits.lags, dtype=np.float64)[measured], variances[measured]
 
     def rise_evenly(self) -> bool:
         """Whether V rises at a large lag, and not more where the image is less calm."""

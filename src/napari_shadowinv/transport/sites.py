@@ -259,18 +259,18 @@ class Levels(Sequence[SiteLevel]):
 
         Source and pixels have the shape (H, W).
         """
-        last = int(np.count_nonzero(pixels))
+        n_sites = int(np.count_nonzero(pixels))
 
         def make(count: int, report: Reporter) -> SiteLevel:
-            if count < last:
+            if count < n_sites:
                 return self._make(count, report)
             middles = np.argwhere(pixels).astype(np.float64)
             sites = np.ascontiguousarray(middles[hilbert_order(middles)])
             beam = Density.from_image(source, threads=threads)
             return SiteLevel.of(RegularTriangulation(sites, region=beam.region), beam, threads)
 
-        counts = (*(count for count in self.counts if count < last), last)
-        return Levels(counts, make, ChainMap({last: _Slot()}, self._slots), self._report)
+        counts = (*(count for count in self.counts if count < n_sites), n_sites)
+        return Levels(counts, make, ChainMap({n_sites: _Slot()}, self._slots), self._report)
 
     def with_reporter(self, report: Reporter | None) -> Levels:
         """Return the same levels with another report for those still to be computed."""

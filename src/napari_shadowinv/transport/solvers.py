@@ -179,8 +179,10 @@ def _solve_levels(
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > limits.stalled and len(levels) > 1:
             stalled = solution if finest else None
-            last = level if finest else levels[-1]
-            return [*solutions, _restart(last, target, stalled, report)]
+            return [
+                *solutions,
+                _restart(level if finest else levels[-1], target, stalled, report),
+            ]
         if needed is None or finest:
             continue
         times = needed(solutions)
