@@ -319,7 +319,7 @@ def _pose(
         )
         assumed = inputs.registered.is_assumed
         budget = Budget(plan, prepared, noise, options, inputs.instrument, is_shift_assumed=assumed)
-        levels = _levels_to_solve(plan, levels, inputs.start, options, report)
+        levels = _levels_to_solve(plan, levels, inputs.start, options)
     return _Problem(inputs, plan, levels, prepared, options, noise, budget)
 
 
@@ -334,11 +334,7 @@ def _check_image(
 
 
 def _levels_to_solve(
-    plan: SitePlan,
-    levels: Levels,
-    start: Inversion | None,
-    options: InversionOptions,
-    report: Reporter,
+    plan: SitePlan, levels: Levels, start: Inversion | None, options: InversionOptions
 ) -> Levels:
     if not options.is_adaptive and not levels.is_complete:
         beam = SpreadBeam.of(plan.source, plan.mask, options)
@@ -348,7 +344,7 @@ def _levels_to_solve(
     may_differ = options.is_adaptive and not levels.is_complete
     sites = start.cells.sites
     if plan.pixels is not None and are_middles(sites) and len(sites) == plan.pixels.counts[-1]:
-        levels = plan.pixels.with_reporter(report)
+        levels = plan.pixels
     return _levels_from_start(start, levels, plan.margin_width, may_differ=may_differ)
 
 

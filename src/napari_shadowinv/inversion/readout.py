@@ -24,7 +24,6 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from scipy.ndimage import binary_dilation
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.arrays import block_sums
@@ -320,26 +319,20 @@ def read_out(
     return _at_middles(fields[0], solution) if solution.level.is_of_pixels else fields
 
 
-_DARK = 0.01  # of the mean, for a pixel without light
-
-
 def _at_middles(potential: FloatArray, solution: LevelSolution) -> tuple[FloatArray, FloatArray]:
     """Return potential and displacement at the middles of pixels that are the cells of the source.
 
     The dual variables of sites 1 px apart are those of a potential less 1/24 of its Laplacian, and
     the cells' centroids move by the mean of the displacement over a pixel, which adds as much.
-    Half of each is the displacement, and beside pixels without light the centroid's alone.
+    Half of each is the displacement.
     """
     level = solution.level
     padded = np.pad(potential, 2, mode="symmetric")  # no flux crosses the border
     slopes = first_derivative(padded, 0)[:, 2:-2], first_derivative(padded, 1)[2:-2]
     displacement = -np.array(slopes)
     rows, columns = np.rint(level.sites.T).astype(np.int64)
-    is_dark = np.ones(level.shape, bool)
-    is_dark[rows, columns] = level.mass < _DARK * level.mass.mean()
-    share = np.where(binary_dilation(is_dark, iterations=2), 1.0, 0.5)[rows, columns]
-    moves = solution.displacement.T
-    displacement[:, rows, columns] += share * (moves - displacement[:, rows, columns])
+    displacement[:, rows, columns] += solution.displacement.T
+    displacement[:, rows, columns] /= 2
     potential = _softened(padded[1:-1, 1:-1])
     return potential - border_mean(potential), displacement
 
