@@ -206,11 +206,12 @@ class Budget:
 
     @cached_property
     def _is_noise_known(self) -> bool:
-        """Whether noise is a reason for fewer sites than a stated accuracy needs.
+        """Whether noise is a reason for fewer sites than the accuracy needs.
 
-        It is none if structure hides it, so that all that is known is a bound.
+        For more than the default accuracy it is none if structure hides it: a bound is known alone.
         """
-        return not (self._noise().is_bound and "accuracy" in self.options.model_fields_set)
+        is_usual = self.options.accuracy >= InversionOptions().accuracy
+        return is_usual or not self._noise().is_bound
 
     @cached_property
     def _resolves_pixels(self) -> bool:
