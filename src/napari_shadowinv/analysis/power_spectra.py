@@ -195,9 +195,8 @@ class SpectralResponse:
 def measure_response(
     spectrum: RingSpectrum,
     weights: FloatArray,
-    n_sites: int,
+    options: InversionOptions,
     *,
-    of_pixels: bool = False,
     phantoms: int,
     seed: int,
     report: Reporter,
@@ -207,15 +206,11 @@ def measure_response(
     """Measure how an inversion changes a spectrum, on random fields with that spectrum.
 
     Rays cross, and small structures are lost, the more the stronger the field. Random fields are
-    made with the measured spectrum, less its noise, imaged, inverted with as many sites, or with
-    those `of_pixels`, and measured in the same window, (H, W). As the measured spectrum is too low
-    where power is lost, it is corrected by the response of a first field, and again by a second
-    one's, but by no response below `least`, before the response is measured on the phantoms. The
-    reporter is called before each field.
+    made with the measured spectrum, less its noise, imaged, inverted, and measured in the same
+    window, (H, W). As the measured spectrum is too low where power is lost, it is corrected by the
+    response of a first field, and again by a second one's, but by no response below `least`, before
+    the response is measured on the phantoms. The reporter is called before each field.
     """
-    # An accuracy out of reach leads to sites in all pixels.
-    sites = InversionOptions(accuracy=1e-9) if of_pixels else InversionOptions(n_sites=n_sites)
-    options = sites.model_copy(update={"noise_level": 1e-3})
     ratio = np.ones(len(spectrum.k))
     spread, contrast = np.zeros(len(spectrum.k)), 0.0
     smooth = _mean_over_rings(spectrum.modes)

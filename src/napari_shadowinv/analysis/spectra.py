@@ -51,6 +51,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, to_figures
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.beam import length_text, number_field
 from napari_shadowinv.physics.units import PIXEL
 
@@ -275,8 +276,7 @@ class TurbulenceSpectrum(Product):
             response = measure_response(
                 less_noise,
                 weights,
-                max(round(potential.size / product.resolution**2), 16),
-                of_pixels=noise is not None and noise.of_pixels,
+                _with_sites(round(potential.size / product.resolution**2), noise),
                 phantoms=self.phantoms,
                 seed=self.phantom_seed,
                 report=Reporter() if noise is None else noise.report,
@@ -461,6 +461,14 @@ class TurbulenceSpectrum(Product):
             "Bands of slope and r.m.s. field hold the scatter between parts of the image, as the "
             "window has a finite number of structures."
         )
+
+
+def _with_sites(count: int, noise: FieldNoise | None) -> InversionOptions:
+    """Return options by which phantoms are inverted with as many sites as the field."""
+    if noise is not None and noise.of_pixels:
+        # An accuracy out of reach leads to a site in each pixel.
+        return InversionOptions(noise_level=1e-3, accuracy=1e-9)
+    return InversionOptions(noise_level=1e-3, n_sites=max(count, 16))
 
 
 def _without_power(frame: FieldFrame, taper: float) -> RingSpectrum:

@@ -360,8 +360,11 @@ class _Solution(NamedTuple):
 
 def _solve(problem: _Problem, report: Reporter, seconds: dict[str, float]) -> _Solution:
     """Solve levels until errors and re-projection need no more sites, and read the fields out."""
-    options, levels, budget = problem.options, problem.levels, problem.budget
+    options, budget = problem.options, problem.budget
     start, adaptive = problem.inputs.start, problem.is_adaptive
+    levels, pixels = problem.levels, problem.plan.pixels
+    if adaptive and pixels is not None and budget.resolves_pixels:
+        levels = pixels.with_reporter(report)
     if not adaptive:
         _ = problem.checks  # begin
     solutions: list[LevelSolution] = []
@@ -375,16 +378,16 @@ def _solve(problem: _Problem, report: Reporter, seconds: dict[str, float]) -> _S
                 start=None if start is None else start.cells.weights,
                 needed=problem.needed if adaptive else None,
                 solved=solutions,
-                finest=budget.finest if adaptive and problem.plan.pixels else None,
             )
         answer = solutions[-1]
+        if answer.level.is_of_pixels and not answer.converged and levels is not problem.levels:
+            levels, solutions = problem.levels, solutions[:-1]
+            continue
         if answer.converged:
             with measure_time("errors", seconds):
                 budget.free_target(solutions)
         fields, wait_for_errors = _read_fields(problem, solutions, report, seconds)
-        finest = adaptive and (
-            answer.level.is_of_pixels or len(answer.weights) == levels.counts[-1]
-        )
+        finest = adaptive and len(answer.weights) == levels.counts[-1]
         more = adaptive and answer.converged and not finest
         units = problem.prepared.in_units()
         if not more or not is_coarse(units, fields.reprojection, problem.noise(), options.threads):

@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import (
     binary_dilation,
+    correlate1d,
     gaussian_filter,
     map_coordinates,
     maximum_filter,
@@ -66,6 +67,10 @@ _EDGE_PLACES = 200  # along the shorter side at most, where the error by the edg
 
 # Of the noise: what slopes in the pixels change. Sites in all pixels raise the noise by 3 to 6 %.
 _LEAST_GAIN = 0.35
+
+# Slopes in a pixel from the means of five, of fourth order, less those of three.
+_FOURTH_LESS_SECOND = np.array([5, -34, 0, 34, -5]) / 48 - np.array([0, -1, 0, 1, 0]) / 2
+_AT_JUMPS = 3.0  # times this change: how far light is away from its place in a pixel
 
 _TESTED_VARIATION = 0.01  # of a beam, r.m.s.
 
@@ -165,7 +170,7 @@ class Budget:
         share = share_of(error, rms)
         text = f"their discretisation error is about {share}{' of the displacement' * (rms > 0)}"
         allowed = self.options.accuracy * rms
-        if self._resolves_pixels and self._by_pixels[0] > allowed:
+        if self.resolves_pixels and self._by_pixels[0] > allowed:
             self.reason = ""
             return math.inf
         if error <= allowed:
@@ -214,17 +219,12 @@ class Budget:
         return is_usual or not self._noise().is_bound
 
     @cached_property
-    def _resolves_pixels(self) -> bool:
+    def resolves_pixels(self) -> bool:
         """Whether there is a level with a site in each pixel, and noise does not hide its gain."""
         if self._plan.pixels is None:
             return False
         gain, noise = self._by_pixels
         return not self._is_noise_known or gain > _LEAST_GAIN * noise
-
-    def finest(self) -> SiteLevel | None:
-        """Return the level with a site in each pixel if that is better than as many others."""
-        pixels = self._plan.pixels
-        return pixels[-1] if pixels is not None and self._resolves_pixels else None
 
     def errors(
         self, solutions: Sequence[LevelSolution], potential: FloatArray, displacement: FloatArray
@@ -242,9 +242,12 @@ class Budget:
         estimate = _Estimator.of(response, lit, peak, along)
         discretisation = None
         if len(solved) > 1:
-            squares, _ = self._change(solved)
-            spacing = max(solved[-2].level.spacing, _stride(mask.shape))
-            weights = _near(peak, self._places.T, spacing)
+            places, spacing = self._places, max(solved[-2].level.spacing, _stride(mask.shape))
+            if solved[-1].level.is_of_pixels:
+                places, squares = self._gap_in_pixels(solved[-1], displacement)
+            else:
+                squares, _ = self._change(solved)
+            weights = _near(peak, places.T, spacing)
             discretisation = root_of(squares.mean(), (squares * weights).sum() / 2)
         lengths = ErrorEstimate(float(np.sqrt(np.mean(length[lit] ** 2))), float(length.max()))
         effects, sensitivities, sizes, assumed = self._by_effects(response, displacement, estimate)
@@ -380,6 +383,26 @@ class Budget:
             rate = float(np.clip(np.sqrt(changes[1] / changes[0]), *_RATES))
         last = ((self._move(solved[-1]) - self._move(solved[-2])) ** 2).sum(axis=0)
         return last * discretisation_share(times, rate) ** 2, _power_of(rate)
+
+    def _gap_in_pixels(
+        self, solution: LevelSolution, displacement: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Estimate squared discretisation errors where each pixel is a cell; return their places.
+
+        The displacement is the mean of two, by the potential and by the cells' centroids: half of
+        their difference is about its error in smooth images. At jumps it is that of the light's
+        place in a pixel: some times the change of it from slopes of second to fourth order.
+        """
+        sites = solution.level.sites - self._plan.margin_width
+        inside = ((sites > -0.5) & (sites < np.array(self._prepared.mask.shape) - 0.5)).all(axis=1)
+        rows, columns = np.rint(sites[inside].T).astype(np.int64)
+        gap = solution.displacement[inside].T - displacement[:, rows, columns]
+        light = self._prepared.floored_image
+        changes = (
+            np.abs(correlate1d(light, _FOURTH_LESS_SECOND, axis)[rows, columns]) for axis in (0, 1)
+        )
+        moved = sum(change**2 for change in changes) / light[rows, columns] ** 2
+        return np.stack([rows, columns]), (gap**2).sum(axis=0) + (_AT_JUMPS / 12) ** 2 * moved
 
     def _response(self, solved: Sequence[LevelSolution]) -> LinearResponse:
         few = [candidate for candidate in solved if len(candidate.weights) <= _MAX_RESPONSE_SITES]

@@ -113,7 +113,6 @@ def solve(
     start: FloatArray | None = None,
     needed: Needed | None = None,
     solved: Sequence[LevelSolution] = (),
-    finest: Callable[[], SiteLevel | None] | None = None,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
@@ -121,8 +120,7 @@ def solve(
     level alone, if that converges. After each coarser level, `needed` returns the factor on the
     number of sites that would suffice; at 1 or less the solution ends there. Levels that are
     already `solved` are not solved again. Returns one solution for each level that was tried. If a
-    level stalls, the finest one is solved from zero weights. The last one counts. `finest`, called
-    after `needed`, may return a level that is solved instead of the finest.
+    level stalls, the finest one is solved from zero weights. The last one counts.
     """
     if target.options.stages == "single":
         levels = levels[-1:]
@@ -131,7 +129,7 @@ def solve(
         if nearby is not None:
             return [nearby]
     with levels.in_background(target.options.threads) as begin:
-        return _solve_levels(levels, target, report, needed, solved, begin, finest)
+        return _solve_levels(levels, target, report, needed, solved, begin)
 
 
 def _solve_levels(
@@ -141,7 +139,6 @@ def _solve_levels(
     needed: Needed | None,
     solved: Sequence[LevelSolution],
     begin: Callable[[Sequence[int]], None],
-    instead: Callable[[], SiteLevel | None] | None,
     *,
     limits: LevelLimits = LevelLimits(),
 ) -> list[LevelSolution]:
@@ -153,14 +150,10 @@ def _solve_levels(
     fewest = len(solutions[-1].weights) if solutions else 0
     finer = [count for count in levels.counts if count > fewest]
     times = math.inf  # as many sites are needed as there are
-    likely = finer[:-1] if instead else finer
-    begin(
-        finer[::-1] if needed is None else [count for count in likely if count <= limits.prepared]
-    )
+    begin(finer[::-1] if needed is None else [count for count in finer if count <= limits.prepared])
     while finer:
-        count = finer.pop(0)
+        level = levels.at(finer.pop(0))
         finest = not finer
-        level = (instead() if instead and finest and solutions else None) or levels.at(count)
         # The level that is expected to be enough is solved as well as it has to be in the end.
         tolerance = options.tolerance if finest or times <= RATIO else coarse
         objective = target.objective(level)
@@ -173,20 +166,13 @@ def _solve_levels(
                 if len(solutions[-1].weights) > limits.kept:
                     solutions[-1].forget_surface()
             solution = _solve_level(objective, weights, options, tolerance, report)
-        if instead and finest and level.is_of_pixels and not solution.converged:
-            instead, finer = None, [count]
-            continue
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > limits.stalled and len(levels) > 1:
-            stalled = solution if finest else None
-            return [
-                *solutions,
-                _restart(level if finest else levels[-1], target, stalled, report),
-            ]
+            return [*solutions, _restart(levels[-1], target, solution if finest else None, report)]
         if needed is None or finest:
             continue
         times = needed(solutions)
-        if times > RATIO and not (instead and len(finer) == 2 and instead()):
+        if times > RATIO:
             begin(finer[1:2])
         elif times <= 1:
             if solution.residual <= options.tolerance:
