@@ -9,6 +9,10 @@ from scipy.optimize import brentq
 from napari_shadowinv.analysis._field_samples import sampled_fields
 from napari_shadowinv.inversion import invert, plan_sites
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics import phantoms
+from napari_shadowinv.physics.forward import synthetic_image
+from napari_shadowinv.physics.poisson import counting_error
+from napari_shadowinv.physics.setup import ProtonSetup
 
 SHAPE = (24, 60)
 EXACT = InversionOptions(accuracy=0.001)
@@ -84,6 +88,36 @@ def test_noise_that_hides_the_slopes_keeps_pixels_constant():
     noisy = image + 0.3 * np.random.default_rng(0).normal(size=SHAPE)
     options = InversionOptions(negative="clip")
     assert not invert(noisy, options=options).cells.are_pixels
+
+
+@pytest.mark.parametrize(
+    ("make", "size"), [(phantoms.toroid, 97.0), (phantoms.cosine_toroid, 40.0)]
+)
+def test_the_error_told_is_that_made(make, size):
+    """Within a factor of two, for a smooth field and for one with a kink at its rim."""
+    setup = ProtonSetup.example()
+    setup = setup.model_copy(update={"pixel_size": 2 * setup.pixel_size})
+    truth = make((100, 100), setup, size, 30e-6).displacement
+    image = synthetic_image(truth)
+    inversion = invert(image, source=np.ones(image.shape), options=EXACT)
+    assert inversion.cells.are_pixels
+    made = np.sqrt(((inversion.displacement - truth) ** 2).sum(axis=0).mean())
+    assert 0.5 < made / inversion.errors.discretisation.rms < 2
+
+
+def test_counts_leave_what_is_told():
+    """The scatter of inversions of all pixels, by independent counts of a weak object."""
+    blob, counts = phantoms.gaussian_blob((48, 48), 4.0, 7.0), 2000.0
+    rng, image = np.random.default_rng(1), synthetic_image(blob.displacement)
+    options = InversionOptions(accuracy=1e-9, noise_level=1e-9)
+    shots = [rng.poisson(counts * image) / counts for _ in range(20)]
+    found = [invert(shot, source=np.ones(shot.shape), options=options) for shot in shots]
+    assert found[0].cells.are_pixels
+    scatter = np.std([each.displacement for each in found], axis=0, ddof=1)
+    made = np.sqrt((scatter**2).sum(axis=0).mean())
+    assert made == pytest.approx(counting_error((48, 48), counts), rel=0.08)
+    told = invert(shots[0], source=np.ones(image.shape)).errors.by_counts.rms
+    assert told == pytest.approx(made, rel=0.15)
 
 
 def test_products_take_the_field_as_it_is():

@@ -10,6 +10,7 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import ellipse_pair, toroid
 from napari_shadowinv.physics.poisson import (
     border_mean,
+    counting_error,
     poisson_invert,
     potential_from_displacement,
 )
@@ -52,6 +53,17 @@ def test_no_flux_crosses_the_border() -> None:
 def test_an_undisturbed_beam_has_no_potential() -> None:
     source = np.random.default_rng(0).uniform(1, 5, (20, 30))
     np.testing.assert_allclose(poisson_invert(3 * source, source=source), 0, atol=1e-12)
+
+
+def test_counts_scatter_a_weak_field_by_what_is_told() -> None:
+    rng, shape, counts = np.random.default_rng(0), (48, 40), 200.0
+    squares = []
+    for _ in range(60):
+        image = rng.poisson(counts, shape) / counts
+        change = image / image.mean() - 1
+        # ∫ |∇φ|² = -∫ φ ∇²φ if no flux crosses the border.
+        squares.append(-(poisson_invert(image) * change).mean())
+    assert counting_error(shape, counts) == pytest.approx(np.mean(squares) ** 0.5, rel=0.03)
 
 
 def test_poisson_inversion_refuses_wrong_input() -> None:

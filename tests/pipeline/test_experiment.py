@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from napari_shadowinv import Instrument, OpticalSetup, ProtonSetup, invert, read, trace, write
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import Verdict
+from napari_shadowinv.facts import Verdict, percent
 from napari_shadowinv.physics import FieldGrid
 from napari_shadowinv.physics.phantom_models import BlobRecipe, FourToroidsRecipe, ToroidRecipe
 from napari_shadowinv.physics.phantoms import gaussian_blob, toroid
+from napari_shadowinv.physics.poisson import counting_error
 from napari_shadowinv.pipeline import ExperimentOptions, plan_experiment
 from napari_shadowinv.pipeline.experiment_object import (
     Grid,
@@ -373,3 +374,21 @@ def test_tables_have_a_row_for_each_draw():
     first, second = plan.rows()
     assert ",".join(first) == "draw,verdict,error,peak_error,reported_error,searched,part_noise"
     assert (second["draw"], second["verdict"], second["error"]) == (1, "determined", 0.2)
+
+
+def test_the_limit_by_counts_is_known_before_the_first_shot():
+    """The error made is about as large."""
+    options = ExperimentOptions(counts=200, draws=4, method="inversion")
+    said: list[str] = []
+    plan = plan_experiment(
+        BlobRecipe(amplitude=10, sigma=9),
+        shape=(64, 64),
+        instrument=Instrument(beam_rms=0),
+        options=options,
+        on_progress=lambda progress: said.append(progress.text),
+    )
+    field = gaussian_blob((64, 64), 10, 9).displacement
+    rms = np.sqrt((field**2).sum(axis=0).mean())
+    assert plan.limit == pytest.approx(counting_error((64, 64), 200) / rms, rel=1e-3)
+    assert f"limit by counts {percent(plan.limit)}" in said[:2]
+    assert plan.error.median == pytest.approx(plan.limit, rel=0.2)

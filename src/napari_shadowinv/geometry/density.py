@@ -199,7 +199,8 @@ def walk_inside(
     dy, dx = yb - ya, xb - xa
     down, right = 1 if last_row > row else 0, 1 if last_column > column else 0
     # shares of the segment where it next leaves its row and its column of pixels
-    per_y, per_x = 1.0 / dy, 1.0 / dx
+    per_y = 1.0 / dy if dy != 0.0 else 0.0  # then it stays in its row, and likewise in its column
+    per_x = 1.0 / dx if dx != 0.0 else 0.0
     t_y = (row + down - ya) * per_y if row != last_row else 2.0
     t_x = (column + right - xa) * per_x if column != last_column else 2.0
     flux = mass = moment_y = moment_x = inertia = 0.0

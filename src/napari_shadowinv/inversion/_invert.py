@@ -378,10 +378,12 @@ def _solve(problem: _Problem, report: Reporter, seconds: dict[str, float]) -> _S
                 start=None if start is None else start.cells.weights,
                 needed=problem.needed if adaptive else None,
                 solved=solutions,
+                restarts=levels is problem.levels,
             )
         answer = solutions[-1]
-        if answer.level.is_of_pixels and not answer.converged and levels is not problem.levels:
-            levels, solutions = problem.levels, solutions[:-1]
+        if levels is not problem.levels and not answer.converged:
+            levels = problem.levels
+            solutions = [each for each in solutions if not each.level.is_of_pixels]
             continue
         if answer.converged:
             with measure_time("errors", seconds):

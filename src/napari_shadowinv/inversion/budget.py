@@ -276,6 +276,7 @@ class Budget:
             rms=lengths.rms,
             discretisation=discretisation,
             noise=estimate(*self._noisy_moves(response, solved[-1].level.spacing)),
+            by_counts=estimate(*self._noisy_moves(response, 1.0)),
             effects=effects,
             edge=edge,
             sides=sides,

@@ -70,6 +70,9 @@ class ErrorBudget:
         Largest displacement inside the mask and its root mean square, px, for comparison.
     noise : ErrorEstimate
         Scatter by the noise of image and source.
+    by_counts : ErrorEstimate or None
+        Scatter by the same noise of all waves that the pixels show: the least of any inversion of
+        one image with a known beam. Noise above it is of the method, below it of fewer sites.
     effects : dict of str to ErrorEstimate
         Effects of errors of the flux in the cells, by their causes in `FLUX_ERRORS`, and of the
         instrument's effects.
@@ -125,6 +128,7 @@ class ErrorBudget:
     rms: float
     noise: ErrorEstimate
     effects: dict[str, ErrorEstimate]
+    by_counts: ErrorEstimate | None = None
     discretisation: ErrorEstimate | None = None
     edge: ErrorEstimate | None = None
     sides: tuple[str, ...] = ()

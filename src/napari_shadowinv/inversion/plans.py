@@ -56,23 +56,15 @@ class SpreadBeam(NamedTuple):
         return round(n_sites * float(self.values.sum()) / float(inner.sum()))
 
     def lit_pixels(
-        self,
-        mask: BoolArray | None,
-        options: InversionOptions,
-        *,
-        dim: float = 0.65,
-        most: float = 0.01,
+        self, options: InversionOptions, *, dim: float = 0.65, most: float = 0.01
     ) -> BoolArray | None:
         """Return the pixels with light, (H, W), of an even beam, each of which may have a site.
 
         None if the beam jumps: more than the share `most` of the pixels are `dim` beside the
         brightest of their neighbours. Sites that are as dense as the beam is bright suit it better.
         """
-        used = np.ones(self.values.shape, bool)
-        if mask is not None:
-            (used if self.margin is None else self.margin.within(used))[:] = mask
-        brightest = maximum_filter(np.where(used, self.values, 0.0), 3)
-        if np.count_nonzero(used & (self.values < dim * brightest)) > most * used.sum():
+        brightest = maximum_filter(self.values, 3)
+        if np.count_nonzero(self.values < dim * brightest) > most * brightest.size:
             return None
         return np.asarray(self.values >= 0.5 * options.floor * self.values.mean())
 
@@ -95,8 +87,9 @@ def plan_over(
         threads=options.threads,
     ).levels
     pixels = None
-    if options.is_adaptive and n_sites == checked.size:
-        lit = beam.lit_pixels(usable, options)
+    # At the edges of masks the image jumps, and sites in all pixels do not converge.
+    if options.is_adaptive and n_sites == checked.size and (usable is None or usable.all()):
+        lit = beam.lit_pixels(options)
         pixels = None if lit is None else levels.ending_in_pixels(beam.values, lit, options.threads)
     return SitePlan(checked, levels, usable, beam.margin, beam.unit, measured, pixels)
 

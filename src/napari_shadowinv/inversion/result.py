@@ -37,7 +37,7 @@ from napari_shadowinv.facts import (
 )
 from napari_shadowinv.instrument.effects import RecordedShot
 from napari_shadowinv.inversion.error_bars import Quantities
-from napari_shadowinv.inversion.error_budget import ErrorBudget, per_pixel_of
+from napari_shadowinv.inversion.error_budget import ErrorBudget, per_pixel_of, share_of
 from napari_shadowinv.inversion.normalise import lit_pixels
 from napari_shadowinv.inversion.solution_checks import DECISIVE
 from napari_shadowinv.inversion.variables import (
@@ -303,6 +303,12 @@ class Inversion(Summarised):
             "floor": f"{report.floor:g} of the mean: {report.floored_pixels} pixels raised, "
             f"{report.clipped_pixels} clipped",
         }
+        if errors is not None and errors.by_counts is not None:
+            details["limit by counts"] = (
+                f"{share_of(errors.by_counts.rms, errors.rms)} of the displacement (r.m.s.), by "
+                "all waves of 2 px and more if the beam is known; only assumptions about the "
+                f"field, such as few sites, leave less: {share_of(errors.noise.rms, errors.rms)}"
+            )
         convergence = Level.SOUND if report.converged else Level.FAILED
         assessment, error_rows = self.assessment, dict(self._error_rows(errors))
         if assessment.verdict is Verdict.CONDITIONAL:

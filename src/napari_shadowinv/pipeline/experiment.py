@@ -32,7 +32,7 @@ from napari_shadowinv.options import FitOptions, Instrument, InversionOptions
 from napari_shadowinv.physics.beam import BeamSetup
 from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.phantom_models import PhantomRecipe
-from napari_shadowinv.physics.poisson import potential_from_displacement
+from napari_shadowinv.physics.poisson import counting_error, potential_from_displacement
 from napari_shadowinv.physics.setup import Setup, deflector_titles
 from napari_shadowinv.pipeline.experiment_object import (
     PlannedObject,
@@ -179,6 +179,9 @@ def _plan(inputs: ExperimentInputs, report: Reporter) -> ExperimentPlan:
             "the object displaces rays by nothing in this experiment: check its strength, the "
             "energy and the distances"
         )
+    limit = counting_error(inputs.shape, options.counts * simulator.information)
+    limit /= float(np.sqrt((simulator.truth**2).sum(axis=0).mean()))
+    report("draws", 0, options.draws, f"limit by counts {percent(limit)}")
     ensure = ensure_fit_compiled if inputs.is_fit else ensure_inversion_compiled
     ensure(None, report.should_stop)
     prepared = time.perf_counter()
@@ -217,6 +220,7 @@ def _plan(inputs: ExperimentInputs, report: Reporter) -> ExperimentPlan:
         retrieved=first.displacement,
         seconds={"prepare": prepared - start, "shots": ended - prepared},
         is_thin=inputs.object.is_thin,
+        limit=limit,
     )
 
 

@@ -111,6 +111,7 @@ class ExperimentPlan(Summarised):
     retrieved: FloatArray  # (2, H, W), the same of the first draw
     seconds: dict[str, float]  # of each stage
     is_thin: bool = True  # whether the object is taken as thin, not traced
+    limit: float = math.nan  # least error that the counts allow, as a share of the field
 
     @property
     def verdicts(self) -> dict[Verdict, int]:
@@ -252,6 +253,13 @@ class ExperimentPlan(Summarised):
                 "the reported error: do not rely on the verdict in this experiment"
             )
             yield Fact("silent", "Warning", text, Level.DOUBTFUL)
+        if not math.isnan(self.limit):
+            text = (
+                f"{percent(self.limit)} of the field (r.m.s.), known before any shot: by all waves "
+                "of 2 px and more if the beam is known and rays do not cross; only assumptions "
+                "about the field leave less"
+            )
+            yield Fact("limit", "Limit by counts", text)
         yield Fact("error", "Error made", f"{self.error.text} of the field (r.m.s.)")
         yield Fact("peak_error", "Error at the peak", self.peak_error.text)
         total = f"{self.total.text} of the field (r.m.s.)"

@@ -105,6 +105,9 @@ class ShotSimulator:
         self._grid = Grid(shape, FINER, margin)
         self._nominal = [self._object.displacement(setup, self._grid) for setup in self._setups]
         self.truth = coarse[0]
+        # Of all images about the displacement in the first, over that of the first.
+        squares = [float((moved**2).sum()) for moved in coarse]
+        self.information = sum(squares) / max(squares[0], 1e-300)
         passed = self._object.transmission(self._setups[0], self._grid)
         self._open_share = np.ones(self._grid.sizes) if passed is None else passed
 

@@ -113,6 +113,7 @@ def solve(
     start: FloatArray | None = None,
     needed: Needed | None = None,
     solved: Sequence[LevelSolution] = (),
+    restarts: bool = True,
 ) -> list[LevelSolution]:
     """Solve on the coarsest level, carry the potential to the next, and so on.
 
@@ -120,7 +121,8 @@ def solve(
     level alone, if that converges. After each coarser level, `needed` returns the factor on the
     number of sites that would suffice; at 1 or less the solution ends there. Levels that are
     already `solved` are not solved again. Returns one solution for each level that was tried. If a
-    level stalls, the finest one is solved from zero weights. The last one counts.
+    level stalls, the finest one is solved from zero weights, unless it `restarts` not. The last one
+    counts.
     """
     if target.options.stages == "single":
         levels = levels[-1:]
@@ -129,7 +131,7 @@ def solve(
         if nearby is not None:
             return [nearby]
     with levels.in_background(target.options.threads) as begin:
-        return _solve_levels(levels, target, report, needed, solved, begin)
+        return _solve_levels(levels, target, report, needed, solved, begin, restarts)
 
 
 def _solve_levels(
@@ -139,6 +141,7 @@ def _solve_levels(
     needed: Needed | None,
     solved: Sequence[LevelSolution],
     begin: Callable[[Sequence[int]], None],
+    restarts: bool,
     *,
     limits: LevelLimits = LevelLimits(),
 ) -> list[LevelSolution]:
@@ -168,6 +171,8 @@ def _solve_levels(
             solution = _solve_level(objective, weights, options, tolerance, report)
         solutions.append(LevelSolution.of_level(level, objective, solution))
         if by_newton and solution.residual > limits.stalled and len(levels) > 1:
+            if not restarts:
+                return solutions
             return [*solutions, _restart(levels[-1], target, solution if finest else None, report)]
         if needed is None or finest:
             continue
