@@ -67,6 +67,26 @@ def test_failures_are_recorded_by_name(
     assert failure in solve(module, folder)["failure"]
 
 
+def test_another_program_reads_two_files_and_writes_a_third(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    script = folder / "linear.py"
+    script.write_text(
+        "import sys\nimport numpy as np\n"
+        f"sys.path.insert(0, {str(ROOT / 'benchmarks' / 'compare' / 'solvers')!r})\n"
+        "from poisson import solve\n"
+        "source, image = map(np.loadtxt, sys.argv[1:3])\n"
+        "np.savetxt(sys.argv[3], np.concatenate(solve(source, image)))\n"
+    )
+    command = f"{sys.executable} {script} {{source}} {{image}} {{displacement}}"
+    monkeypatch.setenv("COMPARE_PROGRAM", command)
+    result, built_in = solve("program", folder), solve(LOCAL[POISSON], folder)
+    assert result["error_percent"] == pytest.approx(built_in["error_percent"])
+    assert result["processor_seconds"] > built_in["processor_seconds"]
+    monkeypatch.setenv("COMPARE_PROGRAM", f"{sys.executable} -c 'raise SystemExit(\"no light\")'")
+    assert "no light" in solve("program", folder)["failure"]
+
+
 def test_page_is_that_of_the_results_and_names_solvers_that_do_not_install() -> None:
     results = json.loads(RESULTS.read_text(encoding="utf-8"))
     text = (ROOT / "docs" / "comparison.md").read_text(encoding="utf-8")

@@ -4,7 +4,8 @@
 
 Any Python from 3.11 on starts it: it installs this package into an environment of its own and goes
 on there. All of it stays in build/compare: environments, images and results, so that a second
-run solves what the first has not. `--page` only writes the page and its plots from the results.
+run solves what the first has not. `--program` puts another program beside the solvers. `--page`
+only writes the page and its plots from the results.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import math
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -23,7 +25,7 @@ from typing import TYPE_CHECKING
 
 sys.path[:0] = [str(Path(__file__).parents[1])]
 
-from compare.catalogue import ENVIRONMENTS, OURS, REPOSITORY, SOLVERS  # noqa: E402
+from compare.catalogue import ENVIRONMENTS, OURS, REPOSITORY, SOLVERS, Solver  # noqa: E402
 from compare.environments import prepare  # noqa: E402
 
 if TYPE_CHECKING:
@@ -46,6 +48,14 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--budget", type=float, default=float("inf"), help="seconds for all images of a size"
     )
     parser.add_argument("--only", default="", help="solvers whose names have this word")
+    parser.add_argument(
+        "--program",
+        default="",
+        metavar="COMMAND",
+        help="another program: it reads the text files {source} and {image} and writes "
+        "{displacement}, such as 'octave --eval \"f('{source}', …)\"'",
+    )
+    parser.add_argument("--name", default="", help="of the other program in the page")
     parser.add_argument("--page", action="store_true", help="write the page from the results")
     return parser.parse_args(arguments)
 
@@ -75,7 +85,12 @@ def measure(chosen: argparse.Namespace, cases: list[Case], path: Path) -> Result
         path.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
 
     write_images(BUILD / "images", cases)
-    for solver in SOLVERS:
+    solvers = SOLVERS
+    if chosen.program:
+        os.environ["COMPARE_PROGRAM"] = chosen.program
+        name = chosen.name or Path(shlex.split(chosen.program)[0]).name
+        solvers = (Solver(name, "ours", "program", f"`{chosen.program}`"),)
+    for solver in solvers:
         if chosen.only.lower() not in solver.name.lower():
             continue
         print(solver.name, flush=True)

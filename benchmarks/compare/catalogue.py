@@ -30,6 +30,8 @@ class Solver:
 
 
 OURS = "napari-shadowinv"
+LINEAR = "Poisson (SciPy)"
+EXACT = f"{OURS}, accuracy 0.001"
 KASIM = "power diagrams by L-BFGS (Kasim et al.)"
 STAND_IN = "grid Monge–Ampère (stand-in for PROBLEM)"
 
@@ -46,7 +48,7 @@ ENVIRONMENTS = {
 
 SOLVERS = (
     Solver(OURS, "ours", "ours", "default options"),
-    Solver(f"{OURS}, 4 sites a pixel", "ours", "ours_fine", "`n_sites` four times the pixels"),
+    Solver(EXACT, "ours", "ours_exact", "`accuracy=0.001`"),
     Solver(f"{OURS}, free boundary", "ours", "ours_free", "`boundary='free'`, `flux='known'`"),
     Solver(
         KASIM,
@@ -55,7 +57,7 @@ SOLVERS = (
         "the algorithm of 2017 with this package's compiled geometry, so not the time of its "
         "MATLAB code: `solver='lbfgs'`, `stages='single'`, `readout='centroid'`, a site a pixel",
     ),
-    Solver("Poisson (SciPy)", "ours", "poisson", "∇²φ = I/I₀ − 1 by cosine transforms"),
+    Solver(LINEAR, "ours", "poisson", "∇²φ = I/I₀ − 1 by cosine transforms"),
     Solver(
         STAND_IN,
         "ours",

@@ -12,7 +12,7 @@ from compare.catalogue import OURS
 Results = dict[str, Any]
 Result = dict[str, Any]
 
-_CLEARLY = 1.1  # a ratio; less is no difference
+CLEARLY = 1.1  # a ratio; less is no difference
 _MEGABYTE = 1e6
 MIN_MEGABYTES = 0.1  # less is below what the system's pages resolve
 
@@ -108,7 +108,7 @@ def rival(results: Results, solver: str) -> Rival | None:
         return [measure(their) / measure(our) for their, our in pairs]
 
     errors, times, memories = (ratios(measure) for measure in (error, seconds, megabytes))
-    better = [sum(ratio * _CLEARLY < 1 for ratio in row) for row in (errors, times, memories)]
+    better = [sum(ratio * CLEARLY < 1 for ratio in row) for row in (errors, times, memories)]
     return Rival(
         solver,
         len(pairs),
