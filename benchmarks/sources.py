@@ -30,7 +30,6 @@ METHODS = {
     "polynomial, degree 2, mask": ({"method": "polynomial"}, True),
     "polynomial, degree 6": ({"method": "polynomial", "degree": 6}, False),
     "polynomial, degree 6, mask": ({"method": "polynomial", "degree": 6}, True),
-    "interpolated, mask": ({"method": "interpolated"}, True),
     "kriged, mask": ({"method": "kriged"}, True),
 }
 OBJECTS = ("weak ring", "ring", "focus", "filament")

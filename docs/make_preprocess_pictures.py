@@ -30,7 +30,6 @@ from napari_shadowinv.preprocessing import (
     ButterworthFilter,
     GaussianEstimate,
     HighPassFilter,
-    InterpolatedEstimate,
     IsotropicEstimate,
     KrigedEstimate,
     LowPassEstimate,
@@ -211,15 +210,7 @@ def source_pictures() -> None:
         clipped,
         TotalVariationEstimate(weight=1.0).source(clipped.shot),
     )
-    covered = scene(patchy_beam(45, seed=6), big_object())
     mask = np.hypot((y - 78) / 38, (x - 102) / 50) > 1
-    source_picture(
-        "interpolated",
-        "interpolated",
-        covered,
-        InterpolatedEstimate(width=8.0).source(covered.shot, mask),
-        mask,
-    )
     uneven = scene(patchy_beam(22, seed=9), big_object())
     source = KrigedEstimate().source(uneven.shot, mask)
     error = on_pixels(kriged_prior(uneven.shot, mask))

@@ -118,7 +118,7 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     "invert shot.npy --source-from gausian": "--source-from is 'gausian': did you mean 'gaussian'",
     "invert shot.npy --source-from gaussian --source shot.npy": "choose one of them",
     "invert shot.npy --source-from 'gaussian degree=3'": "'gaussian degree=3': unknown key",
-    "invert shot.npy --source-from interpolated": "without a source mask",
+    "invert shot.npy --source-from kriged": "without a source mask",
     "invert shot.npy --step 'low-pas 3'": "--step is 'low-pas 3': did you mean 'low-pass'",
     "invert shot.npy --step 'low-pass 3 4'": "expected name=value instead of '4'",
     "invert shot.npy --step 'butterworth 9 kind=band'": "kind=band': 'kind' is 'band'",

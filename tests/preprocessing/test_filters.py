@@ -9,7 +9,6 @@ from napari_shadowinv.preprocessing import (
     ButterworthFilter,
     HighPassFilter,
     HotPixelFilter,
-    InterpolatedEstimate,
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
@@ -255,7 +254,6 @@ WRONG_VALUES = [
     (BackgroundFilter, {"degree": 11}), (BackgroundFilter, {"kind": "add"}),
     (PolynomialEstimate, {"degree": -1}), (LowPassEstimate, {"width": 0}),
     (TotalVariationEstimate, {"weight": -1}), (TotalVariationEstimate, {"iterations": 0}),
-    (InterpolatedEstimate, {"width": np.inf}), (InterpolatedEstimate, {"kind": "cubic"}),
 ]  # fmt: skip
 
 

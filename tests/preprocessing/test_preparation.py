@@ -9,7 +9,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import (
     Estimate,
-    InterpolatedEstimate,
+    KrigedEstimate,
     PolynomialEstimate,
     Recipe,
     estimate_source,
@@ -53,7 +53,7 @@ STRAY = outside(1, (5, 5))  # a slip of the brush
 def test_a_mask_that_hides_the_object_too_is_refused(
     mask: np.ndarray, source_mask: np.ndarray
 ) -> None:
-    for estimate in (PolynomialEstimate(), InterpolatedEstimate()):
+    for estimate in (PolynomialEstimate(), KrigedEstimate()):
         with pytest.raises(InputError, match="the object would be excluded from the inversion"):
             check(estimate, mask, source_mask)
 
@@ -78,7 +78,7 @@ def test_masks_that_share_dead_pixels_are_fine(
 
 def test_filled_in_pixels_must_be_inverted() -> None:
     with pytest.raises(InputError, match="without a source mask"):
-        check(InterpolatedEstimate(), OBJECT, None)
+        check(KrigedEstimate(), OBJECT, None)
 
 
 def test_a_source_dark_behind_the_source_mask_is_reported() -> None:

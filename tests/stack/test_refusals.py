@@ -22,8 +22,8 @@ from napari_shadowinv import (
 from napari_shadowinv.physics.setup import OpticalSetup
 from napari_shadowinv.preprocessing import (
     HighPassFilter,
-    InterpolatedEstimate,
     IsotropicEstimate,
+    KrigedEstimate,
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
@@ -40,7 +40,7 @@ ONES = np.ones(SHAPE)
 NONSENSE: dict[str, tuple[dict[str, Any], str]] = {
     "a flattened image": ({"filters": (HighPassFilter(),)}, "would flatten the image but not the"),
     "a mask of no estimate": ({"source_mask": Y != X}, "got a source mask"),
-    "nothing to interpolate": ({"source": InterpolatedEstimate()}, "without a source mask"),
+    "nothing to predict": ({"source": KrigedEstimate()}, "without a source mask"),
     "masks apart": (
         {"source": PolynomialEstimate(), "source_mask": X > 9, "mask": X > 9},
         "excluded from the inversion",

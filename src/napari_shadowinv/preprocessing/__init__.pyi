@@ -2,7 +2,6 @@ from .alignment import Shift, measure_shift, move, register_source
 from .estimates import (
     Estimate,
     GaussianEstimate,
-    InterpolatedEstimate,
     IsotropicEstimate,
     KrigedEstimate,
     LowPassEstimate,
@@ -51,7 +50,6 @@ __all__ = [
     "GaussianEstimate",
     "HighPassFilter",
     "HotPixelFilter",
-    "InterpolatedEstimate",
     "IsotropicEstimate",
     "KrigedEstimate",
     "LowPassEstimate",

@@ -8,7 +8,6 @@ none was recorded, or the beam changes from shot to shot, it must be estimated f
 - the beam is a Gaussian spot: `GaussianEstimate`
 - the beam varies slowly, in no known way: `PolynomialEstimate`, `LowPassEstimate`
 - the beam has edges that matter: `TotalVariationEstimate`
-- the object covers a known part of the image: `InterpolatedEstimate`
 - the beam is smooth and random, and visible around the object: `KrigedEstimate`
 - their base class: `Estimate`
 
@@ -213,7 +212,7 @@ class TotalVariationEstimate(Estimate):
     """The shot without small structures, but with its edges.
 
     A disc of radius r px is lowered by 2·weight/r of the image's mean. Unusable pixels are first
-    filled as by `InterpolatedEstimate`. The iterations take 10 s a megapixel and cannot be stopped.
+    filled in from around them. The iterations take 10 s a megapixel and cannot be stopped.
 
     References
     ----------
@@ -258,47 +257,6 @@ class TotalVariationEstimate(Estimate):
         # A step reaches one pixel farther: fewer steps go as far in larger pixels.
         steps = max(1, self.iterations // factor**2)
         return super().coarsen(factor).model_copy(update={"iterations": steps})
-
-
-class InterpolatedEstimate(Estimate):
-    """The shot, with the masked part filled in from around it.
-
-    Notes
-    -----
-    The filling u minimises ∑(u - image)² over the usable pixels + width²ᵖ ∑ u(-Δ)ᵖu over
-    all, with p = 2 (a thin plate) or p = 1 (a membrane) and mirrored borders, by conjugate
-    gradients preconditioned with the discrete cosine transform, from coarse to fine.
-
-    References
-    ----------
-    D. Garcia, "Robust smoothing of gridded data in one and higher dimensions with missing
-    values", Computational Statistics & Data Analysis 54, 1167 (2010).
-    """
-
-    needs_mask = True
-    title = "filled in under the mask"
-    place = 70
-    method: Literal["interpolated"] = "interpolated"
-    width: float = width_field(
-        5.0,
-        "Standard deviation in px of the blur applied to the surroundings before they are "
-        "extrapolated.",
-        0.5,
-        50.0,
-    )
-    kind: Literal["biharmonic", "laplace"] = Field(
-        default="biharmonic",
-        title="Continuation",
-        description="'biharmonic' continues the slope and curvature of the beam; use it for gaps "
-        "inside the image. 'laplace' stays within the range of the surrounding values; use it for "
-        "gaps at the edge.",
-    )
-
-    def _estimate(
-        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
-    ) -> FloatArray:
-        power = 2 if self.kind == "biharmonic" else 1
-        return pixels.with_filled_part(values, usable, report, self.width, power)
 
 
 class KrigedEstimate(Estimate):
