@@ -404,8 +404,11 @@ def lloyd(
         if report is not None:
             report(step)
         diagram = PowerDiagram(triangulation, source, with_moments=True, threads=threads)
-        centroids = diagram.centroids
-        moves = centroids - triangulation.sites
+        sites, centroids = triangulation.sites, diagram.centroids
+        # The centroid of a cell with hardly any light is nothing but rounding errors.
+        inside = (centroids > -0.5) & (centroids < np.array(source.shape) - 0.5)
+        centroids = np.where(inside.all(axis=1)[:, None], centroids, sites)
+        moves = centroids - sites
         away = np.sqrt(np.einsum("na,na->", moves, moves) / len(moves))
         if step == iterations or away < near:
             return diagram, step
