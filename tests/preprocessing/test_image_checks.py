@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from napari_shadowinv import InversionOptions, invert, run, synthetic_image
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import plan_sites
-from napari_shadowinv.physics.phantoms import toroid
+from napari_shadowinv.physics.phantoms import gaussian_blob, toroid
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.preprocessing import (
     Bin,
@@ -93,6 +93,23 @@ def test_pixels_without_light_never_make_the_peak(name, seed) -> None:
     assert f"{int(dark.sum()):,} " in caution.text
     planned = invert(image, plan=plan_sites(source, options), options=options)
     np.testing.assert_array_equal(planned.potential, inversion.potential)
+
+
+def test_light_that_has_moved_into_the_dark_is_not_masked():
+    """Bright discs on a dark ground, whose light an object moves by up to 4 px."""
+    y, x = np.indices(SHAPE)
+    discs = [np.hypot(y - a, x - b) < 14 for a, b in ((40, 45), (95, 60), (70, 115), (120, 120))]
+    source = np.where(np.any(discs, axis=0), 300.0, 0.0)
+    truth = gaussian_blob(SHAPE, 150.0, 24.0).displacement
+    image = synthetic_image(truth, source)
+    mask, (caution,) = mask_dark(image, source, None)
+    assert caution.code == "unlit"
+    assert 0.5 < 1 - mask.mean() < 0.9
+    assert image[~mask].sum() < 1e-3 * image.sum()
+    found = invert(image, source=source).displacement
+    lit = source > 0
+    error = np.linalg.norm((found - truth)[:, lit]) / np.linalg.norm(truth[:, lit])
+    assert error < 0.05
 
 
 @pytest.mark.parametrize("name", ["rim", "frame"])

@@ -289,7 +289,7 @@ def _dark_pixels(
     planes: Sequence[FloatArray], usable: BoolArray, check: DarkCheck = DarkCheck()
 ) -> BoolArray:
     """Return the pixels that are dark in all planes, the source first if it was recorded."""
-    dark, noisy, dim, lights = usable, usable, usable, []
+    dark, noisy, dim, lights, relative = usable, usable, usable, [], []
     # Quick for most images: no mean is less than the least value.
     if any(plane.min() >= check.dim * plane.max() for plane in planes):
         return np.zeros_like(usable)
@@ -309,6 +309,13 @@ def _dark_pixels(
             return dark
         dim = dim & (plane < check.lit * level)
         lights.append(light / level)
+        relative.append(plane / level)
+    if len(planes) > 1:  # light that an object has moved is no edge of a window
+        beam, shot = (_mean_around(plane, dim, check.sides[0]) for plane in relative)
+        most, least = np.maximum(*relative), np.minimum(*relative)
+        arrived = ndimage.maximum_filter((most >= check.lit) & (least < check.dim), 5)
+        dim = dim & (np.abs(shot - beam) < check.dark) & ~arrived
+        dark = dark & dim
     square = np.ones((3, 3))
     noisy = ndimage.binary_opening(noisy, square)
     regions, count = ndimage.label(noisy | dark)
