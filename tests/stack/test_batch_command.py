@@ -189,8 +189,8 @@ def test_a_film_has_a_frame_for_each_shot(store, name):
     refused("movie", store, "-o", name, names="exists")
     if name.endswith("gif"):
         # A palette of 256 colours for each frame; antialiased letters are not in it.
-        drawn = np.array(list(stack_frames(read(store).isel(shot=slice(1, 5)))), dtype=int)
-        difference = np.abs(frames - drawn)
+        frames_now = np.array(list(stack_frames(read(store).isel(shot=slice(1, 5)))), dtype=int)
+        difference = np.abs(frames - frames_now)
         assert difference.mean() < 0.5
         assert np.quantile(difference, 0.99) <= 6
 

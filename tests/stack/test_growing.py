@@ -92,27 +92,6 @@ def test_pending_and_failed_shots_stay_so_until_their_turn(night, out, hidden):
     assert list(night.run(out, redo_failed=True).status) == [DONE] * 6
 
 
-def test_sources_arrive_with_their_shots(night, out, hidden):
-    sources = [night.folder / f"source_{i}.npy" for i in range(6)]
-    for index, path in enumerate(sources):
-        np.save(path, night.source + 5 * index * np.eye(24, 28))
-    hidden(1, 5)
-    night.run(out, source=[sources[i] for i in (0, 2, 3, 4)])
-    hidden()
-    grown = night.run(out, source=sources)
-    order = [0, 2, 3, 4, 1, 5]
-    assert list(grown.name.values) == [f"shot_{i}.npy" for i in order]
-    one_by_one = [
-        night.run(out.with_name(f"{i}.shadowinv.zarr"), shots=night.images[i : i + 1], source=path)
-        for i, path in enumerate(np.load(path) for path in sources)
-    ]
-    for place, index in enumerate(order):
-        np.testing.assert_array_equal(grown.potential[place], one_by_one[index].potential[0])
-    np.save(sources[2], night.source)
-    with pytest.raises(InputError, match=r"the source of shot 1 \(shot_2.npy\) has changed"):
-        night.run(out, source=sources)
-
-
 def test_arrays_and_films_grow_too(night, out, tmp_path, expected):
     film = tmp_path / "film.tif"
     for count in (4, 6):

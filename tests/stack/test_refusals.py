@@ -52,11 +52,11 @@ NONSENSE: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "a small source": ({"source": np.ones((5, 6))}, r"source has shape \(5, 6\), shots \(24, 28\)"),
     "a small mask": ({"source": None, "mask": np.ones((5, 6), bool)}, "mask has shape"),
-    "two sources": ({"source": np.stack([ONES, ONES])}, "got 2 sources for 6 shots"),
+    "two sources": ({"source": np.stack([ONES, ONES])}, r"shape \(2, 24, 28\): expected one image"),
     "a variable": ({"variables": ["potental"]}, "no variable 'potental'"),
     "a variable in SI units": ({"variables": ["potential_si"]}, "needs a setup"),
     "a ragged variable": (
-        {"source": np.stack([ONES] * 6), "options": FREE, "variables": ["site_flux"]},
+        {"source": ONES, "options": FREE, "variables": ["site_flux"]},
         r"'site_flux' \(shots may differ",
     ),
     "a pattern": ({"shots": "nothing/*.tif"}, "no file matches nothing/"),

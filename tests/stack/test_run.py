@@ -107,16 +107,9 @@ def test_bad_shots_fail_alone_and_can_be_repeated(make_night, out):
     assert "reason" not in StackStore(out).report(0)
 
 
-def test_a_source_that_cannot_be_had_fails_its_shot_alone(night, out):
-    sources = [night.folder / f"source_{i}.npy" for i in range(6)]
-    for path in sources:
-        np.save(path, night.source)
-    sources[2].write_bytes(b"")
-    written = night.run(out, source=sources)
-    assert list(np.flatnonzero(written.status == FAILED)) == [2]
+def test_a_source_that_cannot_be_estimated_fails_its_shot_alone(night, out):
     night.images[3] = 0
-    estimate = {"source": PolynomialEstimate(degree=1), "overwrite": True}
-    written = night.run(out, shots=night.images, **estimate)
+    written = night.run(out, shots=night.images, source=PolynomialEstimate(degree=1))
     assert list(np.flatnonzero(written.status == FAILED)) == [3]
     text = 'estimated from each shot: {"method":"polynomial","degree":1}'
     assert written.attrs["source_image"] == text

@@ -108,7 +108,7 @@ def test_a_stack_of_any_kind_runs_with_default_options(kind, images, reference, 
         part = find_shots(shots).items[1:3]
         assert len(part) == 2
         for shot, image in zip(part, images[1:3], strict=True):
-            np.testing.assert_array_equal(shot.read()[0], image)
+            np.testing.assert_array_equal(shot.load()[0].image, image)
 
 
 def test_a_shot_has_the_mask_of_its_own_file_and_that_of_all(images, tmp_path):

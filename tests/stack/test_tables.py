@@ -312,9 +312,9 @@ def test_masks_of_a_shot_and_of_all_hold_both_but_for_a_file() -> None:
     images = np.ones((3, *SHAPE))
     shots = Shot(images, mask=common[0], source_mask=common[1])
     task = describe_stack(shots, recipe, FILES, RunOptions()).task
-    joined = task.completed(Shot(images[0], mask=own[0], source_mask=own[1]), None)
+    joined = task.completed(Shot(images[0], mask=own[0], source_mask=own[1]))
     np.testing.assert_array_equal(joined.mask, common[0] & own[0])
     np.testing.assert_array_equal(joined.source_mask, common[1] & own[1])
-    of_file = task.completed(Shot(images[0], mask=Path("mask.png")), None)
+    of_file = task.completed(Shot(images[0], mask=Path("mask.png")))
     assert of_file.mask == Path("mask.png")
     np.testing.assert_array_equal(of_file.source_mask, common[1])

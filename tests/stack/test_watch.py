@@ -22,7 +22,6 @@ from napari_shadowinv import (
     FileFormatError,
     InputError,
     InversionOptions,
-    Shot,
     invert,
     read,
 )
@@ -127,9 +126,6 @@ def test_pattern_may_name_an_array_in_each_file_but_the_source(folder, out, tmp_
     assert list(stored.status.values) == [DONE, DONE]
     with pytest.raises(InputError, match="read by a function, which selects no array"):
         watch_stack(folder, out, reader=np.load, watch={"pattern": "*.h5::entry/data"})
-    sources = np.stack([SOURCE, SOURCE])
-    with pytest.raises(InputError, match="got 2 sources, and the shots are still to arrive"):
-        watch_stack(Shot(folder, source=sources), out)
 
 
 def test_store_waits_for_the_first_shot_that_can_be_read(folder, out):
@@ -220,8 +216,8 @@ def test_watch_command_prints_a_line_for_each_shot(folder, out, tmp_path, monkey
     shot_lines = [line for line in lines if line.startswith("shot_")]
     store = StackStore(out)
     headlines = [report["headline"] for report in store.reports()[:2]]
-    shown = sorted(tuple(line.split("  ")[:2]) for line in shot_lines)  # two run side by side
-    assert shown == list(zip(store.names, headlines, strict=False))
+    printed = sorted(tuple(line.split("  ")[:2]) for line in shot_lines)  # two run side by side
+    assert printed == list(zip(store.names, headlines, strict=False))
     assert "waiting" in shot_lines[0]
     # Each kind of doubt about a shot is reported once, whatever its numbers.
     failure, warning = sorted(result.stderr.splitlines())

@@ -140,9 +140,8 @@ def columns_of(own_setups: str | None) -> tuple[ShotColumn, ...]:
 
     `own_setups` is the kind of these setups, None where all shots share one.
     """
-    first, *others = COLUMNS
     beam = () if own_setups is None else (_beam_column(own_setups),)
-    return (first, *beam, *others)
+    return (COLUMNS[0], *beam, *COLUMNS[1:])
 
 
 def _beam_column(setup_kind: str) -> ShotColumn:

@@ -166,7 +166,7 @@ def remove_unfinished(path: Path) -> None:
                 Path(folder, name).unlink(missing_ok=True)
 
 
-def grow_store(path: Path, names: Sequence[str], attributes: Mapping[str, Any]) -> None:
+def grow_store(path: Path, names: Sequence[str]) -> None:
     """Make room for more shots, pending; a process killed meanwhile leaves the store unchanged."""
     # The store is longer once its description is replaced.
     with _as_store_errors(path), _changing_description(path) as metadata:
@@ -182,7 +182,6 @@ def grow_store(path: Path, names: Sequence[str], attributes: Mapping[str, Any]) 
             metadata["consolidated_metadata"]["metadata"][name]["shape"][0] = length
         arrays["shot"][before:length] = np.arange(before, length)
         arrays["name"][before:length] = np.array(names, np.dtypes.StringDType())
-        metadata["attributes"].update(attributes)
 
 
 @contextmanager

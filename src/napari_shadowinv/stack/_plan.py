@@ -71,12 +71,10 @@ class Stack:
         options = self.task.recipe.options
         return sizes if options.n_sites is None else {**sizes, "site": options.n_sites}
 
-    def source_text(self, shots: int | None) -> str:
-        """Describe the source of the first shots."""
-        sources = [shot.source.name for shot in self.shots.items[:shots] if shot.source is not None]
+    @property
+    def source_text(self) -> str:
+        """A text by which a store is not continued with another source."""
         estimate, source = self.task.requested.estimate, self.task.inputs.shot.source
-        if sources:
-            return f"one for each shot: {', '.join(sources)}"
         if source is not None:
             return f"sha256 {checksum(source)}"
         if estimate not in (None, UniformEstimate()):
@@ -88,12 +86,7 @@ class Stack:
         shot, label = self.shots.items[index], self.shots.label(index)
         if isinstance(shot, RowExposure) and (difference := shot.difference(origin)):
             return f"the row of {label} ({difference})"
-        if not shot.unchanged(origin):
-            return label
-        # A common source is compared once, as a part of the store's identity.
-        if shot.source is None or shot.source.unchanged(origin["source"]):
-            return ""
-        return f"the source of {label}"
+        return "" if shot.unchanged(origin) else label
 
 
 def describe_stack(
@@ -110,28 +103,14 @@ def describe_stack(
         )
     if isinstance(common.source, (Estimate, Shot)) or common.beam_unknown:
         raise InputError(
-            f"the source of the shots is {common.source!r:.60}: expected an image, a file, or one "
-            "for each shot; choose an estimate in the recipe"
+            f"the source of the shots is {common.source!r:.60}: expected an image or a file; "
+            "choose an estimate in the recipe"
         )
     resolved = map_paths(recipe or Recipe(), Path.absolute)  # for workers elsewhere
     if common.setup is not None:
         resolved = resolved.model_copy(update={"setup": common.setup})
     files = FileReader.of(reader)
-    stack_shots, inputs, sources = _describe_inputs(common, resolved, files)
-    if sources is not None:
-        if isinstance(common.image, Shots):
-            raise InputError(
-                f"got {len(sources)} sources, and the shots are still to arrive: expected one for "
-                "all"
-            )
-        if len(sources) != len(stack_shots):
-            raise InputError(
-                f"got {len(sources)} sources for {len(stack_shots)} shots: expected one, or one "
-                "for each shot"
-            )
-        pairs = zip(stack_shots.items, sources.items, strict=True)
-        items = [replace(shot, source=source) for shot, source in pairs]
-        stack_shots = replace(stack_shots, items=items)
+    stack_shots, inputs = _describe_inputs(common, resolved, files)
     task = _plan_inversion(stack_shots, inputs, resolved, options.variables or STORED)
     return Stack(stack_shots, task, files.name, options.dtype)
 
@@ -152,25 +131,22 @@ def _plan_inversion(
     return Task(inputs=inputs, variables=tuple(variables), requested=recipe, by_row=bool(rows))
 
 
-def _describe_inputs(
-    common: Shot, recipe: Recipe, reader: FileReader
-) -> tuple[Shots, Inputs, Shots | None]:
-    """Return the shots, all that they share, and a source for each if they have their own."""
+def _describe_inputs(common: Shot, recipe: Recipe, reader: FileReader) -> tuple[Shots, Inputs]:
+    """Return the shots, and all that they share."""
     shots = common.image
     measured = recipe.source if isinstance(recipe.source, MeasuredSource) else MeasuredSource()
-    source = measured.file if common.source is None else common.source
-    if getattr(source, "ndim", None) == 2:
-        source = unpack_array(source, "source")
+    recorded = measured.file if common.source is None else common.source
+    if getattr(recorded, "ndim", None) == 2:
+        recorded = unpack_array(recorded, "source")
     # The reader's array is that of the shots.
-    sources = find_source(source, replace(reader, variable=measured.variable))
-    lit = sources.mask if isinstance(sources, Shots) else None
-    if sources is None and isinstance(recipe.source, MeasuredSource):
+    source = find_source(recorded, replace(reader, variable=measured.variable))
+    if source is None and isinstance(recipe.source, MeasuredSource):
         raise InputError(
             "the recipe asks for a measured source, but names no file: name one, or give a source"
         )
     mask = unpack_array(common.mask, "mask")
     # With a source, no shot needs to be read for its shape.
-    shape = (() if mask is None else np.shape(mask)) if sources is None else sources.shape
+    shape = (() if mask is None else np.shape(mask)) if source is None else source.shape
     image_shape = (shape[0], shape[1]) if len(shape) == 2 else None
     table = _find_table(shots)
     if table is not None:
@@ -178,21 +154,19 @@ def _describe_inputs(
         recipe = recipe.model_copy(update={"setup": first})
     else:
         stack_shots = find_shots(shots, reader, image_shape)
-    if sources is not None:
-        check_shape("source", sources.shape, stack_shots.shape, "shots")
-    mask = join_masks(mask, stack_shots.mask, lit)
+    if source is not None:
+        check_shape("source", source.shape, stack_shots.shape, "shots")
+    mask = join_masks(mask, stack_shots.mask)
     if recipe.setup is not None:
         check_spacing(shots, "shots", recipe.setup.pixel_sizes)
     if not recipe.steps:
         check_memory(stack_shots.shape, bytes_per_pixel(recipe.options), "an inversion")
     blank = np.ones(stack_shots.shape)
-    beam = None
-    if sources is not None:  # where each shot has its own, one that is not flat, as they may be
-        beam = Shot(blank.cumsum(axis=0) if isinstance(sources, Shots) else sources)
-        if isinstance(source, (str, Path)):
-            path, variable = split_address(source, measured.variable)
-            digest = sha256(path) if path.is_file() else ""  # else a pattern of several files
-            beam = replace(beam, path=path, metadata={"sha256": digest, "variable": variable})
+    beam = None if source is None else Shot(source)
+    if beam is not None and isinstance(recorded, (str, Path)):
+        path, variable = split_address(recorded, measured.variable)
+        digest = sha256(path) if path.is_file() else ""  # else a pattern of the file
+        beam = replace(beam, path=path, metadata={"sha256": digest, "variable": variable})
     inputs = collect_inputs(
         recipe.model_copy(update={"source": recipe.estimate}),
         Shot(blank, source=beam, mask=mask, source_mask=common.source_mask),
@@ -201,9 +175,7 @@ def _describe_inputs(
     if inputs.recipe.estimate is not None:
         # It refuses a wrong setup.
         inputs.recipe.estimate.adapt_to(inputs.recipe.setup, stack_shots.shape)
-    if isinstance(sources, Shots):
-        return stack_shots, replace(inputs, shot=replace(inputs.shot, source=None)), sources
-    return stack_shots, inputs, None
+    return stack_shots, inputs
 
 
 def _find_table(shots: Any) -> Path | Sequence[ShotRow] | None:

@@ -123,7 +123,7 @@ def run_stack(
         a glob such as ``"shots/*.tif"``, sorted so that 2 comes before 10; a TIFF with a page for
         each shot; or a table (CSV) with a row for each shot, which may have its own energy, setup,
         brightness, mask and source. A `Shot` with one of these as its image has the setup, the
-        mask and the source mask of all shots, and their source: one for all, or as many as shots.
+        masks and the source of all shots.
         To resume a store, earlier shots must be the same, and so must recipe and reader.
     out : str or Path
         The store, ``name.shadowinv.zarr``.
@@ -190,8 +190,7 @@ def run_stack(
                 )
             if filled is None:
                 filled = StoreRun(create(path, stack, overwrite=run.overwrite))
-            new = stack.shots.names[len(filled.names) :]
-            filled.append(new, source_image=stack.source_text(None))
+            filled.append(stack.shots.names[len(filled.names) :])
 
             def report(outcome: ShotOutcome | None = None) -> None:
                 name = "" if outcome is None else stack.shots.items[outcome.index].name
@@ -271,11 +270,11 @@ class StoreRun:
         """Return the report of a shot that has ended."""
         return dict(json.loads(str(self.writer.arrays()["report"][index]) or "{}"))
 
-    def append(self, names: Sequence[str], **attributes: str) -> None:
+    def append(self, names: Sequence[str]) -> None:
         """Append pending shots."""
         if not names:
             return
-        grow_store(self._path, names, attributes)
+        grow_store(self._path, names)
         self.numbers |= {name: index for index, name in enumerate(names, len(self.names))}
         self.names += names
         self.statuses.extend([PENDING] * len(names))
@@ -314,8 +313,8 @@ def create(path: Path, stack: Stack, *, overwrite: bool) -> StackStore:
     return create_store(path, empty_results(stack).assign_attrs(identity), overwrite=overwrite)
 
 
-def _identity(stack: Stack, shots: int | None = None) -> dict[str, str]:
-    """Return the attributes that must agree for a store with `shots` shots to be continued."""
+def _identity(stack: Stack) -> dict[str, str]:
+    """Return the attributes that must agree for a store to be continued."""
     task, recipe, common = stack.task, stack.task.requested, stack.task.inputs.shot
     height, width = task.shape
     steps = [step.model_dump(mode="json") for step in task.recipe.steps]
@@ -328,7 +327,7 @@ def _identity(stack: Stack, shots: int | None = None) -> dict[str, str]:
         **setups,
         "options": recipe.options.model_dump_json(exclude={"threads"}),
         "instrument": json.dumps(instrument) if instrument else "",
-        "source_image": stack.source_text(shots),
+        "source_image": stack.source_text,
         "mask_image": _mask_text(common.mask) or "none",
         "steps": json.dumps(steps) if steps else "",
         "source_mask_image": _mask_text(common.source_mask),
@@ -370,8 +369,7 @@ def reopen_damaged(path: Path) -> None:
 
 def match_store(store: StackStore, stack: Stack) -> None:
     """Refuse a stack with an `InputError` that is not the store's."""
-    identity = _identity(stack, len(store.names))
-    for name, value in {**identity, "package_version": __version__}.items():
+    for name, value in {**_identity(stack), "package_version": __version__}.items():
         before = str(store.attributes.get(name, ""))
         if before != value:
             article = "" if name.endswith("s") else "a "

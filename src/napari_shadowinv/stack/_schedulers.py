@@ -195,7 +195,7 @@ def _graph(
             block = shot.block
             graph |= block.dask
             parts = [(block.name, 0, 0, 0)]
-            shot = Exposure(shot.name, source=shot.source)
+            shot = Exposure(shot.name)
         keys.append(f"shot-{2 * 10**9 - index}-{name}")  # of ten digits each: the last is first
         graph[keys[-1]] = (partial(run_shot, shot, index, should_stop), shared, *parts)
     return graph, keys

@@ -2,7 +2,7 @@
 
 - in an array, in a file, in a row of a table: `ArrayExposure`, `FileExposure`, `RowExposure`
 - all shots of an array, of files or of a list: `find_shots`; of a table: `table_shots`
-- their sources: `find_source`
+- their source: `find_source`
 """
 
 from __future__ import annotations
@@ -55,7 +55,6 @@ class Exposure:
     """A shot of a stack, whose images are read on demand; it can be sent to a worker."""
 
     name: str  # for messages and tables
-    source: Exposure | None = field(default=None, kw_only=True)  # unless shared or estimated
 
     def load(self) -> tuple[Shot, dict[str, Any]]:
         """Return the image with all that is known of it, and metadata for the shot's report.
@@ -64,18 +63,13 @@ class Exposure:
         """
         raise NotImplementedError
 
-    def read(self) -> tuple[AnyArray, dict[str, Any]]:
-        """Return the image alone, such as a source, and the metadata."""
-        shot, metadata = self.load()
-        return shot.image, metadata
-
     def stamp(self) -> dict[str, Any]:
         """Return metadata that are known before an image is read."""
         return {}
 
     def shape(self) -> tuple[int, ...]:
         """Return the shape of the image, which has to be read."""
-        return np.shape(self.read()[0])
+        return np.shape(self.load()[0].image)
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
         """Return whether the image still agrees with the metadata from `load`."""
@@ -109,7 +103,7 @@ class ArrayExposure(Exposure):
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Otherwise all images, or their tasks, would be sent with it.
-        return functools.partial(ArrayExposure, source=self.source), (self.name, self.block)
+        return ArrayExposure, (self.name, self.block)
 
 
 @dataclass(frozen=True)
@@ -398,10 +392,10 @@ def _from_xarray(shots: xarray.DataArray | xarray.Dataset) -> Shots:
     values = unpack_array(shots, "shots", ("shot", *PLANE))
     if labels is None or labels.dims != (name,):
         labels = shots.coords.get(name)
-    found = _from_array(values, None if labels is None else labels.values)
+    frames = _from_array(values, None if labels is None else labels.values)
     if usable is None or usable.dims != PLANE or usable.dtype != np.bool_:
-        return found
-    return replace(found, mask=usable.values)
+        return frames
+    return replace(frames, mask=usable.values)
 
 
 def _from_array(shots: Any, labels: Any = None) -> Shots:
@@ -426,18 +420,24 @@ def _from_array(shots: Any, labels: Any = None) -> Shots:
     return Shots(items, (shots.shape[1], shots.shape[2]))
 
 
-def find_source(source: Any, reader: FileReader) -> AnyArray | Shots | None:
-    """Return the undisturbed beam as one image, or as many."""
+def find_source(source: Any, reader: FileReader) -> AnyArray | None:
+    """Return the undisturbed beam of all shots."""
     if source is None:
         return None
+    content = f"a {type(source).__name__}"
     if isinstance(source, (str, Path)):
         frames = reader.frames(source)
         if len(frames) == 1:
             return np.asarray(reader.read(frames[0]).image)
-    if getattr(source, "ndim", None) == 2:
+        content = f"{len(frames)} images"
+    elif getattr(source, "ndim", None) == 2:
         return np.asarray(source)
-    sources = find_shots(source, reader)
-    return sources.items[0].read()[0] if len(sources) == 1 else sources
+    elif hasattr(source, "shape"):
+        content = f"an array of shape {source.shape}"
+    raise InputError(
+        f"the source of the shots is {content}: expected one image for all; give shots with a "
+        "source each as a table"
+    )
 
 
 def table_shots(

@@ -125,18 +125,18 @@ class Task:
         options = self.recipe.options.model_dump_json()
         return {"options": options, "provenance": provenance.to_json()}
 
-    def completed(self, shot: Shot, source: AnyArray | None) -> Shot:
-        """Return a shot with the masks of all shots, and a source: its own, this, or that of all.
+    def completed(self, shot: Shot) -> Shot:
+        """Return a shot with the masks of all shots, and its own source or that of all.
 
         A mask's file precedes the masks of all, by the rule of `collect_inputs`.
         """
         common = self.inputs.shot
         is_file = isinstance(shot.mask, Path)
-        beam = common.source if source is None else source
+        has_source = shot.source is not None and not shot.has_own_source
         return replace(
             shot,
             image=np.asarray(shot.image, dtype=np.float64),
-            source=beam if shot.source is None else shot.source,
+            source=shot.source if has_source else common.source,
             mask=shot.mask if is_file else join_masks(common.mask, shot.mask),
             source_mask=join_masks(common.source_mask, shot.source_mask),
         )
@@ -147,14 +147,8 @@ class Task:
         names = (*self.variables, *self.masks)
         return {name: dataset[name].values for name in names if name in dataset}
 
-    def run(
-        self,
-        image: Shot,
-        source: AnyArray | None,
-        workers: int | None,
-        should_stop: ShouldStop | None,
-    ) -> Inversion:
-        """Apply the recipe to a shot as recorded, with its own source or else `source`."""
+    def run(self, image: Shot, workers: int | None, should_stop: ShouldStop | None) -> Inversion:
+        """Apply the recipe to a shot as recorded."""
         common = self.inputs.shot
         if np.shape(image.image) != common.shape:
             reference = "the others" if common.source is None else "the source"
@@ -164,7 +158,7 @@ class Task:
         if self.by_row:
             self._check_kind(image.setup)
         # Doubts about the file are in the report of the shot.
-        shot = self.completed(replace(image, cautions=()), source)
+        shot = self.completed(replace(image, cautions=()))
         setup = image.setup if self.by_row else self.requested.setup
         # Without masks: the shot has those of all.
         cleared = {"source": self.requested.estimate, "mask": None, "source_mask": None}
@@ -264,7 +258,7 @@ def run_shot(
     A shot is replaced by its block of a dask array if a cluster has computed that already.
     """
     if block is not None:
-        shot = ArrayExposure(shot.name, block, source=shot.source)
+        shot = ArrayExposure(shot.name, block)
     task, began = context.task, time.perf_counter()
     result: Inversion | None = None
     origin: dict[str, Any] = {}
@@ -273,10 +267,7 @@ def run_shot(
         origin = shot.stamp()
         image, loaded = shot.load()
         origin |= loaded
-        source = None
-        if shot.source is not None:
-            source, origin["source"] = shot.source.read()
-        result = task.run(image, source, context.workers, should_stop)
+        result = task.run(image, context.workers, should_stop)
         entries = task.report(result)
     except InversionCancelled:
         raise

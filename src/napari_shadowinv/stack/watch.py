@@ -223,7 +223,7 @@ def watch_stack(
         return is_idle or (should_stop is not None and should_stop())
 
     growing = _GrowingRun(path, watch, describe, on_progress or (lambda _: None))
-    known = set[str]()  # endings of files that are left out
+    endings = set[str]()  # endings of files that are left out
     with suppress(InversionCancelled):
         ensure_compiled(
             lambda news: growing.report(stage=f"compiling, {news.message}"), should_stop
@@ -236,8 +236,8 @@ def watch_stack(
             growing.open()
             while not is_over():
                 growing.take(shots_of(arrivals.look()))
-                if arrivals.left_out.keys() - known:
-                    known |= arrivals.left_out.keys()
+                if arrivals.left_out.keys() - endings:
+                    endings |= arrivals.left_out.keys()
                     counts = counts_text(arrivals.left_out)
                     growing.report(note=f"Left out: {counts}; choose others by a pattern of names")
                 if not growing.run(scheduler, should_stop):
