@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,15 +60,6 @@ class Stack:
     task: Task
     reader: str  # name of the reader of the files
     dtype: str  # of fields in the store
-
-    @cached_property
-    def sizes(self) -> dict[str, int]:
-        height, width = self.task.shape
-        sizes = {"shot": 0, "y": height, "x": width, "component": 2}
-        for dims, *_ in self.task.masks.values():
-            sizes |= zip(dims[-2:], self.task.inputs.shot.shape, strict=True)
-        options = self.task.recipe.options
-        return sizes if options.n_sites is None else {**sizes, "site": options.n_sites}
 
     @property
     def source_text(self) -> str:
@@ -227,7 +217,12 @@ def empty_results(stack: Stack) -> xarray.Dataset:
     """Return the dataset of a stack as its store has it, without a shot."""
     import xarray as xr
 
-    task, sizes, text = stack.task, stack.sizes, np.dtypes.StringDType()
+    task, text = stack.task, np.dtypes.StringDType()
+    height, width = task.shape
+    sizes = {"shot": 0, "y": height, "x": width, "component": 2}
+    sizes["site"] = task.recipe.options.n_sites or 0
+    for dims, *_ in task.masks.values():
+        sizes |= zip(dims[-2:], task.inputs.shot.shape, strict=True)
     variables: dict[str, Any] = {}
     for name, (of_one, labels) in task.labels.items():
         if name in task.variables:
