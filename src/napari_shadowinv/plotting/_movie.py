@@ -56,17 +56,8 @@ def stack_frames(
         (factor * _plane(field, index, used), str(stack["name"].values[index]))
         for index in range(field.sizes["shot"])
     )
-    return _draw_frames(planes, shape, _common_setup(stack), label, (factor * low, factor * high))
-
-
-def _common_setup(stack: xarray.Dataset) -> Any:
-    """Return a setup with the pixel size of all shots; None if they differ, or without setups."""
-    shots = (
-        [stack] if "setup" not in stack else [stack.isel(shot=k) for k in range(stack.shot.size)]
-    )
-    setups = [setup_from_dataset(shot) for shot in shots]
-    sizes = {None if setup is None else setup.object_pixel_size for setup in setups}
-    return setups[0] if len(sizes) == 1 else None
+    common = None if "setup" in stack else setup  # otherwise shots may differ in their pixels
+    return _draw_frames(planes, shape, common, label, (factor * low, factor * high))
 
 
 def _plane(field: xarray.DataArray, index: int, used: xarray.DataArray | None) -> FloatArray:
