@@ -141,6 +141,16 @@ def test_store_waits_for_the_first_shot_that_can_be_read(folder, out):
     assert list(watch.result.status.values) == [FAILED, DONE]
 
 
+@pytest.mark.parametrize(("files", "code"), [(0, 0), (1, 1)])
+def test_watch_command_without_a_shot_fails_if_one_cannot_be_read(folder, out, files, code):
+    for index in range(files):
+        (folder / f"shot_{index}.npy").write_bytes(b"")
+    settle = f"--set=run.settle={SETTLE}"
+    result = shadowinv("watch", folder, "--pattern", "*.npy", "--out", out, settle, "--idle", "0.2")
+    assert result.exit_code == code
+    assert result.stdout.splitlines()[-1].startswith("Stopped: no shots")
+
+
 def test_it_goes_on_with_its_store_and_does_nothing_twice(folder, out):
     put(folder, 0, 1)
     (folder / "shot_2.npy").write_bytes(b"")

@@ -347,7 +347,8 @@ def run_watch(
             should_stop=is_interrupted,
         )
     if not out.exists():  # no shot could be read
-        say("Stopped: no shots; repeat the command to watch again.")
+        if not quiet:
+            say("Stopped: no shots; repeat the command to watch again.")
         raise typer.Exit(EXIT_FAILED_SHOTS if printer.status and printer.status.waiting else 0)
     store = StackStore(out)
     text = f"Stopped: {_counts_text(store)}; repeat the command to go on."

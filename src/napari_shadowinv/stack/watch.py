@@ -89,9 +89,10 @@ class _GrowingRun:
             try:
                 self.stack = self.describe(shots.values())
             except NoShotError as error:
-                if len(shots) > len(self.pending):
-                    self.report(note=str(error))
+                is_news = len(shots) > len(self.pending)
                 self.pending = shots
+                if is_news:
+                    self.report(note=str(error))
                 return
             if self.filled is not None:
                 match_store(StackStore(self.path), self.stack)
