@@ -132,11 +132,10 @@ class Task:
         """
         common = self.inputs.shot
         is_file = isinstance(shot.mask, Path)
-        has_source = shot.source is not None and not shot.has_own_source
         return replace(
             shot,
             image=np.asarray(shot.image, dtype=np.float64),
-            source=shot.source if has_source else common.source,
+            source=common.source if shot.source is None else shot.source,
             mask=shot.mask if is_file else join_masks(common.mask, shot.mask),
             source_mask=join_masks(common.source_mask, shot.source_mask),
         )

@@ -406,8 +406,8 @@ def lloyd(
         diagram = PowerDiagram(triangulation, source, with_moments=True, threads=threads)
         sites, centroids = triangulation.sites, diagram.centroids
         # The centroid of a cell with hardly any light is nothing but rounding errors.
-        inside = (centroids > -0.5) & (centroids < np.array(source.shape) - 0.5)
-        centroids = np.where(inside.all(axis=1)[:, None], centroids, sites)
+        inside = np.all((centroids > -0.5) & (centroids < np.array(source.shape) - 0.5), axis=1)
+        centroids = np.where(np.expand_dims(inside, 1), centroids, sites)
         moves = centroids - sites
         away = np.sqrt(np.einsum("na,na->", moves, moves) / len(moves))
         if step == iterations or away < near:
