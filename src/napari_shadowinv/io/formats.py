@@ -119,7 +119,7 @@ TIFF = Format(
 )
 PNG = Format(
     "png", (".png",), "PNG", ((0, b"\x89PNG\r\n\x1a\n"),),
-    reader="images:read_png", image_writer="images:write_png", is_scan=True,
+    reader="images:read_picture", image_writer="images:write_png", is_scan=True,
 )
 BMP = Format("bmp", (".bmp",), "BMP", ((0, b"BM"),), reader="images:read_picture", is_scan=True)
 JPEG = Format(

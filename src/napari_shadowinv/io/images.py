@@ -173,19 +173,6 @@ def is_linear_profile(profile: bytes) -> bool:
     return b"linear" in profile.replace(b"\0", b"").lower()
 
 
-def read_png(path: Path) -> tuple[AnyArray, dict[str, Any]]:
-    """Read a PNG; colours with 16 bits are refused."""
-    with path.open("rb") as file:
-        bits = file.read(25)[24]
-    array, metadata = read_picture(path)
-    if bits == 16 and metadata["bits"] == 8:
-        raise FileFormatError(
-            f"{path} is a colour PNG with 16 bits per channel, which would be reduced to 8 bits: "
-            "expected a greyscale PNG or a TIFF; save it as TIFF"
-        )
-    return array, {**metadata, "bits": max(bits, 8)}
-
-
 def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
     """Read a PNG, BMP or JPEG: upright, with NaN at transparent pixels."""
     from PIL import ExifTags, Image
@@ -201,12 +188,19 @@ def read_picture(path: Path) -> tuple[AnyArray, dict[str, Any]]:
                 f"{path} holds pixels of the kind {picture.mode}, which are not proportional to "
                 "the light: expected grey or RGB; export it as 16-bit TIFF"
             )
+        has_16_bits = ";16B" in str(picture.tile[0][3])  # of a PNG
+        if has_16_bits and len(picture.getbands()) > 1:
+            raise FileFormatError(
+                f"{path} is a colour PNG with 16 bits per channel, which would be reduced to 8 "
+                "bits: expected a greyscale PNG or a TIFF; save it as TIFF"
+            )
         orientation = picture.getexif().get(ExifTags.Base.Orientation, 1)
         pixels, missing = _pixels_and_gaps(picture)
         array, metadata = as_picture(path, "picture's", pixels, missing, orientation)
         sides = _printed_sides(picture.info)
         cautions = _light_cautions(picture.format, picture.info) + square_cautions(sides)
-    bits, size = 8 * max(1, array.dtype.itemsize), geometry_of(sides, is_length=False)
+    bits = 16 if has_16_bits else 8 * array.dtype.itemsize
+    size = geometry_of(sides, is_length=False)
     return array, {**metadata, "bits": bits, "cautions": cautions, **size}
 
 
