@@ -18,7 +18,6 @@ from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 import tifffile
@@ -289,26 +288,15 @@ def _cautions(page: Any, layout: _Layout) -> tuple[Caution, ...]:
 
 def _pixel_sides(tiff: Any, page: Any) -> tuple[tuple[float, ...], bool]:
     """Return width and height of a pixel (m) if stated, and whether their unit is a length's."""
-    first = tiff.pages.first
-    if first.is_ome:
-        root = ElementTree.fromstring(first.description)
-        stated = next((part.attrib for part in root.iter() if part.tag.endswith("Pixels")), {})
-        sides = [float(stated.get(f"PhysicalSize{axis}", 0)) for axis in "XY"]
-        units: list[Any] = [stated.get(f"PhysicalSize{axis}Unit", "µm") for axis in "XY"]
-    else:
-        ratios = [page.tags.valueof(number) for number in (282, 283)]
-        is_stated = all(isinstance(ratio, tuple) and all(ratio) for ratio in ratios)
-        sides = [per / count for count, per in ratios] if is_stated else [0.0, 0.0]
-        units = [(tiff.imagej_metadata or {}).get("unit", page.tags.valueof(296, default=2))] * 2
-    lengths = [
-        _UNITS_M.get(unit.replace("\\u00B5", "µ") if isinstance(unit, str) else unit, 0.0)
-        for unit in units
-    ]
-    # Programs that do not know it write 1.
-    if not all(lengths) or not all(sides) or sides == [1.0, 1.0]:
+    ratios = [page.tags.valueof(number) for number in (282, 283)]
+    unit = (tiff.imagej_metadata or {}).get("unit", page.tags.valueof(296, default=2))
+    length = _UNITS_M.get(unit.replace("\\u00B5", "µ") if isinstance(unit, str) else unit, 0.0)
+    if not length or not all(isinstance(ratio, tuple) and all(ratio) for ratio in ratios):
         return (), False
-    metres = tuple(side * length for side, length in zip(sides, lengths, strict=True))
-    return metres, max(lengths) <= 1e-3
+    sides = [per / count for count, per in ratios]
+    if sides == [1.0, 1.0]:  # of programs that do not know it
+        return (), False
+    return tuple(side * length for side in sides), length <= 1e-3
 
 
 def write_tiff(content: BytesIO, plane: AnyArray, pixel_size: float | None = None) -> None:
