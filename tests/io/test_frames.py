@@ -222,13 +222,6 @@ def test_what_is_no_path_is_called_what_it_is(path, words):
         read(path)
 
 
-@pytest.mark.parametrize("start", ["file://localhost", "file://", "FILE:"])
-def test_the_url_of_a_local_file_is_its_path(tmp_path, start):
-    np.save(tmp_path / "run 1.npy", CUBE[0, 0])
-    url = (tmp_path / "run 1.npy").as_uri().replace("file://", start)
-    np.testing.assert_array_equal(read(url).image, CUBE[0, 0])
-
-
 def test_brackets_in_the_name_of_a_folder_are_no_pattern(tmp_path):
     for name in ("run[3]", "run3"):
         (tmp_path / name).mkdir()

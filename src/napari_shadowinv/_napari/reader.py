@@ -85,12 +85,10 @@ def _read_file(file: Path, variable: str | None) -> list[Any]:
     if variable is None and not is_field_grid(file):
         names = format_of(file).image_names(file)
         if len(names) > _MAX_IMAGES:
-            # napari asks whether a path exists unless it names a host.
-            place = file.absolute().as_uri().replace("file://", "file://localhost", 1)
-            address = f"{place}::{names[_MAX_IMAGES]}"
+            address = str(join_address(file, names[_MAX_IMAGES]))
             show_caution(
                 f"{file.name}: {_MAX_IMAGES} of {len(names)} images are open: open another in "
-                f"napari's console, viewer.open({address!r}, plugin='napari-shadowinv')"
+                f"napari's console, viewer.add_image(napari_shadowinv.read({address!r}).image)"
             )
         if len(names) > 1:
             arrays = [(join_address(file, name), name) for name in names[:_MAX_IMAGES]]

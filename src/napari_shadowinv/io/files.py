@@ -25,24 +25,19 @@ from napari_shadowinv.errors import FileFormatError, InputError
 
 DEFLATE_RATIO = 1040  # the most that zlib can pack into one byte, a little rounded up
 _ADDRESS = "::"  # between a file and the name of an array in it
-_LOCAL = re.compile(r"file:/+(?:localhost(?=/))?", re.IGNORECASE)
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def split_address(path: str | Path, variable: str | None = None) -> tuple[Path, str | None]:
     """Return the file of an image, and the name of the array that its path ends with.
 
-    Every path of an image goes through here, also one as ``file://localhost/data/run.h5``.
+    Every path of an image goes through here.
     """
     text = str(path)
     if not text:
         raise InputError("received an empty text: expected the path of a file")
     if os.path.exists(path):
         return Path(path), variable
-    if local := _LOCAL.match(text):
-        from urllib.request import url2pathname
-
-        return split_address(url2pathname("/" + text[local.end() :].lstrip("/")), variable)
     file, separator, name = text.partition(_ADDRESS)
     if not separator:
         return Path(path), variable
