@@ -50,22 +50,6 @@ def test_complete_radiograph_brings_its_setup(tmp_path: Path) -> None:
     assert radiograph.setup.object_pixel_size == pytest.approx(1e-5)
 
 
-def test_distances_of_version_0_1_are_measured_from_the_image(tmp_path: Path) -> None:
-    path = radiograph_file(
-        tmp_path / "shot.h5",
-        source_object_dist=None,
-        object_image_dist=None,
-        source_distance=0.31,
-        ROI_distance=0.3,
-        spec_name=b"D 1+",
-    )
-    setup = read_shot(path).setup
-    assert isinstance(setup, ProtonSetup)
-    assert setup.source_object_distance == pytest.approx(0.01)
-    assert setup.object_image_distance == 0.3
-    assert setup.species == "deuteron"
-
-
 @pytest.mark.parametrize(
     "changes", [{"spec_energy": None}, {"spec_name": "Au 79+"}, {"source_object_dist": None}]
 )

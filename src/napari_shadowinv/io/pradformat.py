@@ -65,9 +65,9 @@ def is_pradformat(path: Path) -> bool:
 # They are looked up by name: walking all attributes of a damaged file may never end.
 _ATTRIBUTES = """
     format object_type radiograph_type inversion_type pradformat_version pixel_width
-    pixel_width_ax2 dr dr_ax2 scale_factor source_object_dist object_image_dist source_distance
-    ROI_distance spec_name spec_mass spec_charge spec_energy label description experiment_date
-    file_date radiograph_filename provenance
+    pixel_width_ax2 dr dr_ax2 scale_factor source_object_dist object_image_dist spec_name spec_mass
+    spec_charge spec_energy label description experiment_date file_date radiograph_filename
+    provenance
 """
 
 
@@ -101,7 +101,6 @@ def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
 
 def _read_geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
     """Return the fields of a particle setup that the attributes contain."""
-    source, image = _read_distances(attributes)
     species = {symbol: name for name, symbol in _SYMBOLS.items()}.get(
         attributes.get("spec_name", _SYMBOLS["proton"])
     )
@@ -109,8 +108,8 @@ def _read_geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[s
     pixel = "pixel_size" if width == "dr" else "detector_pixel_size"
     geometry = {
         "kind": "proton",
-        "source_object_distance": source,
-        "object_image_distance": image,
+        "source_object_distance": attributes.get("source_object_dist"),
+        "object_image_distance": attributes.get("object_image_dist"),
         pixel: attributes.get(width),
         "species": species if "spec_name" in attributes else None,
         # The energy of a species that nobody here knows gives no field.
@@ -122,17 +121,6 @@ def _read_geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[s
             f"{path} has pixels of {first:g} m by {second:g} m: expected square pixels; resample it"
         )
     return {name: value for name, value in geometry.items() if value is not None}
-
-
-def _read_distances(attributes: dict[str, Any]) -> tuple[float | None, float | None]:
-    """Return source to object and object to image, from any version of the format."""
-    if "object_image_dist" in attributes or "source_object_dist" in attributes:
-        return attributes.get("source_object_dist"), attributes.get("object_image_dist")
-    # Version 0.1 gave the distances of source and object from the image.
-    source_image, object_image = attributes.get("source_distance"), attributes.get("ROI_distance")
-    if source_image is None or object_image is None:
-        return None, object_image
-    return source_image - object_image, object_image
 
 
 def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
