@@ -401,7 +401,7 @@ def labels_on(layer: Any, image: Any) -> BoolArray:
 
 
 def source_on(layer: Any, data: Any, image: Any) -> Any:
-    """Return a beam, or one for each shot, on an image's pixels, or an `InputError`."""
+    """Return a beam on an image's pixels, or an `InputError`."""
     height, width = _shape(image)
     if frame_of(layer) == frame_of(image) or _is_unplaced(layer, image):
         if _shape(layer) != (height, width):

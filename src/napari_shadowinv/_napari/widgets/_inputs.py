@@ -16,7 +16,6 @@ from qtpy.QtWidgets import QFileDialog, QWidget
 from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.layer_metadata import source_on
 from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.shots import shot_of_layer, source_of_shot
 from napari_shadowinv._napari.widgets import _layers as layers
@@ -381,14 +380,6 @@ class SourcePicker(layers.LayerPicker):
                 f"no source was supplied with '{image.name}': choose another kind of source"
             )
         return shot_of_layer(image, supplied)
-
-    def measured_for_stack(self, image: Any) -> Any:
-        """Return the measured source of a stack, or of each of its shots; None for estimates."""
-        if self.layer is None or self.layer.ndim != 3:
-            beam = self.measured(image)
-            return None if beam is None else beam.image
-        beams = layers.stack_of(self.layer)
-        return beams if image is None else source_on(self.layer, beams, image)
 
     def usable(self, source: Any, image: Any, path: Path) -> Any:
         """Return the source of a recipe for these controls; None for uniform."""

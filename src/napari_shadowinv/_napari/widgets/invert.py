@@ -222,7 +222,8 @@ class Invert(ImagePanel):
         """Return the shot or the shots, with their source and mask."""
         if not self.image.is_stack:
             return replace(self.shot_of(layer), cautions=layers.cautions_of(layer))
-        source = self.source.measured_for_stack(layer)
+        beam = self.source.measured(layer)
+        source = None if beam is None else beam.image
         return Shot(self.image.shots(), source=source, mask=self.masks.usable(layer))
 
     @qt.notify_errors
