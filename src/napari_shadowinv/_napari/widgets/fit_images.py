@@ -30,7 +30,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.options import FitChoices, FitOptions
 from napari_shadowinv.physics.beam import number_in_unit, text_in_unit
-from napari_shadowinv.physics.setup import SETUPS, ProtonSetup, Setup
+from napari_shadowinv.physics.setup import SETUPS, Setup
 from napari_shadowinv.pipeline.costs import fit_cost
 from napari_shadowinv.pipeline.shot_table import ShotRow
 from napari_shadowinv.preprocessing import FIT_STEPS, Recipe
@@ -340,8 +340,8 @@ _OTHER_COLUMNS = (
 
 
 def beam_column(kind: str) -> Column:
-    """Return the column for a kind of setup, by default of protons."""
-    quantity = SETUPS.get(kind, ProtonSetup).beam_quantity()
+    """Return the column for a kind of setup, by default for the first."""
+    quantity = SETUPS.get(kind, next(iter(SETUPS.values()))).beam_quantity()
     title = quantity.noun.capitalize()
     return Column(quantity.name, title, quantity.unit, quantity.description)
 
