@@ -372,13 +372,6 @@ def test_references_lose_noise_and_keep_structure(mesh: float, remaining: float)
     assert after <= remaining * before
 
 
-def test_noise_that_nobody_tells_is_estimated() -> None:
-    stack = images() * np.array([1, 3])[:, None, None]
-    data = given(images=stack, noise=None)
-    noise = data.units[:, None] / np.sqrt(data.scene.weights[:, 0, :5])
-    np.testing.assert_allclose(noise / np.array([[0.1], [0.3]]), 1, atol=0.05)
-
-
 def test_shots_have_setup_source_mask_and_name() -> None:
     setups = protons(14.7), protons(6)
     beam, mask = np.full(SIZE, 5.0), np.eye(*SIZE) == 0

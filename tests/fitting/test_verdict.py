@@ -11,7 +11,7 @@ from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.facts import Assessment, Headline, Verdict
 from napari_shadowinv.fitting.pattern import Pattern
 from napari_shadowinv.fitting.result import Basin, Fit, FitReport, FittedField
-from napari_shadowinv.fitting.verdict import Evidence, assess_verdict
+from napari_shadowinv.fitting.verdict import Evidence, assess_verdict, hidden_contrast
 from napari_shadowinv.instrument.effects import EFFECTS
 from napari_shadowinv.inversion.error_budget import ErrorBudget, ErrorEstimate
 from napari_shadowinv.options import FitOptions, Instrument
@@ -213,6 +213,11 @@ DOUBTFUL = ALONE | {"rivals": [(0.0, 1.5)], "total": 0.5, "parts": {"noise": 0.5
         (with_errors(noise=0.12) | {"rivals": [(0.0, 0.3)]}, Verdict.SEVERAL, ""),
         (with_errors(noise=0.12) | {"rivals": [(0.0, 0.2)]}, Verdict.UNCERTAIN, "limited by noise"),
         (with_errors(noise=0.12), Verdict.UNCERTAIN, "(errors 12 %)"),
+        (
+            with_errors(noise=0.12) | {"options": FitOptions(max_error=0.2)},
+            Verdict.DETERMINED,
+            "",
+        ),
         ({"total": float("nan")}, Verdict.DETERMINED, "error bars were not"),
         ({"hidden": 0.3}, Verdict.DETERMINED, ""),
         ({"hidden": 0.8}, Verdict.UNCERTAIN, "mask hides"),
@@ -314,3 +319,31 @@ def test_a_beam_that_was_assumed_is_a_condition_of_a_fit_with_other_numbers() ->
     of_beam["parts"] = {"beam": 0.09, "background": 0.04}
     film = Instrument(background=0.03)
     assert assess(**GOOD | big | of_beam | {"instrument": film})[0] is Verdict.CONDITIONAL
+
+
+Y, X = np.indices((64, 64))
+RING = np.exp(-((np.hypot(Y - 32, X - 32) - 14) ** 2) / 2 / 2**2)[None]
+
+
+def holed(middle: tuple[int, int], side: int) -> np.ndarray:
+    used = np.ones((1, 64, 64), bool)
+    row, column = (place - side // 2 for place in middle)
+    used[0, row : row + side, column : column + side] = False
+    return used
+
+
+@pytest.mark.parametrize(
+    ("middle", "side", "is_hidden"),
+    [((32, 46), 16, True), ((32, 46), 6, False), ((10, 10), 14, False)],
+    ids=["over the ring", "too small to matter", "beside it"],
+)
+def test_hidden_contrast_is_that_of_structure_under_holes(
+    middle: tuple[int, int], side: int, is_hidden: bool
+) -> None:
+    assert (hidden_contrast(RING, holed(middle, side)) > 0.5) == is_hidden
+
+
+def test_hidden_contrast_is_zero_without_a_mask_in_one_image() -> None:
+    assert hidden_contrast(RING, np.ones((1, 64, 64), bool)) == 0
+    used = np.concatenate([holed((32, 46), 16), np.ones((1, 64, 64), bool)])
+    assert hidden_contrast(np.concatenate([RING, RING]), used) == 0

@@ -3,9 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from helpers.polygons import clipped, power_cell, shoelace
 from napari_shadowinv.geometry.interpolation import (
+    WIDTH,
     CloughTocher,
+    corner_weights,
     fit_gradients,
+    natural_neighbor,
+    with_gradients,
     with_mirror_images,
 )
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
@@ -139,3 +144,80 @@ def test_pixels_equal_points_for_any_number_of_threads(threads):
     alone = CloughTocher(RegularTriangulation(sites), values, gradients, threads=1)
     np.testing.assert_array_equal(surface.at_pixels(shape), alone.at_pixels(shape))
     np.testing.assert_array_equal(expected, alone(pixels).reshape(shape))
+
+
+FAR = ((-1e3, -1e3), (1e3, 1e3))
+
+
+def test_shares_are_the_areas_taken_from_each_voronoi_cell():
+    rng = np.random.default_rng(0)
+    sites = rng.random((60, 2)) * 10
+    values = rng.random(60)
+    for query in rng.random((20, 2)) * 4 + 3:
+        weighted = total = 0.0
+        for i in range(60):
+            cell = power_cell(sites, np.zeros(60), i, *FAR)
+            taken = clipped(cell, 2 * (sites[i] - query), sites[i] @ sites[i] - query @ query)
+            area = abs(shoelace(taken)[0])
+            weighted += area * values[i]
+            total += area
+        expected = weighted / total
+        got = natural_neighbor(RegularTriangulation(sites), values, query[None])[0]
+        assert got == pytest.approx(expected, abs=1e-10)
+
+
+def test_values_are_met_at_the_sites_and_in_the_middle_of_a_grid():
+    y, x = np.mgrid[0:5.0, 0:5.0]
+    sites = np.column_stack([y.ravel(), x.ravel()])
+    values = np.random.default_rng(3).random(25)
+    triangulation = RegularTriangulation(sites)
+    np.testing.assert_array_equal(natural_neighbor(triangulation, values, sites), values)
+    middle = natural_neighbor(triangulation, values, [[1.5, 2.5]])[0]
+    assert middle == pytest.approx(values.reshape(5, 5)[1:3, 2:4].mean())
+
+
+@pytest.fixture(scope="module")
+def triangulation():
+    return RegularTriangulation(np.random.default_rng(0).random((400, 2)) * 20)
+
+
+@pytest.fixture(scope="module")
+def values():
+    return np.random.default_rng(1).normal(size=(400, WIDTH))
+
+
+def mean_of_triangles(triangulation, values):
+    """Gradients at the sites, by solving for the plane over each triangle."""
+    total, area = np.zeros((len(values), 2)), np.zeros(len(values))
+    for corners in triangulation.vertices:
+        if corners.max() < len(values):
+            edges = triangulation.sites[corners[1:]] - triangulation.sites[corners[0]]
+            size = abs(np.linalg.det(edges))
+            total[corners] += size * np.linalg.solve(
+                edges, values[corners[1:]] - values[corners[0]]
+            )
+            area[corners] += size
+    return total / area[:, None]
+
+
+def test_gradients_equal_separate_sets_of_values(triangulation, values):
+    surface = with_gradients(triangulation, values)
+    np.testing.assert_array_equal(surface[:, 0], values)
+    for column in range(WIDTH):
+        begun = mean_of_triangles(triangulation, values[:, column])
+        fitted = fit_gradients(triangulation, values[:, column], begun)
+        np.testing.assert_allclose(surface[:, 1:, column], fitted, rtol=1e-9, atol=1e-9)
+
+
+def test_corner_weights_give_the_surface_also_beyond_the_sites(triangulation, values):
+    rng = np.random.default_rng(2)
+    gradients = rng.normal(size=(400, 2))
+    queries = np.sort(rng.random((5000, 2)) * 24 - 2, axis=0)
+    corners, weights = corner_weights(triangulation, queries)
+    at_sites = np.column_stack([values[:, 0], gradients])
+    interpolated = (weights * at_sites[corners]).sum(axis=(1, 2))
+    surface = CloughTocher(triangulation, values[:, 0], gradients)
+    np.testing.assert_allclose(interpolated, surface(queries), rtol=1e-9, atol=1e-9)
+    again = corner_weights(triangulation, queries, threads=3)
+    np.testing.assert_array_equal(corners, again[0])
+    np.testing.assert_array_equal(weights, again[1])
