@@ -105,37 +105,6 @@ print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) >
     assert printed.stdout.strip() == "[]"
 
 
-def test_a_second_process_compiles_for_the_types_that_are_needed():
-    """Else it would compile in vain: an inversion after it needs nothing of the kind anew."""
-    script = """
-import sys
-import numpy as np
-from napari_shadowinv import invert
-from napari_shadowinv.inversion.compilation import compile_rest
-
-def signatures():
-    return {
-        (function.py_func.__name__, str(signature))
-        for name in ("interpolation", "power_diagram", "forward", "linear", "_coarsening")
-        for module in sys.modules.values()
-        if getattr(module, "__name__", "").endswith("." + name)
-        for function in vars(module).values() if hasattr(function, "signatures")
-        for signature in function.signatures
-    }
-
-compile_rest()
-compiled = signatures()
-assert len(compiled) > 12
-y, x = np.indices((64, 64)) / 64
-invert(1 + y * x, source=1 + x)
-print([name for name, _ in signatures() - compiled])
-"""
-    printed = subprocess.run(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=True
-    )
-    assert printed.stdout.strip() == "[]"
-
-
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of another kind")
 def test_a_kernel_runs_where_no_folder_keeps_its_code(tmp_path):
     """Neither the package nor the home can be written."""

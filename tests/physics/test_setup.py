@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
 import tomli_w
 from pydantic import TypeAdapter, ValidationError
 
-import napari_shadowinv
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.beam import (
     displacement_from_potential,
@@ -283,36 +280,6 @@ def test_vectors_must_have_two_components(proton: ProtonSetup) -> None:
         proton.displacement_from_path_integrated_b(1.0)
     with pytest.raises(InputError, match="unit is 'G cm': it must be one of T m, MG um"):
         proton.path_integrated_b(np.zeros((2, 4)), "G cm")  # type: ignore[arg-type]
-
-
-# Source files that may name a kind of setup.
-NAMED_IN = {
-    "__init__.py": "the index of the public names",
-    "__init__.pyi": "the public names",
-    "physics/__init__.pyi": "the public names",
-    "physics/beam.py": "an example in a docstring",
-    "physics/projection.py": "an example in a docstring",
-    "preprocessing/estimates.py": "an example in a docstring",
-    "_napari/samples.py": "the samples' experiments",
-    "cli/_shot_commands.py": "the experiment of the demo",
-    "physics/setup.py": "where they are defined",
-    "physics/tracing.py": "only charged particles are traced",
-    "physics/particle_flight.py": "only charged particles are traced",
-    "physics/phantoms.py": "a magnetic field deflects particles, a plasma wave is probed by light",
-    "film/pack.py": "stopping in film is that of protons",
-    "film_doses.py": "stopping in film is that of protons",
-}
-
-
-def test_setup_kinds_are_named_only_where_they_are_defined() -> None:
-    source = Path(napari_shadowinv.__file__).parent
-    kinds = re.compile("|".join(model.__name__ for model in SETUPS.values()))
-    mentioning = {
-        path.relative_to(source).as_posix()
-        for path in source.rglob("*.py*")
-        if path.suffix in (".py", ".pyi") and kinds.search(path.read_text(encoding="utf-8"))
-    }
-    assert mentioning == set(NAMED_IN)
 
 
 @pytest.mark.parametrize("kind", SETUPS)
