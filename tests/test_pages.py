@@ -133,15 +133,12 @@ def test_the_loop_of_the_page_on_fits_names_the_film_that_changed() -> None:
         for block in blocks(text_of("docs/fit.md"), "python")
         if "ProtonSetup(" in block or "enumerate(films)" in block
     )
-    names: dict[str, Any] = {"__name__": "page"}
-    chi2 = {}
-    for strength in ("", "1.1 * "):
-        printed = io.StringIO()
-        with contextlib.redirect_stdout(printed):
-            exec(first + loop.replace("synthetic_image(", f"synthetic_image({strength}", 1), names)
-        chi2[strength] = [float(line.split()[-1]) for line in printed.getvalue().splitlines()[-3:]]
-    np.testing.assert_allclose(chi2[""], [1.04, 1.02, 1.03], atol=0.01)
-    np.testing.assert_allclose(chi2["1.1 * "], [1.8, 1.1, 2.3], atol=0.05)
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        stronger = loop.replace("synthetic_image(", "synthetic_image(1.1 * ", 1)
+        exec(first + stronger, {"__name__": "page"})
+    chi2 = [float(line.split()[-1]) for line in printed.getvalue().splitlines()[-3:]]
+    np.testing.assert_allclose(chi2, [1.8, 1.1, 2.3], atol=0.05)
 
 
 def test_the_loop_of_the_page_on_plans_shows_what_a_beam_is_worth() -> None:

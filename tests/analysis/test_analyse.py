@@ -80,6 +80,15 @@ def test_a_saved_inversion_has_the_same_bands(inversion: Inversion):
     np.testing.assert_array_equal(before["magnitude"].samples, of_file["magnitude"].samples)
 
 
+def test_bands_follow_the_stated_noise(inversion: Inversion):
+    def spread(level: float) -> float:
+        options = inversion.options.model_copy(update={"noise_level": level})
+        (result,) = analyse(replace(inversion, options=options), LINE, samples=40)
+        return float(result["normal"].std.mean())
+
+    assert spread(80.0) > 2 * spread(20.0)
+
+
 def test_discretisation_and_instrument_are_among_the_causes(inversion: Inversion):
     instrument = inversion.instrument.model_copy(update={"background": 0.05, "energy": 0.1})
     (result,) = analyse(

@@ -160,7 +160,7 @@ def test_a_beams_error_is_that_of_inversions_with_other_beams(image, source):
     plan = plan_sites(source, OPTIONS)
     here = invert(image, plan=plan, options=OPTIONS)
     rng, indices, fields = np.random.default_rng(1), np.indices(SHAPE), []
-    for _ in range(40):
+    for _ in range(24):
         waves = rng.normal(size=(40, 2)) / (0.25 * min(SHAPE))
         phases = rng.uniform(0, 2 * np.pi, 40)[:, None, None]
         wave = np.cos(np.tensordot(waves, indices, 1) + phases).sum(axis=0)

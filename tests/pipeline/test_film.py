@@ -95,12 +95,6 @@ def on_films(truth: Truth, doses, plane: Callable[[int], np.ndarray], layer: int
     return ndimage.map_coordinates(plane(layer), np.moveaxis(at, -1, 0), order=3, mode="nearest")
 
 
-def test_doses_print_a_few_lines(doses) -> None:
-    lines = repr(doses).splitlines()
-    assert lines[1] == str(doses.headline)
-    assert len(lines) <= 6
-
-
 def test_doses_equal_the_exposure_of_the_films(truth: Truth, doses) -> None:
     scales = truth.scene.magnifications / truth.scene.magnifications[0]
     for layer in range(COUNT):

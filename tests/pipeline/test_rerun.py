@@ -119,7 +119,7 @@ def fit_of_arrays(folder: Path) -> Example:
     assert result.provenance is not None
     assert result.provenance.recipe.fit.brightness == "free"
     np.testing.assert_array_equal(result.provenance.fiducial_rows, rows)
-    return Example(write(Path("a.shadowinv"), result), paths[1])
+    return Example(write(Path("a.shadowinv"), result), paths[1], is_quick=False)
 
 
 def refinement(folder: Path) -> Example:

@@ -134,7 +134,7 @@ def test_a_fit_takes_the_instrument_of_its_recipe(images: list[FloatArray]) -> N
         Shot(image, setup, source=np.ones(SHAPE))
         for image, setup in zip(images, SETUPS, strict=True)
     ]
-    result = run_fit(Recipe(instrument=instrument, fit=choices), shots)
+    result = run_fit(Recipe(steps=STEPS, instrument=instrument, fit=choices), shots)
     assert result.report.numbers.keys() == {"background"}
     assert result.provenance is not None
     assert result.provenance.recipe.instrument == instrument
@@ -148,7 +148,7 @@ def test_a_source_declared_as_an_estimate_has_the_error_of_one(images: list[Floa
             Shot(image, setup, source=np.ones(SHAPE), measured=measured)
             for image, setup in zip(images, SETUPS, strict=True)
         ]
-        result = run_fit(Recipe(fit=choices), shots)
+        result = run_fit(Recipe(steps=STEPS, fit=choices), shots)
         # A beam that is not fitted has an estimated error; a uniform one is exact.
         are_fitted[measured] = result.errors.beam_sensitivity is None
         assert (result.errors.shares.get("beam", 0.0) > 0) == (not measured)
