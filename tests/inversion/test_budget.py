@@ -202,7 +202,7 @@ def test_the_solvers_part_is_the_change_by_a_better_solution(each_image):
     assert exact.errors.effects["solver"].rms < 1e-3 * true
 
 
-@pytest.mark.parametrize("each_image", ["strong", "pair"], indirect=True)
+@pytest.mark.parametrize("each_displacement", ["strong", "pair"], indirect=True)
 def test_the_error_by_an_unmeasured_beam_is_that_by_other_beams(each_image):
     """Beams that are drawn here, in another way, with the same spectrum."""
     options = InversionOptions(n_sites=900)

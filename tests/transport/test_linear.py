@@ -368,6 +368,5 @@ def test_every_system_is_solved(laplacian, grounded):
 
 
 def test_groups_without_conductors_between_them_are_refused(laplacian):
-    n = laplacian.shape[0]
     with pytest.raises(RuntimeError, match="several groups"):
         FactorisedLaplacian(csr_array(block_diag([laplacian, laplacian])))
