@@ -405,9 +405,12 @@ def lloyd(
             report(step)
         diagram = PowerDiagram(triangulation, source, with_moments=True, threads=threads)
         sites, centroids = triangulation.sites, diagram.centroids
-        # The centroid of a cell with hardly any light is nothing but rounding errors.
-        inside = np.all((centroids > -0.5) & (centroids < np.array(source.shape) - 0.5), axis=1)
-        centroids = np.where(np.expand_dims(inside, 1), centroids, sites)
+        # A site stays where there is light: in the dark its cell may lose all of it, and have a
+        # centroid of nothing but rounding errors.
+        places = np.clip(np.rint(centroids), 0, np.array(source.image.shape) - 1).astype(np.int64)
+        is_lit = source.image[tuple(places.T)] > 0
+        is_lit &= np.all(np.abs(centroids - places) <= 0.5, axis=1)
+        centroids = np.where(np.expand_dims(is_lit, 1), centroids, sites)
         moves = centroids - sites
         away = np.sqrt(np.einsum("na,na->", moves, moves) / len(moves))
         if step == iterations or away < near:
