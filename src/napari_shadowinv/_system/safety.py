@@ -106,9 +106,10 @@ def check_regular(path: Path, expected: str) -> None:
         raise FileFormatError(
             f"{path} does not exist: expected {expected}; check the path"
         ) from None
-    except OSError as error:
+    except (OSError, ValueError) as error:  # a null character
+        shown, reason = str(path).replace("\0", "\\0"), getattr(error, "strerror", error)
         raise FileFormatError(
-            f"{path} cannot be opened ({error.strerror}): check its permissions and the path"
+            f"{shown} cannot be opened ({reason}): check its permissions and the path"
         ) from None
     if stat.S_ISDIR(mode):
         raise FileFormatError(f"{path} is a folder: expected {expected}")
@@ -120,7 +121,10 @@ def check_regular(path: Path, expected: str) -> None:
 
 def resolved_path(path: str | Path) -> Path:
     """Return an absolute path without links; one that cannot be followed as far as it can be."""
-    return Path(os.path.realpath(path))
+    try:
+        return Path(os.path.realpath(path))
+    except ValueError as error:  # a null character
+        raise FileFormatError(f"{str(path)!r} is no path ({error}): correct it") from None
 
 
 def size_limit(*, share: float = 1 / 8, memory_if_unknown: int = 8_000_000_000) -> int:
