@@ -35,12 +35,13 @@ from napari_shadowinv import (
     synthetic_image,
     write,
 )
-from napari_shadowinv._system.safety import LIMIT_VARIABLE
+from napari_shadowinv._system.safety import LIMIT_VARIABLE, resolved_path
 from napari_shadowinv.cli._export import _escape_cell
 from napari_shadowinv.film import Calibration, Pack
 from napari_shadowinv.film.scans import usable_pixels
 from napari_shadowinv.inversion import Inversion, plan_sites
 from napari_shadowinv.inversion.variables import setup_from_dataset
+from napari_shadowinv.io import read_toml
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.options import FitChoices
 from napari_shadowinv.pipeline.shot_table import ShotRow, is_table, table_rows
@@ -177,6 +178,20 @@ def test_limit_of_memory_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
 # Files
 
 
+def test_toml_with_a_deep_key_is_refused_and_usual_keys_are_read(here: Path) -> None:
+    file = Path("deep.toml")
+    for text in (
+        '[options]\nseed = 1.5\nx = "a.b.c.d.e.f"\n',
+        "a.b.c.d = 1\n",
+        f'x = "{"a " * 50_000}"\n',
+    ):
+        file.write_text(text)
+        assert read_toml(file)
+    file.write_text("seed = 1\n" + ".".join(["a"] * 10_000) + " = 1\n")
+    with pytest.raises(InputError, match=r"deep\.toml, line 2 has a key of more than 16 parts"):
+        read_toml(file)
+
+
 def test_tiff_whose_strip_unpacks_to_far_more_is_refused(here: Path) -> None:
     pixels = np.zeros((100, 100), np.uint16)
     tifffile.imwrite("bomb.tif", pixels, compression="zlib", rowsperstrip=100)
@@ -203,6 +218,9 @@ def test_pipes_and_loops_of_links_are_refused_in_one_sentence(here: Path) -> Non
     refused("fit", "shot.npy", "--fiducials", "pipe.csv", names="pipe.csv is a pipe")
     for arguments in (["loop.npy"], ["shot.npy", "--source", "loop.npy"]):
         assert "Too many levels of symbolic links" in done("invert", *arguments, code=2)
+    for check in (sha256, resolved_path):
+        with pytest.raises(FileFormatError, match="null byte"):
+            check(Path("a\0b.npy"))
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from functools import partial
 from io import BytesIO
@@ -42,6 +43,12 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
     from napari_shadowinv.results import AnyResult
 
+# The parser takes memory and time with the square of a key's parts.
+_DEEPEST_KEY = 16
+_KEY_PART = r"""(?:[A-Za-z0-9_-]+|"[^"\n]*"|'[^'\n]*')"""
+_DEEP_KEY = re.compile(
+    rf"(?<![A-Za-z0-9_.-]){_KEY_PART}(?:[ \t]*\.[ \t]*{_KEY_PART}){{{_DEEPEST_KEY}}}"
+)
 _DISTANCES = {"source_object_distance", "object_image_distance"}
 
 
@@ -201,10 +208,20 @@ def read_toml(path: Path) -> dict[str, Any]:
     if it is not TOML.
     """
     text = small_text(path, "a TOML file")
+    if deep := _DEEP_KEY.search(text):
+        line = text.count("\n", 0, deep.start()) + 1
+        raise InputError(
+            f"{path}, line {line} has a key of more than {_DEEPEST_KEY} parts: expected keys such "
+            "as options.seed; check that it is the right file"
+        )
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{path} is not valid TOML: {error}") from None
+    except RecursionError:
+        raise InputError(
+            f"{path} has tables or lists nested too deeply: check that it is the right file"
+        ) from None
 
 
 def write_result(content: BytesIO, dataset: xarray.Dataset) -> None:
