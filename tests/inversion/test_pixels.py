@@ -45,11 +45,11 @@ def error(inversion):
 @pytest.mark.parametrize("flux", [lambda x: x, beam])
 def test_a_field_known_exactly_is_found_at_the_middles_of_pixels(flux):
     source, image = shot(flux)
-    found = invert(image, source=source, options=EXACT)
-    assert found.cells.are_pixels
+    inversion = invert(image, source=source, options=EXACT)
+    assert inversion.cells.are_pixels
     constant = invert(image, source=source, options=InversionOptions(n_sites=4 * image.size))
-    assert error(found) < 0.004
-    assert error(found) < error(constant) / 3
+    assert error(inversion) < 0.004
+    assert error(inversion) < error(constant) / 3
 
 
 def test_a_smooth_beam_that_is_not_deflected_gives_no_field():
@@ -69,9 +69,9 @@ def test_the_error_falls_at_least_with_the_square_of_the_pixel():
         starts = [brentq(lambda x, end=end: landing(x) - end, -0.1, 1.1) for end in borders]
         image = np.tile(pixels * np.diff(starts), (16, 1))
         options = InversionOptions(accuracy=1e-4, tolerance=1e-6)
-        found = invert(image, options=options)
-        assert found.cells.are_pixels
-        return np.abs(found.displacement[1] / pixels + middles - landing(middles)).max()
+        inversion = invert(image, options=options)
+        assert inversion.cells.are_pixels
+        return np.abs(inversion.displacement[1] / pixels + middles - landing(middles)).max()
 
     assert off(128) < off(64) / 4
 
@@ -93,7 +93,7 @@ def test_noise_that_hides_the_slopes_keeps_pixels_constant():
 @pytest.mark.parametrize(
     ("make", "size"), [(phantoms.toroid, 97.0), (phantoms.cosine_toroid, 40.0)]
 )
-def test_the_error_told_is_that_made(make, size):
+def test_the_error_stated_is_within_twice_the_true_one(make, size):
     """Within a factor of two, for a smooth field and for one with a kink at its rim."""
     setup = ProtonSetup.example()
     setup = setup.model_copy(update={"pixel_size": 2 * setup.pixel_size})
@@ -101,23 +101,23 @@ def test_the_error_told_is_that_made(make, size):
     image = synthetic_image(truth)
     inversion = invert(image, source=np.ones(image.shape), options=EXACT)
     assert inversion.cells.are_pixels
-    made = np.sqrt(((inversion.displacement - truth) ** 2).sum(axis=0).mean())
-    assert 0.5 < made / inversion.errors.discretisation.rms < 2
+    true_error = np.sqrt(((inversion.displacement - truth) ** 2).sum(axis=0).mean())
+    assert 0.5 < true_error / inversion.errors.discretisation.rms < 2
 
 
-def test_counts_leave_what_is_told():
+def test_the_limit_by_counts_is_the_scatter_of_inversions():
     """The scatter of inversions of all pixels, by independent counts of a weak object."""
     blob, counts = phantoms.gaussian_blob((48, 48), 4.0, 7.0), 2000.0
     rng, image = np.random.default_rng(1), synthetic_image(blob.displacement)
     options = InversionOptions(accuracy=1e-9, noise_level=1e-9)
     shots = [rng.poisson(counts * image) / counts for _ in range(20)]
-    found = [invert(shot, source=np.ones(shot.shape), options=options) for shot in shots]
-    assert found[0].cells.are_pixels
-    scatter = np.std([each.displacement for each in found], axis=0, ddof=1)
-    made = np.sqrt((scatter**2).sum(axis=0).mean())
-    assert made == pytest.approx(counting_error((48, 48), counts), rel=0.08)
-    told = invert(shots[0], source=np.ones(image.shape)).errors.by_counts.rms
-    assert told == pytest.approx(made, rel=0.15)
+    inversions = [invert(shot, source=np.ones(shot.shape), options=options) for shot in shots]
+    assert inversions[0].cells.are_pixels
+    scatter = np.std([inversion.displacement for inversion in inversions], axis=0, ddof=1)
+    noise_error = np.sqrt((scatter**2).sum(axis=0).mean())
+    assert noise_error == pytest.approx(counting_error((48, 48), counts), rel=0.08)
+    limit = invert(shots[0], source=np.ones(image.shape)).errors.by_counts.rms
+    assert limit == pytest.approx(noise_error, rel=0.15)
 
 
 def test_products_take_the_field_as_it_is():
@@ -126,8 +126,8 @@ def test_products_take_the_field_as_it_is():
     (field,) = sampled_fields(inversion, None, None, None)
     fields = inversion.potential, inversion.displacement
     for points in (field.at_points(*fields), field.within_pixels()):
-        for found, expected in zip(points, fields, strict=True):
-            np.testing.assert_array_equal(found, expected)
+        for values, expected in zip(points, fields, strict=True):
+            np.testing.assert_array_equal(values, expected)
 
 
 def test_a_similar_shot_starts_from_the_cells_of_pixels():

@@ -84,7 +84,7 @@ def _stored(shots: Any, recipe: Recipe | None = None) -> Any:
 def _stack_of(image: Any) -> Any:
     if isinstance(image, xr.DataArray):
         return xr.concat([image, image], "shot").transpose(..., "shot")
-    return np.stack([image, image])
+    return (np.ma if isinstance(image, np.ma.MaskedArray) else np).stack([image, image])
 
 
 @pytest.mark.parametrize("entry", INVERT)
