@@ -114,11 +114,9 @@ SOLVERS = (
 )
 
 LEFT_OUT = {
-    "scikit-image": "its public functions have no solver of Poisson's equation for a displacement, "
-    "so the linear route is SciPy's alone; its pictures stand in for two classes of DOTmark",
     "oliker-prussner-method": "solves the Monge–Ampère equation, but has no image to land on",
-    "prad": "traces particles on a graphics processor: the forward problem only",
-    "flash-sinkhorn, curegot": "made for graphics processors, by their descriptions",
+    "prad": "only traces particles",
+    "flash-sinkhorn, curegot": "made for graphics processors",
     "InvertDeflectPy, PROBLEM, invert-shadowgraphy": "not in the package index",
 }
 
@@ -132,13 +130,6 @@ PUBLISHED = (
         "the same, its demonstration",
         "50 × 50 px: about 10 minutes on its author's computer",
         "comment in its repository, mfkasim1/invert-shadowgraphy",
-    ),
-    (
-        "PIC and Lagrangian code, Monge–Ampère code",
-        "no time in the abstract: the Monge–Ampère code is the fastest in 2-D and fails for large "
-        "voids, high contrast and deflections across the border; the power diagrams of 2017 are "
-        "“by far the slowest and most memory intensive”, and fail for large peaks",
-        "Davies, Heuer and Bott, High Energy Density Phys. 49, 101067 (2023), abstract",
     ),
     (
         "PROBLEM (Monge–Ampère)",

@@ -98,7 +98,8 @@ def cell(result: Result) -> str:
 
 
 def error_table(results: Results, chosen: list[str]) -> str:
-    names = installed(results)
+    """Errors of the solvers that solved at least one of the chosen images."""
+    names = [name for name in installed(results) if summary.solved(results, name, chosen)]
     rows = []
     for key in chosen:
         successes = {name: summary.solved(results, name, [key]) for name in names}
