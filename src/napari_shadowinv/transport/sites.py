@@ -407,9 +407,10 @@ def lloyd(
         sites, centroids = triangulation.sites, diagram.centroids
         # A site stays where there is light: in the dark its cell may lose all of it, and have a
         # centroid of nothing but rounding errors.
-        places = np.clip(np.rint(centroids), 0, np.array(source.image.shape) - 1).astype(np.int64)
-        is_lit = source.image[tuple(places.T)] > 0
-        is_lit &= np.all(np.abs(centroids - places) <= 0.5, axis=1)
+        last = np.array(source.image.shape) - 1
+        is_lit = np.all((centroids > -0.5) & (centroids < last + 0.5), axis=1)
+        places = np.clip(np.rint(centroids), 0, last).astype(np.int64)
+        is_lit &= source.image[tuple(places.T)] > 0
         centroids = np.where(np.expand_dims(is_lit, 1), centroids, sites)
         moves = centroids - sites
         away = np.sqrt(np.einsum("na,na->", moves, moves) / len(moves))
