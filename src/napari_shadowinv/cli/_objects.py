@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 HELP = (
     "A phantom such as toroid:peak=60,radius=3e-5, a result, a displacement (2, H, W) in px or "
-    "potential (H, W) in px², or a 3-D field (openPMD, also fields.h5::iteration, NetCDF)."
+    "potential (H, W) in px², or a 3-D field (NetCDF)."
 )
 
 
@@ -58,7 +58,7 @@ def object_of(
     from napari_shadowinv.pipeline.experiment_object import phantom_of_text
 
     file, (_, array) = file_of(text), split_address(text)
-    is_grid = file is not None and is_field_grid(file)
+    is_grid = file is not None and array is None and is_field_grid(file)
     stated = {"--recorded-with": flags.recorded_with, "--deflector": flags.deflector}
     received = [] if file and not is_grid else [flag for flag in stated if stated[flag]]
     sections = () if is_grid else ("view.", "trace.")
@@ -71,7 +71,7 @@ def object_of(
     if file is None:
         return phantom_of_text(text)
     if is_grid:
-        return view.apply(read_field_grid(file, iteration=array))
+        return view.apply(read_field_grid(file))
     return _displaced(Path(text), flags)
 
 
@@ -131,6 +131,6 @@ def _displacement(path: Path, array: AnyArray) -> FloatArray:
 
 def _no_field(path: Path, kind: str) -> FileFormatError:
     return FileFormatError(
-        f"{path} is {kind}: expected a .shadowinv result, or NPY with a displacement "
-        "(2, height, width) in px or a potential (height, width) in px²"
+        f"{path} is {kind}: expected a .shadowinv result, NetCDF with the fields of a grid, or NPY with a "
+        "displacement (2, height, width) in px or a potential (height, width) in px²"
     )

@@ -6,8 +6,7 @@
 - write a result or an image: `write`; check the path beforehand: `check_output`
 - results of many shots in one store: `read_stack`; recognise its folder: `is_stack`
 - write a file of your own, whole or not at all: `replacing`
-- a 3-D field of a simulation: `read_field_grid`, of an openPMD or NetCDF file; recognise it:
-  `is_field_grid`
+- a 3-D field of a simulation: `read_field_grid`; recognise it: `is_field_grid`
 - every format, and how to add one: `napari_shadowinv.io.formats`
 """
 

@@ -32,7 +32,7 @@ _TESLAS = {"T": 1.0, "mT": 1e-3, "kT": 1e3, "G": 1e-4, "kG": 0.1, "MG": 100.0}
 _TESLAS |= {"tesla": 1.0, "gauss": 1e-4, "Gauss": 1e-4, "Tesla": 1.0}
 _VOLTS = {"V": 1.0, "kV": 1e3, "MV": 1e6, "GV": 1e9, "TV": 1e12, "volt": 1.0, "Volt": 1.0}
 _FIELDS = {"B": "magnetic field", "E": "electric field"}
-_COMPONENT = re.compile(r"([BE])_?([xyz])", re.IGNORECASE)
+COMPONENT = re.compile(r"([BE])_?([xyz])", re.IGNORECASE)
 _PLASMAPY_AXES = ("ax0", "ax1", "ax2")
 _DIRECTION = re.compile(r"([+-]?)([xyz])")
 _LARGEST = float(np.finfo(np.float32).max)
@@ -207,7 +207,7 @@ def field_grid(field: Any) -> FieldGrid:
     check_memory([len(at) for _, _, at in places], 48, "a field")
     names: dict[tuple[str, str], str] = {}
     for variable in map(str, field.data_vars):
-        if match := _COMPONENT.fullmatch(variable):
+        if match := COMPONENT.fullmatch(variable):
             names[match[1].upper(), match[2].lower()] = variable
     arrays: dict[str, FloatArray] = {}
     for symbol, title in _FIELDS.items():
