@@ -176,7 +176,6 @@ FORMATS: dict[str, Writer] = {
     "scan.cpsa": _cpsa,
     "shot.txt": _table,
     "pradformat.h5": lambda path: _hdf5(path, object_type="radiograph"),
-    "inversion.h5": _result,
     "result.shadowinv": _result,
     "run.shadowinv.zarr": _store,
     "setup.toml": _toml,

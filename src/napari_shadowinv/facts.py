@@ -117,7 +117,7 @@ class ResultKind(StrEnum):
     INVERSION = "shadowinv result"
     FIT = "shadowinv fit"
     FILM_DOSES = "shadowinv film pack"
-    # Without images: of a shot of a store, of pradformat, of another program.
+    # Without images: of a shot of a store, of another program.
     FIELD = "shadowinv field"
 
     @classmethod

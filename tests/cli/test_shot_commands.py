@@ -35,6 +35,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Assessment, Verdict
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
+from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.io import read, read_shot, write
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -230,7 +231,6 @@ DESCRIBED = {
     "|turned upright as the file says|not proportional to the light",
     "shots.mat::beam": "array 'beam' of a MATLAB file|90, 100, 110",
     "shots.h5::day/d": "(2, 24, 32)",
-    "field.h5": "pradformat inversion|14.7 MeV proton",
     "kept.shadowinv": "another program|14.7 MeV proton",
     "fit.shadowinv": "one of several peak |; 2 different fields explain the data"
     "|alternative from near: objective +20 %, displacement 30 % away"
@@ -259,8 +259,8 @@ def test_info_describes_a_file(
         several = Assessment(Verdict.SEVERAL, "2 different fields explain the data")
         write(name, make_fit(assessment=several, setups=(proton_setup, proton_setup)))
     else:
-        write("field.h5", inversion, setup=proton_setup)
-        write("kept.shadowinv", read("field.h5"))
+        field = inversion.displacement, inversion.potential, proton_setup
+        write("kept.shadowinv", dataset_from_field(*field))
     text = done("info", name)
     for words in DESCRIBED[name].split("|"):
         assert words in text

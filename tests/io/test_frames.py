@@ -188,7 +188,7 @@ def test_arrays_of_a_deep_file_are_counted_and_loops_end(tmp_path):
             file[f"a/b/c/d/shot_{number:02d}/image"] = CUBE[0, 0]
         file["a/b/again"] = file["a"]
         file["a/same"] = file["a/b/c/d/shot_00/image"]
-        file["elsewhere"] = h5py.ExternalLink("other.h5", "/data")
+        file.create_dataset("elsewhere", (2, 2), "f8", external=[("other.bin", 0, 32)])
     with pytest.raises(InputError) as error:
         read(f"{path}::a/b/c/d/shot_17/imge")
     assert "did you mean 'a/b/c/d/shot_17/image'? it holds" in str(error.value)
@@ -201,11 +201,11 @@ def test_why_arrays_are_no_images(tmp_path):
         file["field"] = CUBE[0, 0] * 1j
         file["table"] = np.zeros((2, 2), [("a", "f4")])
         file["names"] = np.full((2, 2), b"a")
-        file["elsewhere"] = h5py.ExternalLink("other.h5", "/data")
+        file.create_dataset("elsewhere", (2, 2), "f8", external=[("other.bin", 0, 32)])
         file["times"] = np.arange(3.0)
     with pytest.raises(FileFormatError, match="has no image") as error:
         read(path)
-    for words in ("complex", "compound", "text", "in another file, 'other.h5'"):
+    for words in ("complex", "compound", "text", "in another file"):
         assert words in str(error.value)
     assert "times" not in str(error.value)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import h5py
@@ -10,8 +11,7 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.errors import FileFormatError, InputError
-from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.io import read, read_shot, write
+from napari_shadowinv.io import read, read_shot
 
 IMAGE = np.random.default_rng(0).normal(100, 10, (20, 24))
 
@@ -35,12 +35,8 @@ def virtual(file: h5py.File, name: str) -> None:
     file.create_virtual_dataset(name, layout)
 
 
-ELSEWHERE = {
-    "other.h5": external_link,
-    " other.h5": link_to_a_link,
-    "other.bin": raw_storage,
-    "  other.h5": virtual,
-}
+Place = Callable[[h5py.File, str], None]
+ELSEWHERE: tuple[Place, ...] = (external_link, link_to_a_link, raw_storage, virtual)
 
 
 @pytest.fixture
@@ -52,34 +48,28 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("place", ELSEWHERE)
-def test_what_lies_elsewhere_is_refused(folder: Path, place: str, inversion: Inversion) -> None:
+def test_what_lies_elsewhere_is_refused(folder: Path, place: Place) -> None:
     path = folder / "shot.h5"
     with h5py.File(path, "w") as file:
         file.attrs["object_type"] = "radiograph"
-        ELSEWHERE[place](file, "image")
+        place(file, "image")
         file["own"] = IMAGE
         file["again"] = h5py.SoftLink("own")
     for variable in (None, "image"):
-        with pytest.raises(FileFormatError, match=rf"which is in .*{place.strip()}") as error:
+        with pytest.raises(FileFormatError, match=r"image' itself, but refers to another file"):
             read(path, variable=variable)
-        assert "image" in str(error.value)
     for variable in ("own", "again", "/own"):
         np.testing.assert_array_equal(read_shot(path, variable=variable).image, IMAGE)
     with h5py.File(folder / "shot.mat", "w") as file:
         file["own"] = IMAGE.T
         file["own"].attrs["MATLAB_class"] = np.bytes_(b"double")
-        ELSEWHERE[place](file, "shot")
-    with pytest.raises(FileFormatError, match="other"):
+        place(file, "shot")
+    with pytest.raises(FileFormatError, match="another file"):
         read(folder / "shot.mat", variable="shot")
-    path = write(folder / "shot.shadowinv", inversion)
-    with h5py.File(path, "r+") as file:
-        ELSEWHERE[place](file, "more")
-    with pytest.raises(FileFormatError, match="which is in"):
-        read(path)
     loop = folder / "loop.h5"
     with h5py.File(loop, "w") as file:
         file["here"], file["there"] = h5py.SoftLink("/there"), h5py.SoftLink("/here")
         file["gone"] = h5py.ExternalLink("nowhere.h5", "image")
-    for name, words in (("here", "too many links"), ("gone", "'nowhere.h5'")):
+    for name, words in (("here", "too many links"), ("gone", "can't open file")):
         with pytest.raises((FileFormatError, InputError), match=words):
             read(loop, variable=name)

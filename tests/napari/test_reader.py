@@ -18,6 +18,7 @@ from napari_shadowinv._napari.layers import add_layers, sample_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
 from napari_shadowinv._napari.result_files import follow_arrows, missing_layers
 from napari_shadowinv._napari.widgets._layers import cautions_of
+from napari_shadowinv.inversion.variables import dataset_from_field
 
 PLUGIN = "napari-shadowinv"
 
@@ -145,9 +146,10 @@ def test_a_stray_file_is_dark_and_gives_a_warning(run):
         assert data[shot].compute().all()
 
 
-def test_a_pradformat_inversion_shows_its_field(viewer, solved, proton_setup, tmp_path):
-    write(tmp_path / "field.h5", solved, setup=proton_setup)
-    layers = by_role(viewer.open(tmp_path / "field.h5", plugin=PLUGIN))
+def test_a_field_of_another_program_is_shown(viewer, solved, proton_setup, tmp_path):
+    dataset = dataset_from_field(solved.displacement, solved.potential, proton_setup)
+    write(tmp_path / "field.shadowinv", dataset)
+    layers = by_role(viewer.open(tmp_path / "field.shadowinv", plugin=PLUGIN))
     assert list(layers) == ["field", "arrows"]
     field = proton_setup.path_integrated_b(solved.displacement)
     np.testing.assert_allclose(layers["field"].data, 1e3 * np.hypot(*field), rtol=1e-9)

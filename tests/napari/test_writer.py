@@ -5,7 +5,7 @@ import pytest
 from napari.components import ViewerModel
 
 from helpers.layers import by_role
-from napari_shadowinv import FileFormatError, add_to_viewer, read, write
+from napari_shadowinv import FileFormatError, add_to_viewer, read
 from napari_shadowinv._napari.layer_metadata import (
     Frame,
     Result,
@@ -19,6 +19,7 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import add_layers
 from napari_shadowinv._napari.result_files import layers_of_result, write_result
+from napari_shadowinv.inversion.variables import dataset_from_field
 from napari_shadowinv.results import result_from_dataset
 
 PLUGIN = "napari-shadowinv"
@@ -38,7 +39,8 @@ def content(request, proton_setup, tmp_path):
         return request.getfixturevalue("two_fields")
     inversion = request.getfixturevalue("solved").in_units(proton_setup)
     if request.param == "field":
-        return result_from_dataset(read(write(tmp_path / "field.h5", inversion)))
+        field = inversion.displacement, inversion.potential, proton_setup
+        return result_from_dataset(dataset_from_field(*field))
     return inversion
 
 

@@ -27,10 +27,12 @@ from napari_shadowinv.cli._batch import _Printer
 from napari_shadowinv.cli._terminal import progress_bars
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.facts import Level, Verdict
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import store_writing
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.plotting import stack_frames, write_film
+from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.stack import RunStatus
 
 OPTICAL = """
@@ -151,11 +153,13 @@ def test_shots_are_exported_as_pradformat_for_particle_beams(night, folder):
     (path,) = Path("n").iterdir()
     with h5py.File(path) as file:
         assert file.attrs["radiograph_filename"] == "shot_4.npy"
-    provenance = provenance_in(path)
+        angle = np.stack([file["defl_ax1"], file["defl_ax2"]])
+        provenance = Provenance.of(file.attrs)
     assert provenance.image.file == "shot_4.npy"
     assert provenance.image.sha256 == sha256("shots/shot_4.npy")
     assert provenance.recipe == provenance_in(store).recipe
-    np.testing.assert_allclose(read(path).displacement, store.displacement[4], atol=1e-6)
+    expected = setup_from_dataset(store).deflection_angle(store.displacement[4].values)
+    np.testing.assert_allclose(angle, expected, rtol=1e-6, atol=1e-12)
 
 
 def test_progress_of_a_batch_fits_80_columns(folder, monkeypatch):

@@ -52,7 +52,7 @@ class ProductFlags:
 @notify_errors
 @_flags.takes_flags
 def analyse(
-    result: Annotated[Path, _flags.argument(help="Result, pradformat file, or store of shots.")],
+    result: Annotated[Path, _flags.argument(help="Result, or store of shots.")],
     flags: ProductFlags,
     product: Annotated[list[str] | None, _flags.argument(help=HELP["products"])] = None,
     csv: Annotated[Path | None, Option(help="Table of all numbers with their bands.")] = None,

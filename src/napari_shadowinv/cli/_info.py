@@ -48,7 +48,7 @@ def _rows(path: Path) -> _summary.Rows:
     if variable is not None and form.name in ("pradformat", "shadowinv"):
         array = read_hdf5(path, variable)
         return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
-    if form.name not in ("npy", "mat", "cpsa", "text", "hdf5") and "result" not in form.holds:
+    if form.is_scan or form.name in ("b16", "spe"):
         return _picture_rows(path, form)
     content = read(path, variable=variable)
     return _shot_rows(content) if isinstance(content, Shot) else _result_rows(content)
@@ -137,8 +137,7 @@ def _result_rows(dataset: xarray.Dataset) -> _summary.Rows:
     content = unpack_result(dataset)
     kind = f"{content.kind.noun} of shadowinv {dataset.attrs.get('package_version')}"
     if content.kind is ResultKind.FIELD and "options" not in dataset.attrs:
-        is_pradformat = dataset.attrs.get("format") == "pradformat"
-        kind = "pradformat inversion" if is_pradformat else "field retrieved by another program"
+        kind = "field retrieved by another program"
     facts = list(content.facts)
     shape = (dataset.sizes["y"], dataset.sizes["x"])
     has_verdict = content.headline.verdict is not None

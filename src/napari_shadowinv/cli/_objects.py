@@ -84,7 +84,7 @@ def _displaced(path: Path, flags: ObjectFlags) -> PlannedObject:
 
     (file, variable), original = split_address(path), read_setup(flags.recorded_with)
     kind = kind_of(file)
-    if variable is None and kind in ("pradformat", "shadowinv"):
+    if variable is None and kind == "shadowinv":
         field = _object_of_result(file, read_dataset(file))
         if field.setup is not None and original is not None:
             raise InputError(f"{file} has its setup: leave out --recorded-with")
@@ -131,6 +131,6 @@ def _displacement(path: Path, array: AnyArray) -> FloatArray:
 
 def _no_field(path: Path, kind: str) -> FileFormatError:
     return FileFormatError(
-        f"{path} is {kind}: expected a .shadowinv result, NetCDF with the fields of a grid, or NPY with a "
-        "displacement (2, height, width) in px or a potential (height, width) in px²"
+        f"{path} is {kind}: expected a .shadowinv result, NetCDF with fields on a grid, or "
+        "NPY with a displacement (2, height, width) in px or a potential (height, width) in px²"
     )

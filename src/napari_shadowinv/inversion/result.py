@@ -637,7 +637,7 @@ _STORED_CAUSES = ("noise, instrument and beam",)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RetrievedField(Summarised):
-    """A displacement of another program, of a pradformat file, or of a shot of a store.
+    """A displacement of another program, or of a shot of a store.
 
     Attributes
     ----------

@@ -61,7 +61,7 @@ def _nexus_number(path: Path, dataset: Any, name: str) -> float | None:
     """Return a number next to an array, for the array alone or for its group."""
     title = dataset.name.rpartition("/")[2]
     for key in (f"{title}_{name}", name):
-        item = member(path, dataset.parent, key)
+        item = member(dataset.parent, key)
         if getattr(getattr(item, "dtype", None), "kind", "") not in tuple("iuf"):
             continue
         numbers = np.ravel(load_dataset(path, item))
@@ -103,9 +103,9 @@ def _rejected_pixels(
     """Return the pixels that the mask in the array's group, or of its only detector, rejects."""
     if is_of_matlab(dataset):
         return None
-    instrument = member(path, dataset.parent.parent, "instrument")
-    groups = [dataset.parent, *(member(path, instrument, name) for name in instrument or ())]
-    masks = [member(path, group, "pixel_mask") for group in groups]
+    instrument = member(dataset.parent.parent, "instrument")
+    groups = [dataset.parent, *(member(instrument, name) for name in instrument or ())]
+    masks = [member(group, "pixel_mask") for group in groups]
     fitting = [item for item in masks if item is not None and item.shape[-2:] == shape]
     if not fitting or (len(fitting) > 1 and fitting[0].parent != dataset.parent):
         return None

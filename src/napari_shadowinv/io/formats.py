@@ -143,7 +143,7 @@ RESULT = Format(
 )
 PRADFORMAT = Format(
     "pradformat", (".h5", ".hdf5"), "pradformat", _HDF5, test="pradformat:is_pradformat",
-    holds=("image", "result"), reader="pradformat:read_pradformat",
+    reader="pradformat:read_pradformat",
     named_reader="hdf5_arrays:read_plane", counter="hdf5_arrays:count_frames",
     result_writer="pradformat:write_pradformat",
     results=(ResultKind.INVERSION, ResultKind.FIT, ResultKind.FIELD),

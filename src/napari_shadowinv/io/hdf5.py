@@ -36,28 +36,11 @@ def open_hdf5(path: Path) -> Any:
     return h5py.File(path, "r")
 
 
-def member(path: Path, group: Any, name: str) -> Any | None:
-    """Return an item by its name with groups, or None; refuse an item in another file."""
+def member(group: Any, name: str) -> Any | None:
+    """Return an item by its name with groups, or None."""
     import h5py
 
-    if not isinstance(group, h5py.Group) or not name or name not in group:
-        return None
-    try:
-        item = group[name]
-    except KeyError:
-        if isinstance(link := group.get(name, getlink=True), h5py.ExternalLink):
-            _refuse_other_file(path, name, [link.filename])
-        raise
-    if item.file.filename != group.file.filename:
-        _refuse_other_file(path, name, [item.file.filename])
-    return item
-
-
-def _refuse_other_file(path: Path, name: str, files: list[str]) -> None:
-    raise FileFormatError(
-        f"{path} does not hold {name!r} itself, which is in {', '.join(map(repr, files))}: "
-        "expected all data in one file; name the file with the data, or save them in this file"
-    )
+    return group[name] if isinstance(group, h5py.Group) and name and name in group else None
 
 
 def plain_value(value: Any) -> Any:
@@ -70,18 +53,14 @@ def plain_value(value: Any) -> Any:
 
 
 def items_of(file: Any, *, most: int = 10_000) -> list[tuple[str, Any]]:
-    """Return names and items of a file once each; an item in another file is the file's name."""
-    import h5py
-
+    """Return names and items of a file, once each and without links."""
     items: list[tuple[str, Any]] = []
 
     def add(name: str, item: Any) -> bool | None:
-        if not isinstance(item, (h5py.HardLink, h5py.SoftLink)):
-            items.append((name, getattr(item, "filename", item)))
+        items.append((name, item))
         return len(items) >= most or None
 
     file.visititems(add)
-    file.visititems_links(add)
     return items
 
 
@@ -99,8 +78,11 @@ def check_array(path: Path, dataset: Any, index: tuple[int, ...] = (), before: i
 
     Returns the bytes in memory of its values at an index, and of what was read `before`.
     """
-    if files := stored_elsewhere(dataset):
-        _refuse_other_file(path, dataset.name, files)
+    if is_elsewhere(dataset) or Path(dataset.file.filename) != path:
+        raise FileFormatError(
+            f"{path} does not hold {dataset.name!r} itself, but refers to another file: expected "
+            "all data in one file; name the file with the data, or save them in this file"
+        )
     itemsize = int(dataset.dtype.itemsize)
     # One chunk may be far larger than what is used of it.
     chunk_bytes = int(np.prod(dataset.chunks or (0,), dtype=float)) * itemsize
@@ -146,11 +128,9 @@ def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:
     return all(chunk.byte_offset is not None for chunk in chunks)
 
 
-def stored_elsewhere(dataset: Any) -> list[str]:
-    """Return the other files that hold the values of an array."""
-    if dataset.is_virtual:
-        return sorted({source.file_name for source in dataset.virtual_sources()})
-    return [name for name, *_ in dataset.external or ()]
+def is_elsewhere(dataset: Any) -> bool:
+    """Return whether the values of an array are in other files."""
+    return dataset.is_virtual or bool(dataset.external)
 
 
 def check_arrays(path: Path) -> None:
@@ -159,9 +139,7 @@ def check_arrays(path: Path) -> None:
 
     total = 0
     with open_hdf5(path) as file:
-        for name, item in items_of(file):
-            if isinstance(item, str):
-                _refuse_other_file(path, name, [item])
+        for _, item in items_of(file):
             if isinstance(item, h5py.Dataset):
                 total = check_array(path, item, before=total)
 

@@ -32,12 +32,12 @@ from napari_shadowinv.io.conventions import (
 )
 from napari_shadowinv.io.field_grids import is_field_grid
 from napari_shadowinv.io.hdf5 import (
+    is_elsewhere,
     items_of,
     load_dataset,
     member,
     open_hdf5,
     plain_value,
-    stored_elsewhere,
 )
 
 _DEFAULTS = ("signal", "default")  # attributes of a NeXus group: its array, or the group to look in
@@ -82,7 +82,7 @@ def list_images(path: Path) -> tuple[list[str], list[ArrayEntry]]:
         )
     with open_hdf5(path) as file:
         entries = list(_entries(file))
-        default = _member_or_default(path, file, "/")
+        default = _member_or_default(file, "/")
         if default is not None and not _reason(default):
             return [str(default.name)], entries
     names = [entry.name for entry in entries if not entry.reason]
@@ -100,7 +100,7 @@ def _stored(path: Path, dataset: Any, number: int | None) -> AnyArray:
 def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
     """Return an array by its name, and the number of the frame that the name ends with."""
     item, frame = find_array(
-        path, name, lambda text: _member_or_default(path, file, text), _entries(file)
+        path, name, lambda text: _member_or_default(file, text), _entries(file)
     )
     if item.dtype.kind not in "buif" or not item.shape:
         raise InputError(
@@ -110,16 +110,16 @@ def _find_array(path: Path, file: Any, name: str) -> tuple[Any, int | None]:
     return item, frame_number(path, frame, item.shape[:-2])
 
 
-def _member_or_default(path: Path, file: Any, name: str) -> Any | None:
+def _member_or_default(file: Any, name: str) -> Any | None:
     """Return an array by its name, or that which a NeXus group of this name shows by default."""
     import h5py
 
-    item = member(path, file, name)
+    item = member(file, name)
     for _ in range(16):
         if not isinstance(item, h5py.Group):
             break
         default = next((plain_value(item.attrs[k]) for k in _DEFAULTS if k in item.attrs), None)
-        item = member(path, item, default) if isinstance(default, str) else None
+        item = member(item, default) if isinstance(default, str) else None
     return item if isinstance(item, h5py.Dataset) else None
 
 
@@ -135,9 +135,7 @@ def _entries(file: Any) -> Iterator[ArrayEntry]:
     for name, item in items_of(file):
         if name[:1] == "#":  # MATLAB's own
             continue
-        if isinstance(item, str):
-            yield ArrayEntry(name, "", f"in another file, {item!r}")
-        elif getattr(item, "shape", ()):
+        if getattr(item, "shape", ()):
             yield ArrayEntry(name, _size_text(item), _reason(item))
 
 
@@ -159,4 +157,4 @@ def _reason(dataset: Any) -> str:
     is_triple = dataset.ndim == 3 and dataset.shape[0] == 3
     if is_of_matlab(dataset) and is_triple and dataset.dtype == np.uint8:
         return "a picture in colour"
-    return "in another file" if stored_elsewhere(dataset) else ""
+    return "in another file" if is_elsewhere(dataset) else ""

@@ -1,5 +1,6 @@
 """pradformat, the HDF5 layout in which codes for proton radiography exchange files.
 
+Radiographs are read, inversions are written.
 It differs from this package in its conventions: energies are in eV; a radiograph's ``pixel_width``
 is in the detector plane; axis 1 is the first of the array, here y; an inversion's ``phi`` (m) has
 the deflection angle as its gradient, where here the angle is *minus* the gradient.
@@ -24,10 +25,9 @@ from scipy import constants
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.facts import ResultKind
-from napari_shadowinv.inversion.variables import dataset_from_field, setup_from_dataset
+from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.hdf5 import load_dataset, member, open_hdf5, plain_value
-from napari_shadowinv.physics.beam import displacement_from_potential
-from napari_shadowinv.physics.setup import Setup, Species, setup_from_dict
+from napari_shadowinv.physics.setup import Setup, Species
 from napari_shadowinv.physics.units import refuse_missing
 from napari_shadowinv.provenance import Provenance
 
@@ -56,7 +56,7 @@ def is_result(path: Path) -> bool:
 
 
 def is_pradformat(path: Path) -> bool:
-    """Return whether a file that begins like HDF5 or a MAT-file is a radiograph or inversion."""
+    """Return whether a file that begins like HDF5 or a MAT-file is of this format."""
     import h5py
 
     return h5py.is_hdf5(path) and _root_attributes(path).get("object_type") in _OBJECT_TYPES
@@ -65,9 +65,8 @@ def is_pradformat(path: Path) -> bool:
 # They are looked up by name: walking all attributes of a damaged file may never end.
 _ATTRIBUTES = """
     format object_type radiograph_type inversion_type pradformat_version pixel_width
-    pixel_width_ax2 dr dr_ax2 scale_factor source_object_dist object_image_dist spec_name spec_mass
-    spec_charge spec_energy label description experiment_date file_date radiograph_filename
-    provenance
+    pixel_width_ax2 scale_factor source_object_dist object_image_dist spec_name spec_mass
+    spec_charge spec_energy label description experiment_date file_date
 """
 
 
@@ -77,73 +76,47 @@ def _root_attributes(path: Path) -> dict[str, Any]:
         return {name: plain_value(file.attrs[name]) for name in names}
 
 
-def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]] | xarray.Dataset:
-    """Read a radiograph, with its ``geometry``, or the dataset of an inversion of any code."""
+def read_pradformat(path: Path) -> tuple[AnyArray, dict[str, Any]]:
+    """Read a radiograph, with its ``geometry``."""
     attributes = _root_attributes(path)
     if attributes["object_type"] == "inversion":
-        return _read_inversion(path, attributes)
-    image = _read_datasets(path, ("image",)).get("image")
+        raise FileFormatError(
+            f"{path} is a pradformat inversion, which is only written here: expected a radiograph, "
+            "or the result as .shadowinv"
+        )
+    with open_hdf5(path) as file:
+        item = member(file, "image")
+        image = None if item is None else load_dataset(path, item)
     if image is None or image.ndim != 2:
         content = "no image" if image is None else f"an image of shape {image.shape}"
         raise FileFormatError(
             f"{path} is a pradformat radiograph with {content}: expected a dataset 'image' of "
             "shape (height, width); export it again"
         )
-    geometry = _read_geometry(path, attributes, "pixel_width")
-    return image, {**attributes, "geometry": geometry}
+    return image, {**attributes, "geometry": _read_geometry(path, attributes)}
 
 
-def _read_datasets(path: Path, names: tuple[str, ...]) -> dict[str, AnyArray]:
-    with open_hdf5(path) as file:
-        items = {name: member(path, file, name) for name in names}
-        return {name: load_dataset(path, item) for name, item in items.items() if item is not None}
-
-
-def _read_geometry(path: Path, attributes: dict[str, Any], width: str) -> dict[str, Any]:
+def _read_geometry(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
     """Return the fields of a particle setup that the attributes contain."""
     species = {symbol: name for name, symbol in _SYMBOLS.items()}.get(
         attributes.get("spec_name", _SYMBOLS["proton"])
     )
     energy = attributes.get("spec_energy")
-    pixel = "pixel_size" if width == "dr" else "detector_pixel_size"
     geometry = {
         "kind": "proton",
         "source_object_distance": attributes.get("source_object_dist"),
         "object_image_distance": attributes.get("object_image_dist"),
-        pixel: attributes.get(width),
+        "detector_pixel_size": attributes.get("pixel_width"),
         "species": species if "spec_name" in attributes else None,
         # The energy of a species that nobody here knows gives no field.
         "energy": energy / constants.mega if energy is not None and species else None,
     }
-    first, second = attributes.get(width), attributes.get(f"{width}_ax2")
+    first, second = attributes.get("pixel_width"), attributes.get("pixel_width_ax2")
     if first is not None and second is not None and not np.isclose(first, second, rtol=1e-6):
         raise FileFormatError(
             f"{path} has pixels of {first:g} m by {second:g} m: expected square pixels; resample it"
         )
     return {name: value for name, value in geometry.items() if value is not None}
-
-
-def _read_inversion(path: Path, attributes: dict[str, Any]) -> xarray.Dataset:
-    setup = setup_from_dict(_read_geometry(path, attributes, "dr"), str(path))
-    arrays = _read_datasets(path, ("phi", "defl_ax1", "defl_ax2"))
-    has_angles = {"defl_ax1", "defl_ax2"} <= arrays.keys()
-    if "phi" not in arrays and not has_angles:
-        raise FileFormatError(
-            f"{path} is a pradformat inversion without data: expected 'phi' or both 'defl_ax1' "
-            "and 'defl_ax2'; export it again"
-        )
-    potential = -setup.normalized_potential(arrays["phi"]) if "phi" in arrays else None
-    if has_angles:
-        displacement = setup.displacement(np.stack([arrays["defl_ax1"], arrays["defl_ax2"]]))
-    else:
-        displacement = displacement_from_potential(-setup.normalized_potential(arrays["phi"]))
-    labels = {"format": "pradformat"}
-    dataset = dataset_from_field(displacement, potential, setup, attributes=labels)
-    provenance = Provenance.of(attributes)
-    if provenance is None:
-        return dataset
-    masks = _read_datasets(path, tuple(provenance.mask_variables))
-    return provenance.with_pixels(masks).added_to(dataset)
 
 
 def write_pradformat(content: BytesIO, dataset: xarray.Dataset) -> None:
@@ -179,8 +152,6 @@ def write_pradformat(content: BytesIO, dataset: xarray.Dataset) -> None:
     )
     provenance = Provenance.of(dataset.attrs, dataset.variables)
     if provenance is not None:
-        masks = provenance.mask_variables.items()
-        datasets |= {name: mask for name, (_, mask, _) in masks if mask is not None}
         attributes["provenance"] = provenance.to_json()
         if provenance.images and provenance.image.file:
             attributes["radiograph_filename"] = provenance.image.file

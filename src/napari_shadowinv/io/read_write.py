@@ -61,8 +61,8 @@ def read(
     ----------
     path : str or Path
         TIFF (8, 16 or 32 bits) and other pictures, NPY, MATLAB (version 5 to 7.3), frames
-        of cameras, numbers as text, tracks in CR-39, a pradformat radiograph or inversion, an
-        array of any HDF5 file as ``file.h5::/entry/data/data``, a ``.shadowinv`` result, or a
+        of cameras, numbers as text, tracks in CR-39, a pradformat radiograph, an array
+        of any HDF5 file as ``file.h5::/entry/data/data``, a ``.shadowinv`` result, or a
         ``.shadowinv.zarr`` store of many shots (read lazily). Of many images, a TIFF with several
         pages, an array with more than two axes, a folder, or a pattern such as ``"shots/*.tif"``.
     channel : {"red", "green", "blue", "mean"} or int, optional
@@ -74,7 +74,7 @@ def read(
     Returns
     -------
     Shot or xarray.Dataset
-        A dataset for a result or an inversion; a dataset with the variable ``image``
+        A dataset for a result; a dataset with the variable ``image``
         (shot, y, x) for many images, which dask reads one by one; a radiograph for all else.
 
     Raises
@@ -187,7 +187,7 @@ def read_shot(
 
 
 def read_dataset(path: str | Path) -> xarray.Dataset:
-    """Read a ``.shadowinv`` file, a pradformat inversion, or a ``.shadowinv.zarr`` store.
+    """Read a ``.shadowinv`` file or a ``.shadowinv.zarr`` store.
 
     The dataset has at least the displacement. It raises the errors of `read`, and a
     `FileFormatError` if the file holds an image.
@@ -195,7 +195,7 @@ def read_dataset(path: str | Path) -> xarray.Dataset:
     content = read(path) if is_stack(path) or "result" in format_of(path).holds else None
     if content is None or isinstance(content, Shot):
         raise FileFormatError(
-            f"{path} is an image: expected the result of an inversion, .shadowinv or pradformat"
+            f"{path} is an image: expected the result of an inversion, .shadowinv"
         )
     return content
 
