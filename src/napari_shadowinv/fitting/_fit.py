@@ -17,7 +17,6 @@ from napari_shadowinv._system.progress import (
     Reporter,
     ShouldStop,
     measure_time,
-    run_in_parallel,
 )
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv.fitting.compilation import ensure_compiled
@@ -25,6 +24,7 @@ from napari_shadowinv.fitting.exploration import PosteriorSummary, adapt, explor
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import EXACT, Imperfect
 from napari_shadowinv.fitting.measurements import FitData, collect_data
+from napari_shadowinv.fitting.parallel import run_in_parallel
 from napari_shadowinv.fitting.pattern import (
     Pattern,
     find_pattern,

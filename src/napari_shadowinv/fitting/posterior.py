@@ -26,12 +26,12 @@ from scipy.fft import dctn
 from scipy.ndimage import gaussian_filter
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import run_in_parallel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.descent import finer, settle
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.measurements import FitData
+from napari_shadowinv.fitting.parallel import run_in_parallel
 from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.inversion.samples import Pairs, stratified_numbers

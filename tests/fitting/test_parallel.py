@@ -10,8 +10,8 @@ from functools import partial
 import pytest
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import run_in_parallel
 from napari_shadowinv.errors import InversionCancelled
+from napari_shadowinv.fitting.parallel import run_in_parallel
 
 Step = Callable[[int], None]
 
@@ -23,20 +23,12 @@ def step_on(number: int, steps: int, after_step: Step) -> int:
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
-def test_results_have_the_order_of_the_functions_and_the_caller_receives_each_step(
-    threads: int,
-) -> None:
-    received: list[tuple[int, str]] = []
-
-    def after_step(number: int) -> None:
-        received.append((number, threading.current_thread().name))
-
+def test_results_have_the_order_of_the_functions_and_each_step_is_reported(threads: int) -> None:
+    received: list[int] = []
     works = [partial(step_on, number, 40 - 10 * number) for number in range(4)]
-    assert run_in_parallel(works, threads, after_step) == [0, 1, 4, 9]
-    numbers = [number for number, _ in received]
-    assert [numbers.count(number) for number in range(4)] == [40, 30, 20, 10]
-    assert {name for _, name in received} == {threading.current_thread().name}
-    assert run_in_parallel([], threads, after_step) == []
+    assert run_in_parallel(works, threads, received.append) == [0, 1, 4, 9]
+    assert [received.count(number) for number in range(4)] == [40, 30, 20, 10]
+    assert run_in_parallel([], threads, received.append) == []
 
 
 def test_a_request_to_stop_ends_all_functions_at_their_next_step() -> None:
@@ -78,7 +70,7 @@ def test_the_first_failure_is_raised_not_those_that_follow_from_it() -> None:
 
 
 def test_cores_are_divided_between_functions_that_still_run() -> None:
-    begun, counted, all_counted = threading.Barrier(2), threading.Event(), threading.Barrier(4)
+    begun, counted, all_counted = threading.Barrier(2), threading.Event(), threading.Barrier(2)
 
     def shares(after_step: Step) -> list[int]:
         begun.wait(10)
@@ -87,7 +79,7 @@ def test_cores_are_divided_between_functions_that_still_run() -> None:
         stop = time.monotonic() + 10
         while available_threads(4) == beside and time.monotonic() < stop:
             time.sleep(0.001)
-        inner = run_in_parallel([count_beside_others] * 4, 4, after_step)
+        inner = run_in_parallel([count_beside_others] * 2, 4, after_step)
         return [beside, available_threads(4), available_threads(1), *inner]
 
     def count_beside_others(after_step: Step) -> int:
@@ -100,19 +92,5 @@ def test_cores_are_divided_between_functions_that_still_run() -> None:
         assert counted.wait(10)
         return 0
 
-    assert run_in_parallel([shares, end], 2, lambda number: None) == [[2, 4, 1, 1, 1, 1, 1], 0]
+    assert run_in_parallel([shares, end], 2, lambda number: None) == [[2, 4, 1, 2, 2], 0]
     assert available_threads(4) == 4
-
-
-def test_a_step_after_the_end_of_all_functions_is_no_request_to_stop() -> None:
-    received: list[int] = []
-    callbacks: list[Step] = []
-
-    def work(after_step: Step) -> None:
-        after_step(1)
-        callbacks.append(after_step)
-
-    run_in_parallel([work] * 2, 2, received.append)
-    for after_step in callbacks:
-        after_step(2)
-    assert received == [1, 1]
