@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import constants
 
-from napari_shadowinv._system.arrays import estimated_noise
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.measurements import (
@@ -22,6 +21,7 @@ from napari_shadowinv.fitting.references import smooth_references
 from napari_shadowinv.fitting.shots import point_spread
 from napari_shadowinv.options import FitOptions
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup
+from napari_shadowinv.preprocessing.noise import estimated_noise
 from napari_shadowinv.shot import Shot, shots_of
 
 SIZE = (40, 51)

@@ -25,7 +25,7 @@ from napari_shadowinv import (
     run,
     synthetic_image,
 )
-from napari_shadowinv._system.arrays import block_sums, coordinate_spacing, order_by_value
+from napari_shadowinv._system.arrays import block_sums, coordinate_spacing
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.physics.phantoms import gaussian_blob
@@ -203,14 +203,6 @@ def test_uneven_coordinates_are_refused() -> None:
     image = _placed(1.0, 1.0, "mm")
     with pytest.raises(InputError, match="not evenly spaced"):
         invert(image.assign_coords(y=image.y**2), options=OPTIONS)
-
-
-@pytest.mark.parametrize("scale", [1e-290, 1.0, 1e290])
-def test_order_by_value_sorts_at_any_scale(scale: float) -> None:
-    values = scale * np.random.default_rng(3).integers(-5, 50, 3000)
-    order = order_by_value(values)
-    assert np.array_equal(order, np.argsort(values, kind="stable"))
-    assert np.array_equal(order_by_value(np.full(7, scale)), np.arange(7))
 
 
 @pytest.mark.parametrize(

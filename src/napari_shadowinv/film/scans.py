@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from napari_shadowinv._system.arrays import NORMAL_MAD
 from napari_shadowinv._system.tables import read_rows, write_cells
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.calibration import Calibration, checked_scan, net_optical_density
+from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 
 _Line = tuple[float, float]  # offset and slope
 

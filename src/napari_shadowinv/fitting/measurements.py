@@ -20,7 +20,6 @@ from napari_shadowinv._system.arrays import (
     check_plane,
     check_shape,
     check_usable,
-    estimated_noise,
     plain_array,
     unpack_array,
 )
@@ -56,6 +55,7 @@ from napari_shadowinv.options import (
 )
 from napari_shadowinv.physics.projection import displacement_ratio
 from napari_shadowinv.physics.setup import Setup, deflector_titles
+from napari_shadowinv.preprocessing.noise import estimated_noise
 from napari_shadowinv.shot import Shot
 
 _LEAST_NOISE = 0.005  # of the beam: what the model itself is off by, about

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, estimated_noise
 from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.preprocessing.noise import NORMAL_MAD, estimated_noise
 
 
 def smooth_references(

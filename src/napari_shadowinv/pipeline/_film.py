@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import estimated_noise
 from napari_shadowinv._system.machine import available_threads, results_of
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.tables import read_rows
@@ -46,6 +45,7 @@ from napari_shadowinv.film_doses import FilmDoses
 from napari_shadowinv.io.files import text_of
 from napari_shadowinv.io.images import INCH_M, Scan, read_scan
 from napari_shadowinv.pipeline.inversion_run import picture_mask
+from napari_shadowinv.preprocessing.noise import estimated_noise
 from napari_shadowinv.provenance import ImageOrigin, Provenance
 
 _UNEXPOSED_RANGE = (0.98, 1.2)  # unexposed film over the lightest film of the table

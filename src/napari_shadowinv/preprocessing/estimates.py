@@ -29,7 +29,7 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr
 
-from napari_shadowinv._system.arrays import NORMAL_MAD, block_means
+from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
@@ -39,6 +39,7 @@ from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.setup import Setup, bin_setup
 from napari_shadowinv.preprocessing import filters, pixels
 from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source
+from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 from napari_shadowinv.preprocessing.steps import Choice, degree_field, width_field
 
 

@@ -29,11 +29,11 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from napari_shadowinv._system.arrays import NORMAL_MAD
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing import pixels
+from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 from napari_shadowinv.preprocessing.steps import Step, degree_field, width_field
 from napari_shadowinv.shot import Shot
 

@@ -13,7 +13,6 @@ from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
 from napari_shadowinv._system.arrays import (
-    NORMAL_MAD,
     block_means,
     check_mask,
     check_plane,
@@ -23,6 +22,7 @@ from napari_shadowinv._system.arrays import (
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 
 
 def with_filled_part(values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
