@@ -75,21 +75,6 @@ def test_errors_of_readers_become_one_error_with_a_reason(tmp_path: Path) -> Non
         broken("a.tif", KeyboardInterrupt())
 
 
-def test_a_mistake_in_the_program_is_not_blamed_on_the_file(tmp_path: Path) -> None:
-    @as_file_errors
-    def lacks_a_module(path: Path) -> None:
-        import napari_shadowinv.nowhere  # noqa: F401
-
-    @as_file_errors
-    def lacks_a_name(path: Path) -> None:
-        nowhere  # type: ignore[name-defined]  # noqa: B018, F821
-
-    with pytest.raises(ModuleNotFoundError, match=r"napari_shadowinv\.nowhere"):
-        lacks_a_module(tmp_path / "a.tif")
-    with pytest.raises(NameError, match="'nowhere' is not defined"):
-        lacks_a_name(tmp_path / "a.tif")
-
-
 def test_a_chunk_larger_than_its_array_counts(tmp_path: Path) -> None:
     path = tmp_path / "shot.h5"
     with h5py.File(path, "w") as file:

@@ -31,10 +31,6 @@ P = ParamSpec("P")
 Content = TypeVar("Content")
 
 
-class _DamagedContentError(InputError):
-    """Content that its reader cannot use; a reader of files names the file instead."""
-
-
 def as_file_errors(
     read: Callable[Concatenate[Path, P], Content],
 ) -> Callable[Concatenate[str | Path, P], Content]:
@@ -44,14 +40,8 @@ def as_file_errors(
     def guarded(path: str | Path, *args: P.args, **kwargs: P.kwargs) -> Content:
         try:
             return read(Path(path), *args, **kwargs)
-        except _DamagedContentError as error:
-            raise _reading_error(path, error.__cause__ or error) from error
-        except (FileFormatError, InputError, InversionCancelled, NameError):
-            raise  # the last is a mistake in a program, which no file can cause
-        except ModuleNotFoundError as error:
-            if (error.name or "").startswith(__name__.partition(".")[0]):
-                raise
-            raise _reading_error(path, error) from error
+        except (FileFormatError, InputError, InversionCancelled):
+            raise
         except MemoryError as error:
             raise FileFormatError(
                 f"{path} needs more memory than is available: close other programs, or crop or "
@@ -62,16 +52,13 @@ def as_file_errors(
                 raise FileFormatError(
                     f"{path} cannot be read ({error.strerror}): check its permissions and the disk"
                 ) from error
-            raise _reading_error(path, error) from error
+            raise FileFormatError(
+                f"{path} could not be read ({_error_reason(error)}): it is damaged, incomplete, "
+                "or in a form that needs another reader; copy it again, or export it, an image as "
+                "16-bit TIFF"
+            ) from error
 
     return cast("Callable[Concatenate[str | Path, P], Content]", guarded)
-
-
-def _reading_error(path: str | Path, cause: BaseException) -> FileFormatError:
-    return FileFormatError(
-        f"{path} could not be read ({_error_reason(cause)}): it is damaged, incomplete, or in a "
-        "form that needs another reader; copy it again, or export it, an image as 16-bit TIFF"
-    )
 
 
 def _error_reason(error: BaseException) -> str:
@@ -89,10 +76,10 @@ def as_input_errors(name: str) -> Iterator[None]:
     """Turn any error that the content of a dataset causes in a block into an `InputError`."""
     try:
         yield
-    except (InputError, ImportError, NameError, MemoryError):
+    except (InputError, MemoryError):
         raise
     except Exception as error:
-        raise _DamagedContentError(
+        raise InputError(
             f"{name} is damaged or was changed ({_error_reason(error)}): expected it as this "
             "package writes it"
         ) from error

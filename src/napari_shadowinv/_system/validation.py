@@ -204,16 +204,7 @@ def _mistakes_in(model_class: type[BaseModel], error: ValidationError) -> Iterat
 
 
 def _error_sentence(mistakes: Sequence[_Mistake], where: str, names: Mapping[str, str]) -> str:
-    intended = {
-        nearest(path[-1], model.model_fields)
-        for model, path, detail in mistakes
-        if detail["type"] == "extra_forbidden"
-    }
-    text = "; ".join(
-        _error_clause(mistake, names)
-        for mistake in mistakes
-        if not (mistake[2]["type"] == "missing" and mistake[1][-1] in intended)
-    )
+    text = "; ".join(_error_clause(mistake, names) for mistake in mistakes)
     return f"{where}: {text}" if where else text
 
 
