@@ -1,7 +1,6 @@
 """Tables as comma-separated values, with the lines of their rows for messages.
 
 - the cells of a table: `read_table`; its rows as models: `read_rows`; to a file: `write_cells`
-- whether a file begins with column names: `has_column_names`
 
 The cells are the standard library's: pandas does not know the lines of its rows. Semicolons and
 tabs separate cells, too. Empty lines and lines that begin with ``#`` are skipped.
@@ -14,10 +13,11 @@ import csv
 import io
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
-from napari_shadowinv._system.safety import as_file_errors, check_regular, small_text
-from napari_shadowinv._system.validation import Model, suggestion, validate
+from napari_shadowinv._system.safety import as_file_errors, small_text
+from napari_shadowinv._system.validation import Model, map_paths, suggestion, validate
 from napari_shadowinv.errors import FileFormatError, InputError
 
 _SEPARATORS = ";\t,"
@@ -67,7 +67,7 @@ def read_rows(
     model: type[Model],
     *,
     columns: Collection[str] = (),
-    shared: Mapping[str, Any] | None = None,
+    shared: Mapping[str, Any] = MappingProxyType({}),
 ) -> dict[int, Model]:
     """Return the rows of a table as models, by their lines in the file.
 
@@ -89,10 +89,9 @@ def read_rows(
         entries = {
             known[name]: cell for name, cell in zip(table.header, cells, strict=True) if cell
         }
-        for name, field in model.model_fields.items():
-            if name in entries and _is_file_name(entries[name], field.annotation):
-                entries[name] = str(path.parent / entries[name])
-        models[line] = validate(model, {**(shared or {}), **entries}, f"{path}, line {line}")
+        row = validate(model, {**shared, **entries}, f"{path}, line {line}")
+        kept = {name: getattr(row, name) for name in shared.keys() - entries.keys()}
+        models[line] = map_paths(row, path.parent.joinpath).model_copy(update=kept)
     return models
 
 
@@ -104,24 +103,6 @@ def write_cells(
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         writer.writerows(rows)
-
-
-def has_column_names(path: Path, *, most_bytes: int = 100_000) -> bool:
-    """Return whether a file begins with column names, not with numbers."""
-    check_regular(path, _EXPECTED)
-    with path.open("rb") as file:  # it may be a large image
-        head = file.read(most_bytes).decode("utf-8-sig", errors="replace")
-    _, names = next(_records(path, head), (0, []))
-    return bool(names) and not any(map(is_number, names))
-
-
-def is_number(text: str) -> bool:
-    """Return whether a text is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 def _records(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
@@ -148,13 +129,6 @@ def _is_comment(line: str) -> bool:
     # A lone # is the name of a column of numbers.
     text = line.lstrip()
     return text.startswith("#") and text[1:2] not in {*_SEPARATORS}
-
-
-def _is_file_name(cell: str, annotation: Any) -> bool:
-    """Return whether a field takes a path, and the cell is none of its keywords."""
-    types = get_args(annotation) or (annotation,)
-    keywords = [word for literal in types for word in get_args(literal)]
-    return Path in types and cell not in keywords
 
 
 def _without_empty_end(cells: list[str]) -> list[str]:

@@ -8,13 +8,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from napari_shadowinv._system.tables import has_column_names, is_number, read_rows
+from napari_shadowinv._system.safety import check_regular
+from napari_shadowinv._system.tables import read_rows
 from napari_shadowinv._system.validation import CheckedModel, suggestion, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.files import name_of
@@ -26,10 +28,12 @@ _BeamValue = Annotated[float, Field(gt=0, le=1e5)] | None
 
 
 def _strength(value: Any) -> Any:
-    parts = str(value).split()
-    if not parts or not all(map(is_number, parts)):
+    try:
+        strengths = tuple(map(float, str(value).split()))
+    except ValueError:
+        strengths = ()
+    if not strengths:
         raise ValueError("expected a number, or one for each field with spaces between them")
-    strengths = tuple(map(float, parts))
     if not all(abs(strength) <= MAX_STRENGTH for strength in strengths):
         raise ValueError(f"expected a displacement of at most {MAX_STRENGTH:g} times the first")
     return strengths
@@ -194,9 +198,16 @@ def _drop_none(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in values.items() if value is not None}
 
 
-def is_table(path: Path) -> bool:
+def is_table(path: Path, *, most_bytes: int = 100_000) -> bool:
     """Return whether a file is a table with column names, not an image as text."""
-    return path.suffix.lower() in TABLE.suffixes and has_column_names(path)
+    if path.suffix.lower() not in TABLE.suffixes:
+        return False
+    check_regular(path, "a table or an image as text")
+    with path.open(encoding="utf-8-sig", errors="replace") as file:  # it may be a large image
+        lines = map(str.strip, file.read(most_bytes).splitlines())
+    # A lone # is the name of a column of numbers.
+    first = next((line for line in lines if line and not re.match("#(?![;,\t])", line)), "")
+    return not re.match(r'"?([-+.\d]|(nan|inf)\b|$)', first, re.IGNORECASE)
 
 
 def _read_shots(table: Path, setup: Path | None = None) -> dict[int, ShotRow]:
