@@ -6,10 +6,8 @@ import errno
 import os
 import signal
 import subprocess
-from collections.abc import Callable
 from pathlib import Path
 
-import filelock
 import pytest
 
 from helpers.signals import start
@@ -148,28 +146,3 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
         lock.unlink()
     assert names_in(tmp_path) == ["theirs"]
     assert theirs.read_text() == "theirs"
-
-
-@pytest.mark.parametrize(
-    ("holder", "step"),
-    [(filelock.FileLock, "acquire"), (filelock.FileLock, "release"), (os, "unlink")],
-)
-@pytest.mark.usefixtures("usual_ctrl_c")
-def test_lock_is_removed_whenever_a_signal_comes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, holder: object, step: str
-) -> None:
-    work: Callable[..., object] = getattr(holder, step)
-
-    def interrupted(*arguments: object) -> object:
-        signal.raise_signal(signal.SIGINT)
-        result = work(*arguments)
-        signal.raise_signal(signal.SIGINT)
-        return result
-
-    monkeypatch.setattr(holder, step, interrupted)
-    with pytest.raises(KeyboardInterrupt), locked(tmp_path / "a.shadowinv.zarr"):
-        pass
-    monkeypatch.undo()
-    assert names_in(tmp_path) == []
-    with locked(tmp_path / "a.shadowinv.zarr"):
-        pass

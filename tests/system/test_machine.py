@@ -14,7 +14,6 @@ import pytest
 
 from napari_shadowinv._system import machine
 from napari_shadowinv._system.machine import (
-    Crew,
     available_threads,
     begin,
     in_ranges,
@@ -103,12 +102,17 @@ def test_of_several_errors_the_first_is_raised(threads):
         results_of([first, second], threads)
 
 
-def test_a_crew_within_a_crew_gives_the_thread_back():
-    def threads_around():
-        inside = Crew(1, 1).call(available_threads, 4)
-        return inside, available_threads(4)
+def test_functions_within_functions_give_the_threads_back():
+    both = threading.Barrier(2)
 
-    assert Crew(2, 2).call(threads_around) == (2, 2)
+    def threads_around():
+        both.wait(10)
+        inside = results_of([lambda: available_threads(4)], 1)
+        outside = available_threads(4)
+        both.wait(10)
+        return *inside, outside
+
+    assert results_of([threads_around] * 2, 2) == [(2, 2)] * 2
 
 
 @pytest.mark.parametrize("threads", [1, 2])

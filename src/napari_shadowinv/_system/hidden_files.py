@@ -10,15 +10,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv.errors import FileFormatError
-
-if TYPE_CHECKING:
-    from filelock import BaseFileLock
 
 
 def hidden_name(path: Path, ending: str) -> Path:
@@ -32,27 +27,22 @@ def locked(path: Path) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     lock = FileLock(hidden_name(path, ".lock"), timeout=0)
-    with ExitStack() as stack:
-        with defer_interrupts():  # a signal leaves no lock without its release
-            try:
-                lock.acquire()
-            except Timeout:
-                raise FileFormatError(
-                    f"{path} is being written by another process, which holds {lock.lock_file}: "
-                    "wait for that process, or stop it first"
-                ) from None
-            except OSError as error:
-                raise FileFormatError(
-                    f"{path} cannot be written, as {lock.lock_file} cannot be locked "
-                    f"({error.strerror}): remove that file, or choose another folder"
-                ) from None
-            stack.callback(_release, lock)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise FileFormatError(
+            f"{path} is being written by another process, which holds {lock.lock_file}: wait for "
+            "that process, or stop it first"
+        ) from None
+    except OSError as error:
+        raise FileFormatError(
+            f"{path} cannot be written, as {lock.lock_file} cannot be locked ({error.strerror}): "
+            "remove that file, or choose another folder"
+        ) from None
+    try:
         yield
-
-
-@defer_interrupts()
-def _release(lock: BaseFileLock) -> None:
-    # Removed while it is held: afterwards it may be another's. Windows removes it by itself.
-    with suppress(OSError):
-        os.unlink(lock.lock_file)
-    lock.release()
+    finally:
+        # Removed while it is held: afterwards it may be another's. Windows removes it by itself.
+        with suppress(OSError):
+            os.unlink(lock.lock_file)
+        lock.release()

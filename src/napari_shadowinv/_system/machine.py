@@ -1,7 +1,7 @@
 """Memory, threads and signals.
 
 - `physical_memory`, `available_threads`, `set_default_threads`
-- `in_ranges`, `run_together`, `results_of`, `begin`, `Crew`: work in threads
+- `in_ranges`, `run_together`, `results_of`, `begin`: work in threads
 - Ctrl-C, SIGTERM and SIGHUP: `defer_interrupts`, `clear_up_when_terminated`, `handling`
 """
 
@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
@@ -69,48 +70,17 @@ def set_default_threads(threads: int | None) -> None:
 def available_threads(threads: int | None) -> int:
     """Return `threads`; where it is None the default, or the number of cores of this process.
 
-    In a thread of a `Crew`: its current share of them.
+    In a function of `results_of`: its current share of them.
     """
     threads = _default_threads if threads is None else threads
     if threads is None:  # macOS and Windows do not report the cores of a process
         affinity = getattr(os, "sched_getaffinity", None)
         threads = len(affinity(0)) if affinity else os.cpu_count() or 1
-    crew = _crew_of_this_thread()
-    return threads if crew is None else max(1, threads // crew.size)
+    return max(1, threads // _SIDE_BY_SIDE.get()())
 
 
-class Crew:
-    """Functions that run side by side, and share the available threads.
-
-    Those that run last have the threads of those that have ended.
-    """
-
-    def __init__(self, functions: int, threads: int) -> None:
-        self._remaining, self._threads = functions, threads
-        self._around, self._lock = _crew_of_this_thread(), threading.Lock()
-
-    @property
-    def size(self) -> int:
-        """The number of functions that run now, times that of the crew around this one."""
-        around = 1 if self._around is None else self._around.size
-        return max(1, min(self._threads, self._remaining)) * around
-
-    def call(self, function: Callable[..., _T], *args: Any) -> _T:
-        """Call one of the functions in this thread."""
-        previous, _of_this_thread.crew = _crew_of_this_thread(), self
-        try:
-            return function(*args)
-        finally:
-            _of_this_thread.crew = previous
-            with self._lock:
-                self._remaining -= 1
-
-
-_of_this_thread = threading.local()
-
-
-def _crew_of_this_thread() -> Crew | None:
-    return getattr(_of_this_thread, "crew", None)
+# How many functions run now beside the one of this thread, itself included.
+_SIDE_BY_SIDE: ContextVar[Callable[[], int]] = ContextVar("side by side", default=lambda: 1)
 
 
 LIGHT_ITEMS = 1 << 14  # the smallest range of a kernel that does little with each item
@@ -173,9 +143,24 @@ def run_together(works: Sequence[Callable[[], _T]], threads: int) -> list[_T]:
 
 
 def results_of(works: Sequence[Callable[[], _T]], threads: int) -> list[_T]:
-    """Call functions side by side, and return their results; their kernels share the threads."""
-    crew = Crew(len(works), threads)
-    return run_together([partial(crew.call, work) for work in works], threads)
+    """Call functions side by side, and return their results; their kernels share the threads.
+
+    Those that run last have the threads of those that have ended.
+    """
+    around, remaining = _SIDE_BY_SIDE.get(), deque(works)
+
+    def count() -> int:
+        return max(1, min(threads, len(remaining))) * around()
+
+    def run(work: Callable[[], _T]) -> _T:
+        token = _SIDE_BY_SIDE.set(count)
+        try:
+            return work()
+        finally:
+            _SIDE_BY_SIDE.reset(token)
+            remaining.pop()
+
+    return run_together([partial(run, work) for work in works], threads)
 
 
 def begin(work: Callable[[], _T], threads: int | None) -> Callable[[], _T]:
