@@ -31,8 +31,6 @@ class Progress:
 
 
 OnProgress = Callable[[Progress], None]
-OnStep = Callable[[str, float], None]
-"""Receives the stage and the objective after each step of a fit; an exception ends the fit."""
 ShouldStop = Callable[[], bool]
 
 

@@ -11,20 +11,14 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import (
-    OnProgress,
-    OnStep,
-    Reporter,
-    ShouldStop,
-    measure_time,
-)
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop, measure_time
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv.fitting.compilation import ensure_compiled
 from napari_shadowinv.fitting.exploration import PosteriorSummary, adapt, explore, find_basins
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import EXACT, Imperfect
 from napari_shadowinv.fitting.measurements import FitData, collect_data
-from napari_shadowinv.fitting.parallel import run_in_parallel
+from napari_shadowinv.fitting.parallel import OnStep, run_in_parallel
 from napari_shadowinv.fitting.pattern import (
     Pattern,
     find_pattern,

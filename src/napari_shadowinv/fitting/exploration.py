@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import ASSUMED, EXACT, Imperfect
 from napari_shadowinv.fitting.measurements import FitData
+from napari_shadowinv.fitting.parallel import OnStep
 from napari_shadowinv.fitting.posterior import (
     BeamShifts,
     Posterior,

@@ -9,6 +9,9 @@ from typing import ParamSpec, TypeVar
 
 from napari_shadowinv._system.machine import results_of
 
+OnStep = Callable[[str, float], None]
+"""Receives the stage and the objective after each step of a fit; an exception ends the fit."""
+
 P = ParamSpec("P")
 T = TypeVar("T")
 

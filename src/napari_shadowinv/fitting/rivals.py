@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes
 from napari_shadowinv.fitting.forward import Scene
 from napari_shadowinv.fitting.instrument import FITTED_VARIANCE, Imperfect
 from napari_shadowinv.fitting.measurements import FitData, strengths_of
-from napari_shadowinv.fitting.parallel import run_in_parallel
+from napari_shadowinv.fitting.parallel import OnStep, run_in_parallel
 from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.search import (
     FIRST_SMOOTHNESS,

@@ -12,13 +12,12 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._system.machine import available_threads
-from napari_shadowinv._system.progress import OnStep
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
 from napari_shadowinv.fitting.descent import NewtonSteps, coarser, descend, finer, settle
 from napari_shadowinv.fitting.forward import Linear, Scene
-from napari_shadowinv.fitting.parallel import run_in_parallel
+from napari_shadowinv.fitting.parallel import OnStep, run_in_parallel
 from napari_shadowinv.fitting.posterior import Posterior, Response
 from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import Unknowns

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv._system.progress import OnStep, Reporter, ShouldStop
+from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting.measurements import FitData
+from napari_shadowinv.fitting.parallel import OnStep
 from napari_shadowinv.fitting.search import Stages, Start
 from napari_shadowinv.inversion import plan_sites
 from napari_shadowinv.inversion.normalise import prepare
