@@ -19,8 +19,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar, cast
 
-from pydantic import ValidationError
-
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 
@@ -62,12 +60,7 @@ def as_file_errors(
 
 
 def _error_reason(error: BaseException) -> str:
-    text = str(error)
-    if isinstance(error, KeyError):
-        text = f"{error} is missing"
-    elif isinstance(error, ValidationError):
-        first = error.errors()[0]
-        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    text = f"{error} is missing" if isinstance(error, KeyError) else str(error)
     return " ".join(text.split())[:120].rstrip(".") or type(error).__name__
 
 

@@ -141,12 +141,8 @@ def validate(
 
     It calls the fields by their keys, or by the names that a face has for them: flags, labels.
     """
-    if not isinstance(mapping, Mapping):
-        raise InputError(
-            f"{where}: received {_shorten(mapping)}, expected a table of keys and values"
-        )
-    if keys := [key for key in mapping if not isinstance(key, str)]:
-        raise InputError(f"{where}: received the key {keys[0]!r}, expected names as keys")
+    if isinstance(mapping, Mapping) and not all(isinstance(key, str) for key in mapping):
+        raise InputError(f"{where}: received {_shorten(mapping)}, expected names as keys")
     try:
         return model_class.model_validate(mapping)
     except ValidationError as error:
@@ -204,7 +200,9 @@ def _mistakes_in(model_class: type[BaseModel], error: ValidationError) -> Iterat
 
 
 def _error_sentence(mistakes: Sequence[_Mistake], where: str, names: Mapping[str, str]) -> str:
-    text = "; ".join(_error_clause(mistake, names) for mistake in mistakes)
+    # A key that is missing may be the one that is misspelt.
+    unknown = [mistake for mistake in mistakes if mistake[2]["type"] == "extra_forbidden"]
+    text = "; ".join(_error_clause(mistake, names) for mistake in unknown or mistakes)
     return f"{where}: {text}" if where else text
 
 
