@@ -10,7 +10,6 @@ Any axes of an array before the last two count frames. At most one frame is in m
 
 from __future__ import annotations
 
-import fnmatch
 import glob
 import math
 import os
@@ -58,14 +57,6 @@ def spellings(suffix: str) -> tuple[str, ...]:
     return next((suffixes for suffixes in pictures if suffix in suffixes), (suffix,))
 
 
-def name_matches(name: str, pattern: str) -> bool:
-    """Return whether a name fits a pattern, whose ending also stands for its other spellings."""
-    (stem, suffix), (stem_pattern, ending) = map(os.path.splitext, (name, pattern))
-    if not ending or _GLOB.search(ending):
-        return fnmatch.fnmatch(name, pattern)
-    return fnmatch.fnmatch(stem, stem_pattern) and suffix.lower() in spellings(ending)
-
-
 def is_pattern(path: str | Path) -> bool:
     """Return whether a path stands for the files that match it; brackets may be in a name."""
     return bool(_GLOB.search(str(path))) and not os.path.exists(path)
@@ -74,16 +65,10 @@ def is_pattern(path: str | Path) -> bool:
 def matching_files(pattern: str | Path) -> list[Path]:
     """List the files that match a pattern, in natural order; existing folders are not patterns."""
     pattern = Path(pattern)
-    folder = pattern.parent
-    exists = next(place for place in (folder, *folder.parents) if place == Path() or place.exists())
-    rest = folder.relative_to(exists)
-    within = os.path.join(glob.escape(str(exists)), rest)
-    every = ".*" if pattern.name.startswith(".") else "*"
-    if pattern.name == "**":
-        names = glob.glob(os.path.join(within, "**"), recursive=True)
-    else:
-        paths = glob.glob(os.path.join(within, every), recursive=True)
-        names = [name for name in paths if name_matches(os.path.basename(name), pattern.name)]
+    folders = pattern.parents
+    exists = next(place for place in folders if place == Path() or place.exists())
+    rest = pattern.relative_to(exists)
+    names = glob.glob(os.path.join(glob.escape(str(exists)), rest), recursive=True)
     return in_counting_order(map(Path, names))
 
 

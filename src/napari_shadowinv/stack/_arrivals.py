@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import os
 import time
 from collections import Counter
@@ -11,7 +12,7 @@ from pathlib import Path
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.files import in_counting_order
-from napari_shadowinv.io.frames import count_endings, images_in, name_matches, spellings
+from napari_shadowinv.io.frames import count_endings, images_in, spellings
 
 
 class Arrivals:
@@ -66,7 +67,7 @@ class Arrivals:
 
     def _matches(self, name: str) -> bool:
         """Return whether a name belongs to a shot."""
-        if not name_matches(name, self._pattern):
+        if not fnmatch.fnmatch(name, self._pattern):
             return False
         has_ending = os.path.splitext(self._pattern)[1]
         return bool(has_ending) or os.path.splitext(name)[1].lower() in self._kind
