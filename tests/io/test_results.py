@@ -246,16 +246,6 @@ def path(tmp_path: Path, inversion: Inversion, proton_setup: ProtonSetup) -> Pat
     return write(tmp_path / "a.shadowinv", inversion, setup=proton_setup)
 
 
-def test_every_dataset_of_a_result_has_fletcher32(path: Path) -> None:
-    with h5py.File(path) as file:
-        numbers = {name: item for name, item in file.items() if item.dtype.kind in "fiu"}
-        stored = {name: item for name, item in numbers.items() if item.chunks}
-        assert {"potential", "displacement", "weights", "caustic", "y"} <= stored.keys()
-        for name, item in stored.items():
-            assert item.fletcher32, name
-            assert item.dtype.kind != "f" or np.isnan(item.fillvalue), name
-
-
 def test_flipped_bits_of_a_result_are_refused(path: Path) -> None:
     content = path.read_bytes()
     places = np.random.default_rng(5).integers(0, 8 * len(content) - 8 * 81, 40)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import hashlib
 import itertools
 import os
-from contextlib import suppress
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
@@ -103,16 +102,16 @@ def _check_filters(path: Path, dataset: Any) -> None:
     import h5py
 
     layout = dataset.id.get_create_plist()
-    for code, _, _, title in map(layout.get_filter, range(layout.get_nfilters())):
-        with suppress(ImportError):
-            if not h5py.h5z.filter_avail(code):
-                import_module("hdf5plugin")  # adds its filters
-        if not h5py.h5z.filter_avail(code):
-            label = f"{code} {title.decode(errors='replace')}".strip()
-            raise FileFormatError(
-                f"{path} holds {dataset.name!r} compressed by a filter that is not installed "
-                f"({label}): install the package hdf5plugin, or save it with gzip"
-            )
+    filters = [layout.get_filter(k)[0] for k in range(layout.get_nfilters())]
+    missing = [code for code in filters if not h5py.h5z.filter_avail(code)]
+    try:
+        if missing:
+            import_module("hdf5plugin")  # adds its filters
+    except ImportError:
+        raise FileFormatError(
+            f"{path} holds {dataset.name!r} compressed by a filter that is not installed "
+            f"({missing[0]}): install the package hdf5plugin, or save it with gzip"
+        ) from None
 
 
 def _is_written(dataset: Any, index: tuple[int, ...]) -> bool:

@@ -176,13 +176,7 @@ def read_shot(
     path, variable = split_address(path, variable)
     content = read_stack(path) if is_stack(path) else _read_file(path, channel, variable)
     if not isinstance(content, Shot):
-        if ResultKind.of(content.attrs) is ResultKind.FILM_DOSES:
-            raise FileFormatError(
-                f"{path} is a film pack: expected one image; write its layers to files first"
-            )
-        raise FileFormatError(
-            f"{path} is the result of an inversion: expected an image; give the original image"
-        )
+        raise FileFormatError(f"{path} is a result: expected an image; give the original image")
     return content
 
 
@@ -225,7 +219,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def write_result(content: BytesIO, dataset: xarray.Dataset) -> None:
-    """Write a dataset as NetCDF4, moderately compressed and with checksums."""
+    """Write a dataset as NetCDF4, moderately compressed and with a checksum."""
     import h5netcdf
     from xarray.backends import H5NetCDFStore
 
@@ -236,12 +230,10 @@ def write_result(content: BytesIO, dataset: xarray.Dataset) -> None:
         if kind in "fiub":
             # What the index loses is read as NaN, not as 0.
             fill = {"_FillValue": np.nan if kind == "f" else None}
-            checked = {"fletcher32": True} if variable.ndim else {}
-            encoding[str(name)] = {**packed, **checked, **fill}
+            encoding[str(name)] = {**packed, **fill}
     # A field that was read from a file of another format still says so.
     marked = dataset.assign_attrs(format=ResultKind.of(dataset.attrs).value)
-    # From this version of the format on, the file's own structures have checksums.
-    with h5netcdf.File(content, "w", libver=("v110", "v110")) as file:
+    with h5netcdf.File(content, "w") as file:
         marked.dump_to_store(H5NetCDFStore(file), encoding=encoding)
     seal_hdf5(content)
 
