@@ -13,8 +13,7 @@ import zarr
 from helpers.store_content import content
 from napari_shadowinv import FileFormatError, InputError, read
 from napari_shadowinv._system.hidden_files import locked
-from napari_shadowinv.io.store import DONE, PENDING, StackStore
-from napari_shadowinv.io.store_writing import ShotWriter
+from napari_shadowinv.io.store import DONE, StackStore
 
 
 @pytest.fixture
@@ -170,7 +169,7 @@ def test_workers_of_the_shorter_store_write_new_shots(night, out, expected, hidd
     assert content(out) == expected
 
 
-def test_only_one_run_grows_a_store_and_none_that_looks_shorter(night, out, hidden):
+def test_only_one_run_grows_a_store(night, out, hidden):
     hidden(5)
     night.run(out)
     hidden()
@@ -178,8 +177,3 @@ def test_only_one_run_grows_a_store_and_none_that_looks_shorter(night, out, hidd
     with locked(out), busy:
         night.run(out)
     assert len(StackStore(out).names) == 5
-    old = ShotWriter.of(StackStore(out))
-    writer = type(old)(old.path, old.store_id, old.shots + 1)
-    with pytest.raises(OSError, match="has 5 shots here and 6 where the run was started"):
-        writer.write(5, {}, {})
-    assert PENDING not in StackStore(out).statuses()

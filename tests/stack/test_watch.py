@@ -46,7 +46,7 @@ def test_watch_inverts_existing_files_first_then_arrivals(folder, out):
         store = read(out)
         assert list(store.status.values) == [DONE] * 4
         assert store.converged.values.all()
-        assert (store.noise_error.values > 0).all()
+        assert (store.total_error.values > 0).all()
         with pytest.raises(FileFormatError, match="is being written by"), locked(out):
             pass
     names = [f"shot_{index}.npy" for index in (1, 2, 5, 0)]

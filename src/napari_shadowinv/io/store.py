@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,16 +38,13 @@ from napari_shadowinv.io.store_damage import (
     is_along_shots,
     read_values,
 )
-from napari_shadowinv.physics.units import place_label
 
 if TYPE_CHECKING:
     import xarray
 
 FORMAT = "shadowinv stack"
 STORE_SUFFIX = STORE.suffix
-PENDING: int  # mypy does not infer these for defaults of parameters
-DONE: int
-PENDING, DONE, FAILED, DAMAGED = map(int, Status)
+PENDING, DONE, FAILED, DAMAGED = Status
 STATUS_NAMES = tuple(status.name.lower() for status in Status)
 # Attribute of a store whose shots are rows of a table, each with its own setup in its report.
 OWN_SETUPS = "table_of_shots"
@@ -227,12 +223,7 @@ def read_stack(path: Path) -> xarray.Dataset:
     columns = {
         column.key: (("shot",), column.values(reports), column.labels) for column in store.columns
     }
-    complete = complete.assign(columns)
-    # The folder's own order is arbitrary.
-    order = [*variable_labels(setup), "status", *columns, "setup", "report"]
-    order += sorted(map(str, complete.data_vars.keys() - {*order}))
-    ordered = complete[[name for name in order if name in complete]]
-    return ordered.assign(status=ordered["status"].copy(data=store.statuses()))
+    return complete.assign(columns, status=complete["status"].copy(data=store.statuses()))
 
 
 def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:
@@ -254,17 +245,7 @@ def with_own_setups(dataset: xarray.Dataset) -> xarray.Dataset:
     if OWN_SETUPS not in dataset.attrs or "setup" not in dataset.attrs:
         return dataset
     texts = dataset["report"].data.map_blocks(_setups_of_block, dtype=object, meta=_NO_TEXT)
-    return with_places(dataset.assign(setup=(("shot",), texts, SETUPS_LABEL)))
-
-
-def with_places(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Add the coordinates of each shot's pixels in metres, by the shot's own setup."""
-    sizes = of_each_setup(dataset, attrgetter("object_pixel_size"))[:, np.newaxis]
-    places = {
-        f"{name}_si": (("shot", name), sizes * dataset[name].values, place_label(name))
-        for name in ("y", "x")
-    }
-    return dataset.assign_coords(places)
+    return dataset.assign(setup=(("shot",), texts, SETUPS_LABEL))
 
 
 def _setups_of_block(reports: AnyArray) -> AnyArray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from napari_shadowinv._typing import AnyArray
 from napari_shadowinv.facts import percent
-from napari_shadowinv.physics.units import PIXEL, display_unit
+from napari_shadowinv.physics.units import display_unit
 
 
 @dataclass(frozen=True)
@@ -59,16 +59,6 @@ class ShotColumn:
     def text(self, report: Mapping[str, Any]) -> str:
         """Return the value from a shot's report as text, empty without a value."""
         return self.show(report[self.key]) if self.show and self.key in report else ""
-
-
-def _error(part: str) -> Callable[[Any], float]:
-    """Return the reader of an error of an inversion; NaN where it is not known."""
-
-    def rms(result: Any) -> float:
-        error = getattr(result.errors, part, None)
-        return math.nan if error is None else float(error.rms)
-
-    return rms
 
 
 # In the order of all tables.
@@ -119,18 +109,6 @@ COLUMNS: tuple[ShotColumn, ...] = (
         "Image minus re-projection, r.m.s. relative to the mean",
         value=attrgetter("report.image_residual"),
         show=percent,
-    ),
-    ShotColumn(
-        "noise_error",
-        "Standard error of the displacement by noise, r.m.s.",
-        unit=PIXEL,
-        value=_error("noise"),
-    ),
-    ShotColumn(
-        "discretisation_error",
-        "Error of the displacement by too few sites, r.m.s.",
-        unit=PIXEL,
-        value=_error("discretisation"),
     ),
 )
 

@@ -31,14 +31,12 @@ from napari_shadowinv._system.machine import defer_interrupts
 from napari_shadowinv.errors import FileFormatError, RunInterruptedError
 from napari_shadowinv.io.files import replacing
 from napari_shadowinv.io.store import (
-    DONE,
     FORMAT,
-    PENDING,
     STATUS_NAMES,
     StackStore,
     read_attributes,
 )
-from napari_shadowinv.io.store_damage import chunk_file, fields_of, is_along_shots
+from napari_shadowinv.io.store_damage import Status, chunk_file, fields_of, is_along_shots
 
 if TYPE_CHECKING:
     import xarray
@@ -79,7 +77,11 @@ class ShotWriter:
         return cls(store.path, store.attributes.get("store_id", ""), len(store.names))
 
     def write(
-        self, index: int, arrays: Mapping[str, Any], report: Mapping[str, Any], status: int = DONE
+        self,
+        index: int,
+        arrays: Mapping[str, Any],
+        report: Mapping[str, Any],
+        status: int = Status.DONE,
     ) -> None:
         """Write a shot and its report; it has its status when this returns, pending if it fails."""
         if read_attributes(self.path).get("store_id", "") != self.store_id:
@@ -90,7 +92,7 @@ class ShotWriter:
         group = self.arrays()
         with _as_store_errors(self.path):
             for name, array in fields_of(group).items():
-                if name in arrays or status == DONE:  # one that is not there has been lost
+                if name in arrays or status == Status.DONE:  # one that is not there has been lost
                     values = arrays.get(name, array.fill_value)
                     array[index : index + 1] = np.broadcast_to(values, (1, *array.shape[1:]))
                 else:  # without its chunk, it is read as the fill value
@@ -102,7 +104,7 @@ class ShotWriter:
         """Mark a shot as pending that is to be done again, and forget its report and fields."""
         group = self.arrays()
         with _as_store_errors(self.path):
-            group["status"][index : index + 1] = np.int8(PENDING)
+            group["status"][index : index + 1] = np.int8(Status.PENDING)
             for name in ("report", *fields_of(group)):
                 chunk_file(self.path, group[name], index).unlink(missing_ok=True)
 
@@ -120,14 +122,7 @@ def _open_to_write(path: Path) -> dict[str, Any]:
 
 @lru_cache(maxsize=4)
 def _open_arrays(path: Path, store_id: str, shots: int) -> dict[str, Any]:
-    arrays = _open_to_write(path)
-    shot_count = arrays["status"].shape[0]
-    if shot_count != shots:
-        raise RunInterruptedError(
-            f"{path} has {shot_count} shots here and {shots} where the run was started: wait until "
-            "the file system is in sync on all machines, then run again to resume"
-        )
-    return arrays
+    return _open_to_write(path)
 
 
 def create_store(path: Path, empty: xarray.Dataset, *, overwrite: bool = False) -> StackStore:
