@@ -13,13 +13,13 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import checksum
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.pack import Pack
 from napari_shadowinv.options import Noise
+from napari_shadowinv.physics.arrays import checksum
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.recipe import Recipe
 

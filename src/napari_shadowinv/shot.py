@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import as_numbers, block_sums
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Summarised
+from napari_shadowinv.physics.arrays import as_numbers, block_sums
 
 if TYPE_CHECKING:
     from napari_shadowinv.options import Noise

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import solve
@@ -19,6 +18,7 @@ from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import Fiducials, Unknowns
 from napari_shadowinv.instrument.shapes import beam_shapes
 from napari_shadowinv.options import BeamPrior
+from napari_shadowinv.physics.arrays import block_sums
 
 SIZE, PAD = (48, 64), 16
 

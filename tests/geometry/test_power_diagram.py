@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helpers.polygons import clipped_to_rectangle, over_pixels, power_cell, power_diagram, shoelace
-from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.physics.arrays import block_sums
 
 
 def low_and_high(shape):

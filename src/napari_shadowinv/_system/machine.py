@@ -187,9 +187,7 @@ if hasattr(os, "register_at_fork"):
 
 
 # Ctrl-C, and the signals of a job scheduler or a closing terminal.
-ENDING_SIGNALS = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-)
+ENDING_SIGNALS = {signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
 
 
 @contextmanager

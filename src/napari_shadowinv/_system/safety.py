@@ -29,6 +29,10 @@ P = ParamSpec("P")
 Content = TypeVar("Content")
 
 
+class _DamagedContentError(InputError):
+    """Content that its reader cannot use; a reader of files names the file, too."""
+
+
 def as_file_errors(
     read: Callable[Concatenate[Path, P], Content],
 ) -> Callable[Concatenate[str | Path, P], Content]:
@@ -38,6 +42,8 @@ def as_file_errors(
     def guarded(path: str | Path, *args: P.args, **kwargs: P.kwargs) -> Content:
         try:
             return read(Path(path), *args, **kwargs)
+        except _DamagedContentError as error:
+            raise FileFormatError(f"{path}: {error}") from error
         except (FileFormatError, InputError, InversionCancelled):
             raise
         except MemoryError as error:
@@ -72,7 +78,7 @@ def as_input_errors(name: str) -> Iterator[None]:
     except (InputError, MemoryError):
         raise
     except Exception as error:
-        raise InputError(
+        raise _DamagedContentError(
             f"{name} is damaged or was changed ({_error_reason(error)}): expected it as this "
             "package writes it"
         ) from error

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -115,11 +115,10 @@ Threads = Annotated[
 
 def as_model(model_class: type[Model], value: Any, name: str) -> Model:
     """Return a model as it is, the default one for None, or one made from a mapping."""
-    if isinstance(value, model_class):
-        return value
     if value is None or isinstance(value, Mapping):
         return validate(model_class, value or {}, name)
-    raise InputError(f"{name} is {_shorten(value)}, expected {model_class.__name__}")
+    check_instance(value, model_class, name)
+    return cast("Model", value)
 
 
 def check_instance(value: object, expected: type | tuple[type, ...], name: str) -> None:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis.frame import FieldUnit, field_unit, si_unit_of
@@ -24,6 +23,7 @@ from napari_shadowinv.analysis.product import BANDS, Coordinate, Measurand, Prod
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact, Level, Summarised
 from napari_shadowinv.inversion.error_bars import Quantity
+from napari_shadowinv.physics.arrays import PLANE
 from napari_shadowinv.physics.units import display_unit, label, numbers_of, prefix_for
 
 if TYPE_CHECKING:

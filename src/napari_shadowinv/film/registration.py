@@ -24,11 +24,11 @@ from numpy.typing import ArrayLike
 from scipy import fft, ndimage
 from scipy.optimize import isotonic_regression
 
-from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.film.scans import upright
+from napari_shadowinv.physics.arrays import block_sums
 from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 
 EDGE_ERROR_PX = 3.0  # standard deviation of a film's place by its edges

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import block_sums, complete_block_means
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.preconditioner import Preconditioner
 from napari_shadowinv.fitting.unknowns import POWERS, Fiducials, Unknowns
+from napari_shadowinv.physics.arrays import block_sums, complete_block_means
 
 Objective = Callable[[FloatArray], tuple[float, FloatArray]]
 

@@ -13,16 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import uniform_filter
 
-from napari_shadowinv._system.arrays import (
-    SQUARE_PIXELS,
-    as_numbers,
-    check_mask,
-    check_plane,
-    check_shape,
-    check_usable,
-    plain_array,
-    unpack_array,
-)
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -52,6 +42,16 @@ from napari_shadowinv.options import (
     BeamPrior,
     FitOptions,
     Instrument,
+)
+from napari_shadowinv.physics.arrays import (
+    SQUARE_PIXELS,
+    as_numbers,
+    check_mask,
+    check_plane,
+    check_shape,
+    check_usable,
+    plain_array,
+    unpack_array,
 )
 from napari_shadowinv.physics.projection import displacement_ratio
 from napari_shadowinv.physics.setup import Setup, deflector_titles

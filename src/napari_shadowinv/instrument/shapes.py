@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.options import BeamPrior
+from napari_shadowinv.physics.arrays import complete_block_means
 
 VARIANCE = 0.999
 """Share of the variance of a smooth field that its shapes hold, where they are drawn."""

@@ -12,7 +12,6 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import unpack_array
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._system.progress import (
     OnProgress,
@@ -47,6 +46,7 @@ from napari_shadowinv.inversion.solution_checks import (
     mark_caustics,
 )
 from napari_shadowinv.options import MAX_DEFAULT_SITES, Instrument, InversionOptions
+from napari_shadowinv.physics.arrays import unpack_array
 from napari_shadowinv.physics.forward import jacobian_determinant, synthetic_image
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.alignment import RegisteredSource, register_source

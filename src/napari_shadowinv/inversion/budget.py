@@ -27,7 +27,6 @@ from scipy.ndimage import (
 )
 from scipy.spatial import KDTree
 
-from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.machine import begin
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.facts import percent
@@ -44,6 +43,7 @@ from napari_shadowinv.inversion.noise import ImageNoise, beam_difference
 from napari_shadowinv.inversion.normalise import Prepared, lit_pixels
 from napari_shadowinv.inversion.readout import LinearResponse
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument, InversionOptions
+from napari_shadowinv.physics.arrays import block_means
 from napari_shadowinv.physics.edge import edge_changes, edge_sides
 from napari_shadowinv.transport.minimise import Solution, with_full_cells
 from napari_shadowinv.transport.sites import RATIO, SiteLevel, SitePlan

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import check_mask, check_plane, check_shape, check_usable
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -22,6 +21,7 @@ from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
+from napari_shadowinv.physics.arrays import check_mask, check_plane, check_shape, check_usable
 from napari_shadowinv.preprocessing.image_checks import mask_dark, mask_gaps
 
 _SMALLEST_SIDE = 4

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import maximum_filter
 
-from napari_shadowinv._system.arrays import check_mask
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry.density import Density
@@ -27,6 +26,7 @@ from napari_shadowinv.inversion.normalise import (
     power_of_two,
 )
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.arrays import check_mask
 from napari_shadowinv.transport.sites import Levels, Margin, SiteLevel, SitePlan, plan_levels
 
 

@@ -26,7 +26,6 @@ from typing import Literal
 import numpy as np
 from scipy.sparse import csr_array
 
-from napari_shadowinv._system.arrays import block_sums
 from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.geometry.compiler import njit
@@ -42,6 +41,7 @@ from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangle_mesh import Indices
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.arrays import block_sums
 from napari_shadowinv.physics.derivatives import first_derivative
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import FactorisedLaplacian

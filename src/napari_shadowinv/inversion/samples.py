@@ -20,7 +20,6 @@ import numpy as np
 from scipy import ndimage
 from scipy.special import ndtri
 
-from napari_shadowinv._system.arrays import plain_array
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -36,6 +35,7 @@ from napari_shadowinv.inversion.normalise import flooring_for
 from napari_shadowinv.inversion.plans import SpreadBeam, plan_on
 from napari_shadowinv.inversion.readout import LinearReadout, read_out
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.arrays import plain_array
 from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.transport.linear import FactorisedLaplacian, LaplacianSolver
 from napari_shadowinv.transport.sites import SitePlan

@@ -13,9 +13,9 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import PLANE, VECTOR
 from napari_shadowinv._system.safety import as_input_errors
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.physics.arrays import PLANE, VECTOR
 from napari_shadowinv.physics.units import (
     FLUX_DENSITY,
     PIXEL,

@@ -223,7 +223,8 @@ def read_stack(path: Path) -> xarray.Dataset:
     columns = {
         column.key: (("shot",), column.values(reports), column.labels) for column in store.columns
     }
-    return complete.assign(columns, status=complete["status"].copy(data=store.statuses()))
+    status = complete["status"].copy(data=store.statuses())
+    return complete.assign({**columns, "status": status})
 
 
 def _with_fields(dataset: xarray.Dataset, setup: Any) -> xarray.Dataset:

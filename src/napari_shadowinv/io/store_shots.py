@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv.errors import FileFormatError, InputError
 from napari_shadowinv.io.store import DAMAGED, DONE, StackStore, read_stack
+from napari_shadowinv.physics.arrays import PLANE
 
 if TYPE_CHECKING:
     import xarray

@@ -23,7 +23,6 @@ import numpy as np
 import tifffile
 from tifffile import PHOTOMETRIC
 
-from napari_shadowinv._system.arrays import METRES
 from napari_shadowinv._system.safety import check_regular, check_size
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.cautions import Caution
@@ -37,6 +36,7 @@ from napari_shadowinv.io.images import (
     is_linear_profile,
     square_cautions,
 )
+from napari_shadowinv.physics.arrays import METRES
 
 _TIFF_RATIO = 3 * DEFLATE_RATIO  # LZW at its best packs two and a half times as well as zlib
 _PICTURE_CODECS = {6, 7, 33003, 33004, 33005, 34712, 34892, 34933, 34934, 50001}

@@ -1,5 +1,6 @@
 """Deflections in SI units, and the formation of an image.
 
+- images as users hold them, with axes and units: `arrays`
 - the experiment and unit conversions: `setup`; units that are handy to read: `units`
 - the image that a displacement makes: `forward`
 - particles traced through a field on a 3-D grid: `tracing`, `field_grid`

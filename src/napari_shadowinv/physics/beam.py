@@ -27,11 +27,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field, ValidationInfo, field_validator, model_serializer, model_validator
 
-from napari_shadowinv._system.arrays import check_plane, plain_array, refuse_masked
 from napari_shadowinv._system.validation import CheckedModel, CombinationError
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.arrays import check_plane, plain_array, refuse_masked
 
 _QUANTITY = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+))(?:[eE]([+-]?\d+))?\s*(.*)")
 _UNIT_IN_TITLE = re.compile(r"\(([^()]+)\)$")

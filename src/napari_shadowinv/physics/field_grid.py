@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import METRES, check_finite
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import AnyArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.arrays import METRES, check_finite
 
 AXES = ("z", "y", "x")
 

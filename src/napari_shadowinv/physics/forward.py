@@ -24,13 +24,13 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import PIXELS, VECTOR, check_finite, check_shape, plain_array
 from napari_shadowinv._system.machine import LIGHT_ITEMS, available_threads, in_ranges
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import FloatArray, IntArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.compiler import njit
+from napari_shadowinv.physics.arrays import PIXELS, VECTOR, check_finite, check_shape, plain_array
 
 # Of a tile: y0, x0, y1, x1, y2, x2, y3, x3.
 Corners = tuple[float, float, float, float, float, float, float, float]

@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import constants
 
-from napari_shadowinv._system.arrays import as_numbers, check_finite
 from napari_shadowinv._system.machine import in_ranges
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.arrays import as_numbers, check_finite
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
 from napari_shadowinv.physics.forward import checked_shape, usable_threads
 from napari_shadowinv.physics.particle_push import (

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.fft import dctn, idctn
 
-from napari_shadowinv._system.arrays import (
+from napari_shadowinv._system.safety import check_memory
+from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.arrays import (
     SQUARE_PIXELS,
     check_finite,
     check_plane,
     check_shape,
     plain_array,
 )
-from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.errors import InputError
 
 
 def poisson_invert(image: ArrayLike, *, source: ArrayLike | None = None) -> FloatArray:

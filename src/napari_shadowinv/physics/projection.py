@@ -30,9 +30,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 
-from napari_shadowinv._system.arrays import plain_array
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.arrays import plain_array
 from napari_shadowinv.physics.forward import (
     MIN_SIDE_PX,
     checked_displacement,

@@ -35,10 +35,10 @@ from pydantic import BeforeValidator, Field, SerializeAsAny, ValidationError, mo
 from pydantic_core import PydanticKnownError
 from scipy import constants
 
-from napari_shadowinv._system.arrays import VECTOR, plain_array
 from napari_shadowinv._system.validation import CombinationError, nearest, validate
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.arrays import VECTOR, plain_array
 from napari_shadowinv.physics.beam import (
     BeamQuantity,
     BeamSetup,

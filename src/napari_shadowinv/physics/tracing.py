@@ -21,7 +21,13 @@ from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import (
+from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._system.safety import check_memory
+from napari_shadowinv._system.validation import as_model
+from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.facts import Fact, Level, Summarised, percent
+from napari_shadowinv.physics.arrays import (
     PLANE,
     VECTOR,
     as_numbers,
@@ -30,12 +36,6 @@ from napari_shadowinv._system.arrays import (
     check_shape,
     plain_array,
 )
-from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
-from napari_shadowinv._system.safety import check_memory
-from napari_shadowinv._system.validation import as_model
-from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
-from napari_shadowinv.errors import InputError
-from napari_shadowinv.facts import Fact, Level, Summarised, percent
 from napari_shadowinv.physics.field_grid import FieldGrid, field_grid
 from napari_shadowinv.physics.forward import checked_shape, synthetic_image, usable_threads
 from napari_shadowinv.physics.particle_flight import (

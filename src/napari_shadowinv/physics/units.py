@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import (
@@ -34,6 +33,7 @@ from napari_shadowinv.facts import (
     to_figures,
     with_error,
 )
+from napari_shadowinv.physics.arrays import PLANE
 
 if TYPE_CHECKING:
     import xarray

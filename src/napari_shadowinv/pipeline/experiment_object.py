@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates, spline_filter
 
-from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._system.validation import suggestion, validate
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.arrays import complete_block_means
 from napari_shadowinv.physics.beam import numbers_in_unit
 from napari_shadowinv.physics.field_grid import FieldGrid
 from napari_shadowinv.physics.forward import checked_displacement, synthetic_image

@@ -18,14 +18,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import (
-    check_plane,
-    check_shape,
-    check_spacing,
-    check_usable,
-    join_masks,
-    unpack_array,
-)
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
@@ -38,6 +30,14 @@ from napari_shadowinv.inversion.normalise import check_source, mask_unlit, prepa
 from napari_shadowinv.io import read_shot
 from napari_shadowinv.io.files import join_address, sha256, split_address, text_of
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.arrays import (
+    check_plane,
+    check_shape,
+    check_spacing,
+    check_usable,
+    join_masks,
+    unpack_array,
+)
 from napari_shadowinv.physics.beam import deflection_cautions, setup_cautions
 from napari_shadowinv.pipeline.remaining_beam import after_steps
 from napari_shadowinv.preprocessing import (

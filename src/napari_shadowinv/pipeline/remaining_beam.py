@@ -15,10 +15,10 @@ from typing import Literal
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.instrument.shapes import Shapes
 from napari_shadowinv.options import BeamComponents, BeamPrior, Instrument
+from napari_shadowinv.physics.arrays import block_means
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.shot import Shot
 

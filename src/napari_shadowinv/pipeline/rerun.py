@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import join_masks
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError, InputError
@@ -26,6 +25,7 @@ from napari_shadowinv.inversion import Inversion
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import read_dataset, read_shot
 from napari_shadowinv.io.files import join_address, split_address
+from napari_shadowinv.physics.arrays import join_masks
 from napari_shadowinv.pipeline._film import run_film
 from napari_shadowinv.pipeline.fit_run import NUMBERS, run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import AnyShot, load_shot, run

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv.analysis.product import BANDS
 from napari_shadowinv.facts import Level
+from napari_shadowinv.physics.arrays import PLANE
 from napari_shadowinv.physics.units import display_unit, prefix_for
 from napari_shadowinv.plotting import _panels
 from napari_shadowinv.plotting._panels import ALARM_COLOUR, QUIET_COLOUR

@@ -29,10 +29,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import linalg, ndimage
 
-from napari_shadowinv._system.arrays import check_shape, complete_block_means
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.options import DEFAULT_REGISTRATION, REFERENCE_BEAM, BeamPrior, Instrument
+from napari_shadowinv.physics.arrays import check_shape, complete_block_means
 from napari_shadowinv.preprocessing.image_checks import border_ring
 from napari_shadowinv.preprocessing.noise import NORMAL_MAD, finest_differences
 from napari_shadowinv.preprocessing.pixels import LEAST_LIGHT, complete_blocks

@@ -29,13 +29,13 @@ import scipy
 from numpy.typing import ArrayLike
 from pydantic import Field, PrivateAttr
 
-from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.options import BeamPrior
+from napari_shadowinv.physics.arrays import block_means
 from napari_shadowinv.physics.setup import Setup, bin_setup
 from napari_shadowinv.preprocessing import filters, pixels
 from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source

@@ -31,10 +31,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 
-from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent
+from napari_shadowinv.physics.arrays import complete_block_means
 from napari_shadowinv.preprocessing.noise import NORMAL_MAD, order_by_value
 from napari_shadowinv.preprocessing.pixels import LEAST_LIGHT, complete_blocks, nonnegative_fit
 

@@ -19,13 +19,13 @@ import scipy
 from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
-from napari_shadowinv._system.arrays import block_means
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.options import BeamComponents, BeamPrior
+from napari_shadowinv.physics.arrays import block_means
 from napari_shadowinv.preprocessing.pixels import beam_pixels, complete_blocks, with_flux_of
 
 _LENGTHS = np.geomspace(0.1, 1.2, 12)  # shorter sides; errors are too small with half of them

@@ -12,16 +12,16 @@ import scipy
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import (
+from napari_shadowinv._system.progress import Reporter, ShouldStop
+from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv.errors import InputError
+from napari_shadowinv.physics.arrays import (
     block_means,
     check_mask,
     check_plane,
     complete_block_means,
     unpack_array,
 )
-from napari_shadowinv._system.progress import Reporter, ShouldStop
-from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 
 

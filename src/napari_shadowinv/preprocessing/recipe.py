@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from napari_shadowinv._system.arrays import check_shape
 from napari_shadowinv._system.progress import ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -24,6 +23,7 @@ from napari_shadowinv.cautions import Caution, OnCaution, warn_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.options import FitChoices, Instrument, InversionOptions
+from napari_shadowinv.physics.arrays import check_shape
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing.estimates import Estimate
 from napari_shadowinv.preprocessing.filters import Filter, HotPixelFilter

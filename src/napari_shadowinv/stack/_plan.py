@@ -10,13 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import (
-    check_shape,
-    check_spacing,
-    checksum,
-    join_masks,
-    unpack_array,
-)
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import check_instance, map_paths
 from napari_shadowinv.errors import InputError
@@ -24,6 +17,13 @@ from napari_shadowinv.inversion.normalise import bytes_per_pixel, check_source
 from napari_shadowinv.inversion.variables import dataset_from_field, variable_labels
 from napari_shadowinv.io.files import sha256, split_address
 from napari_shadowinv.io.store import FORMAT
+from napari_shadowinv.physics.arrays import (
+    check_shape,
+    check_spacing,
+    checksum,
+    join_masks,
+    unpack_array,
+)
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline.inversion_run import Inputs, collect_inputs
 from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions

@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from napari_shadowinv import __version__
-from napari_shadowinv._system.arrays import checksum
 from napari_shadowinv._system.hidden_files import locked
 from napari_shadowinv._system.machine import clear_up_when_terminated
 from napari_shadowinv._system.progress import ShouldStop
@@ -44,6 +43,7 @@ from napari_shadowinv.io.store_writing import (
     grow_store,
     remove_unfinished,
 )
+from napari_shadowinv.physics.arrays import checksum
 from napari_shadowinv.pipeline.run_options import RunOptions
 from napari_shadowinv.preprocessing import Recipe
 from napari_shadowinv.stack._plan import Stack, describe_stack, empty_results

@@ -19,12 +19,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.arrays import (
-    PLANE,
-    checksum,
-    refuse_masked,
-    unpack_array,
-)
 from napari_shadowinv._system.validation import map_paths
 from napari_shadowinv._typing import AnyArray, BoolArray
 from napari_shadowinv.cautions import Caution
@@ -33,6 +27,12 @@ from napari_shadowinv.io.files import name_of, sha256, split_address, text_of
 from napari_shadowinv.io.formats import HDF5, PRADFORMAT, format_of
 from napari_shadowinv.io.frames import FileFrame, find_frames
 from napari_shadowinv.io.read_write import read_frame, read_shot
+from napari_shadowinv.physics.arrays import (
+    PLANE,
+    checksum,
+    refuse_masked,
+    unpack_array,
+)
 from napari_shadowinv.physics.setup import Setup, setup_from_dict
 from napari_shadowinv.pipeline.fit_run import read_row_images, row_setup
 from napari_shadowinv.pipeline.shot_table import ShotRow, rows_to_invert

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from napari_shadowinv._system.arrays import checksum, join_masks
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
@@ -28,6 +27,7 @@ from napari_shadowinv.io.store import DONE, FAILED
 from napari_shadowinv.io.store_columns import column_values
 from napari_shadowinv.io.store_writing import ShotWriter
 from napari_shadowinv.options import InversionOptions
+from napari_shadowinv.physics.arrays import checksum, join_masks
 from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline.inversion_run import Cache, Inputs, collect_inputs, run_prepared
 from napari_shadowinv.preprocessing import Recipe, UniformEstimate

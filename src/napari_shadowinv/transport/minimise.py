@@ -40,7 +40,6 @@ from scipy.fft import dctn, idctn
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
-from napari_shadowinv._system.arrays import complete_block_means
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
@@ -48,6 +47,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.density import Density, side_of_squares, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
+from napari_shadowinv.physics.arrays import complete_block_means
 from napari_shadowinv.transport.linear import SimilarSystems
 from napari_shadowinv.transport.sites import Margin, SiteLevel
 

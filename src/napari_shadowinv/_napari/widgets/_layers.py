@@ -22,13 +22,13 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.viewer_sync import without_proxy
 from napari_shadowinv._napari.widgets import _qt as qt
-from napari_shadowinv._system.arrays import complete_block_means, join_masks
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
 from napari_shadowinv.io.formats import SCAN_SUFFIXES
 from napari_shadowinv.io.images import film_cautions
+from napari_shadowinv.physics.arrays import complete_block_means, join_masks
 from napari_shadowinv.preprocessing import Crop
 
 

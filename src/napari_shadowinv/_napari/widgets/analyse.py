@@ -32,7 +32,6 @@ from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes, shown_plane
 from napari_shadowinv._napari.widgets._panels import ReportView, ToolPanel
-from napari_shadowinv._system.arrays import PLANE
 from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
@@ -55,6 +54,7 @@ from napari_shadowinv.analysis.paths import (
 )
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import FIGURE_SUFFIXES
+from napari_shadowinv.physics.arrays import PLANE
 from napari_shadowinv.physics.beam import number_in_unit
 from napari_shadowinv.physics.units import prefix_for
 from napari_shadowinv.plotting import draw_curves, products_figure, save_figure

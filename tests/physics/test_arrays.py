@@ -25,9 +25,9 @@ from napari_shadowinv import (
     run,
     synthetic_image,
 )
-from napari_shadowinv._system.arrays import block_sums, coordinate_spacing
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.inversion import plan_sites
+from napari_shadowinv.physics.arrays import block_sums, coordinate_spacing
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing.estimates import UniformEstimate
