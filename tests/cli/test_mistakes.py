@@ -65,7 +65,7 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     "invert shot.npy --mask small.npy": "small.npy",
     "invert shot.npy --source shot.npy": "the source is the image itself",
     "invert zero.npy": "zero.npy: image has no positive pixel",
-    "invert ring.shadowinv --out again.shadowinv": "is the result",
+    "invert ring.shadowinv --out again.shadowinv": "is a result",
     "invert shot.npy::shot": "neither a MATLAB nor an HDF5 file",
     "invert shots.mat": ("shots.mat", "::shot", "shot"),
     "info shots.mat": ("shots.mat", "::shot", "'shot' (24×32"),
