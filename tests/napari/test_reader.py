@@ -205,7 +205,7 @@ def damaged(folder, inversion):
     [
         (grid, "grid.h5", "trace particles through them with shadowinv forwa"),
         (no_shot, "night", "none of 1 files can be read as a shot: .*a.tif"),
-        (damaged, "shot.shadowinv", r"shot\.shadowinv could not be read"),
+        (damaged, "shot.shadowinv", r"shot\.shadowinv: the result is damaged"),
     ],
 )
 def test_what_cannot_be_read_is_one_sentence(make, name, words, tmp_path, inversion):

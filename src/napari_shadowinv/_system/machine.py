@@ -93,12 +93,11 @@ def in_ranges(
     *args: Any,
     smallest: int = 4096,
     uneven: bool = False,
-    uneven_ranges: int = 4,
 ) -> None:
     """Call ``kernel(start, stop, *args)`` on ranges of at least `smallest` items that cover n.
 
-    There is one range for each thread. Where items take `uneven` times there are
-    `uneven_ranges`, so that a thread with light ranges takes more of them.
+    There is one range for each thread. Where items take `uneven` times there are four, so that
+    a thread with light ranges takes more of them.
     """
     # The items are independent and a kernel writes only what belongs to them, so the cut cannot
     # change a result. Plain threads suffice because the kernels release the GIL; unlike numba's
@@ -108,7 +107,7 @@ def in_ranges(
     if threads == 1:
         kernel(0, n, *args)
         return
-    ranges = min(uneven_ranges * threads, most) if uneven else threads
+    ranges = min(4 * threads, most) if uneven else threads
     bounds = [n * k // ranges for k in range(ranges + 1)]
     run_together([partial(kernel, *pair, *args) for pair in pairwise(bounds)], threads)
 

@@ -19,6 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar, cast
 
+from pydantic import ValidationError
+
 from napari_shadowinv._system.machine import physical_memory
 from napari_shadowinv.errors import FileFormatError, InputError, InversionCancelled
 
@@ -67,6 +69,9 @@ def as_file_errors(
 
 def _error_reason(error: BaseException) -> str:
     text = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+    if isinstance(error, ValidationError):
+        first = error.errors()[0]
+        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     return " ".join(text.split())[:120].rstrip(".") or type(error).__name__
 
 
@@ -153,16 +158,14 @@ def check_memory(shape: Sequence[int], bytes_per_pixel: float, work: str) -> Non
         )
 
 
-def small_text(
-    path: Path, expected: str, encoding: str = "utf-8", *, most_bytes: int = 1_000_000
-) -> str:
-    """Return the text of a file, refusing a large one."""
+def small_text(path: Path, expected: str, encoding: str = "utf-8-sig", most: int = 10**6) -> str:
+    """Return the text of a file, refusing one of more than `most` bytes."""
     check_regular(path, expected)
     with path.open("rb") as file:
-        raw = file.read(most_bytes + 1)
-    if len(raw) > most_bytes:
+        raw = file.read(most + 1)
+    if len(raw) > most:
         raise FileFormatError(
-            f"{path} is larger than {most_bytes // 1_000_000} MB: expected {expected}; check "
+            f"{path} is larger than {most // 1_000_000} MB: expected {expected}; check "
             "that it is the right file"
         )
     try:

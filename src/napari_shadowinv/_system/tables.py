@@ -46,7 +46,7 @@ class Table(NamedTuple):
 @as_file_errors
 def read_table(path: Path) -> Table:
     """Read a table; an `InputError` names the line with more cells than there are columns."""
-    records = _records(path, small_text(path, _EXPECTED, "utf-8-sig"))
+    records = _records(path, small_text(path, _EXPECTED))
     _, names = next(records, (0, []))
     header = [name.lower() for name in _without_empty_end(names)]
     rows = {}
@@ -95,11 +95,9 @@ def read_rows(
     return models
 
 
-def write_cells(
-    path: str | Path, columns: Sequence[str], rows: Iterable[Mapping[str, object]]
-) -> None:
+def write_cells(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> None:
     """Write a table from the cells of its rows by column; missing ones are empty."""
-    with Path(path).open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         writer.writerows(rows)

@@ -325,7 +325,7 @@ def write_corners(path: str | Path, films: dict[str, FloatArray]) -> None:
         dict(zip(columns, [name, *(f"{value:.2f}" for value in np.ravel(corners))], strict=True))
         for name, corners in films.items()
     ]
-    write_cells(path, columns, rows)
+    write_cells(Path(path), columns, rows)
 
 
 def usable_pixels(
