@@ -264,7 +264,7 @@ def test_random_fields_report_and_stop_on_request(shot):
 
 
 def test_slope_of_one_image_is_refused_past_a_contrast_of_one():
-    counts, _ = turbulent_image(96, 1.6, 1)
+    counts, _ = turbulent_image(64, 1.6, 1)
     inversion = invert(counts, source=np.full(counts.shape, 250.0))
     with pytest.raises(InputError, match=r"contrast|trusted rings"):
         analyse(inversion, TurbulenceSpectrum(phantoms=1), samples=20)

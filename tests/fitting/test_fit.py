@@ -283,13 +283,13 @@ def test_an_object_cut_by_the_end_of_a_filled_side_is_reported() -> None:
 
 def test_an_unknown_beam_does_not_hide_a_strong_field() -> None:
     """Of 14.7 and 3 MeV; the beam has to be held until the field is found."""
-    size = (100, 100)
+    size = (64, 64)
 
     def beam(y: FloatArray, x: FloatArray) -> FloatArray:
-        v, u = y / 50 - 1, x / 50 - 1
+        v, u = y / 32 - 1, x / 32 - 1
         return np.exp(0.25 * np.sin(1.9 * u + 0.4) * np.cos(1.4 * v - 0.5) + 0.12 * u)
 
-    ring = bump(2.3, 10, (45, 52))
+    ring = bump(2.3, 7, (29, 33))
     strengths = [1, 2.23]
     images = [counted(lambda y, x: s * ring(y, x), size, beam=beam) for s in strengths]  # noqa: B023
     counts = [np.random.default_rng(k).poisson(400 * image) for k, image in enumerate(images)]

@@ -58,8 +58,8 @@ def test_a_known_point_spread_is_undone() -> None:
 
 def test_a_blur_that_was_not_told_is_noticed() -> None:
     """It would pass for a weaker field, with a perfect χ²; one image is enough to see it."""
-    size = (80, 80)
-    ring = bump(1.9, 8, (40, 40))
+    size = (64, 64)
+    ring = bump(1.9, 8, (32, 32))
     for blur in (0.0, 2.0):
         image = noisy([counted(ring, size, blur=blur)], 0.02)[0]
         keywords = {"strength": None, "noise": 0.02, "source": np.ones(size)}
@@ -92,8 +92,8 @@ def test_a_dark_level_shows_in_the_noise_of_counts(unfolded: list[FloatArray]) -
 
 def test_one_folded_image_does_not_pass_for_an_answer() -> None:
     """The field is 20 % wrong, and explains the image to the noise."""
-    size = (80, 80)
-    ring = bump(4.0, 8, (40, 40))
+    size = (64, 64)
+    ring = bump(4.0, 8, (32, 32))
     image = noisy([counted(ring, size, blur=1.5)], 0.05)[0]
     keywords = {"strength": None, "noise": 0.05, "source": np.ones(size)}
     result = fitted(image, psf=1.5, **keywords)
@@ -216,7 +216,9 @@ def test_fiducials_hold_the_field_where_noise_does_not() -> None:
 
 
 @pytest.mark.parametrize(
-    "instrument", [None, Instrument(beam_rms=0.0, beam_between=0.05)], ids=["exact", "own beams"]
+    "instrument",
+    [None, Instrument(beam_rms=0.0, beam_between=0.05, beam_length=1.0)],
+    ids=["exact", "own beams"],
 )
 def test_neither_threads_nor_a_second_time_change_a_bit(instrument: Instrument | None) -> None:
     ring = bump(1.5, 4.5, (15, 19))

@@ -78,33 +78,6 @@ def test_a_first_inversion_has_the_help_of_a_second_process_which_ends_with_it(m
     assert namespace["compile_rest"] is compilation.compile_rest
 
 
-def test_it_leaves_nothing_to_compile_for_an_inversion():
-    script = """
-import sys
-import numpy as np
-from napari_shadowinv import InversionOptions, invert
-from napari_shadowinv.inversion import compilation
-
-compilation.is_compiled = lambda: False
-compilation.ensure_compiled()
-kernels = {
-    function
-    for name, module in list(sys.modules.items()) if name.startswith("napari_shadowinv")
-    for function in vars(module).values() if hasattr(function, "signatures")
-}
-compiled = {kernel: len(kernel.signatures) for kernel in kernels}
-assert sum(compiled.values()) > 10
-for side in (40, 900):  # the latter needs blocks of nodes on two levels
-    y, x = np.indices((side, 240)) / 240
-    invert(1 + y * x, source=1 + x, options=InversionOptions(n_sites=240 * side))
-print([kernel.py_func.__name__ for kernel in kernels if len(kernel.signatures) > compiled[kernel]])
-"""
-    printed = subprocess.run(
-        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=True
-    )
-    assert printed.stdout.strip() == "[]"
-
-
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="permissions of another kind")
 def test_a_kernel_runs_where_no_folder_keeps_its_code(tmp_path):
     """Neither the package nor the home can be written."""

@@ -160,9 +160,8 @@ def test_an_array_gives_each_pixel_its_own_noise(clean, plan):
     assert np.median(noiseless) < 0.5 * np.median(noisy)
 
 
-@pytest.mark.parametrize("noise", [0.02, 0.2])
-def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, clean, plan, noise):
-    choices = {"plan": plan, "noise": noise, "method": "resolve"}
+def test_solving_samples_loosely_does_not_change_the_error_bars(monkeypatch, clean, plan):
+    choices = {"plan": plan, "noise": 0.2, "method": "resolve"}
     loose = samples_of(clean, 6, **choices, options=OPTIONS)
     monkeypatch.setattr(samples, "_SAMPLE_SHARE", 0.0)
     strict = OPTIONS.model_copy(update={"tolerance": 1e-6})

@@ -334,7 +334,7 @@ def test_progress_covers_all_stages_and_cancelling_ends_each(image):
 @pytest.mark.parametrize("boundary", ["closed", "free"])
 def test_the_read_out_reports_its_share_and_can_be_stopped(image, boundary):
     options, steps = InversionOptions(n_sites=500, boundary=boundary), []
-    image = np.kron(image, np.ones((8, 8)))  # a small one takes no time worth a report
+    image = np.kron(image, np.ones((5, 5)))  # a small one takes no time worth a report
 
     def listen(news):
         if news.stage == "read-out":
@@ -433,7 +433,7 @@ def test_the_donut_is_retrieved():
 
 
 def test_a_real_plume_with_its_real_reference_is_explained(burner):
-    reference, shot = (read(burner[number]).bin_pixels(2) for number in (0, 3))
+    reference, shot = (read(burner[number]).bin_pixels(4) for number in (0, 3))
     options = InversionOptions(n_sites=shot.image.size)
     inversion = invert(shot.image, source=reference.image, options=options)
     assert inversion.report.converged
@@ -441,7 +441,7 @@ def test_a_real_plume_with_its_real_reference_is_explained(burner):
     modulation = (inversion.image - reference.image).std() / reference.image.mean()
     assert unexplained < 0.01
     assert modulation > 0.05
-    assert 2 < peak(inversion.displacement) < 4
+    assert 1 < peak(inversion.displacement) < 2
 
 
 def _lens(shape=(48, 60)):

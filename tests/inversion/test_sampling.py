@@ -22,7 +22,6 @@ from napari_shadowinv.inversion.samples import (
     FullResampling,
     LinearResampling,
     Pairs,
-    Scatter,
     correct,
     noise_of,
     stratified_numbers,
@@ -114,15 +113,6 @@ def test_too_many_sites_for_factors_are_left_to_the_multigrid(monkeypatch, image
         bars, exact_bars = getattr(iterative, name), getattr(factorised, name)
         # a residual of 2 % was allowed
         assert np.linalg.norm(bars - exact_bars) < 0.02 * np.linalg.norm(exact_bars)
-
-
-def test_the_scatter_of_samples_is_that_of_all_at_once():
-    values = np.random.default_rng(0).normal(size=(50, 3, 4, 5)) + 3
-    scatter = Scatter.of(values[0])
-    for value in values[1:]:
-        scatter = scatter + Scatter.of(value)
-    np.testing.assert_allclose(scatter.mean, values.mean(axis=0), rtol=1e-13)
-    np.testing.assert_allclose(scatter.std, values.std(axis=0, ddof=1), rtol=1e-12)
 
 
 def pairs_of(linear, solved):
