@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 from numba.core.dispatcher import Dispatcher
 
+from helpers.sources import trees_of
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.preprocessing import ESTIMATES, STEPS
 
@@ -61,7 +62,6 @@ def module_of(path: Path) -> str:
 # A stub names what its package loads lazily.
 FILES = [*sorted((SOURCE / PACKAGE).rglob("*.py")), *sorted((SOURCE / PACKAGE).rglob("*.pyi"))]
 MODULES = {module_of(path) for path in FILES}
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 
 
 def imported(path: Path, nodes: Iterator[ast.AST]) -> Iterator[str]:
@@ -95,7 +95,7 @@ def outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
 def needs() -> dict[str, set[str]]:
     """Every module of the package, and those of the package that it imports."""
     imports: dict[str, set[str]] = {module: set() for module in MODULES}
-    for path, tree in TREES.items():
+    for path, tree in trees_of(FILES).items():
         names = imported(path, ast.walk(tree))
         imports[module_of(path)] |= {name for name in names if name.split(".")[0] == PACKAGE}
     return imports
@@ -134,7 +134,7 @@ def test_modules_do_not_import_each_other_in_circles():
 
 @pytest.mark.parametrize("room", sorted(CORE))
 def test_the_core_imports_no_window_no_cluster_no_figure(room):
-    for path, tree in TREES.items():
+    for path, tree in trees_of(FILES).items():
         if room_of(module_of(path)) != room:
             continue
         anywhere = {name.split(".")[0] for name in imported(path, ast.walk(tree))}
@@ -146,7 +146,7 @@ def test_the_core_imports_no_window_no_cluster_no_figure(room):
 def test_only_one_module_connects_to_events_of_napari():
     places = [
         f"{path.name}:{node.lineno}"
-        for path, tree in TREES.items()
+        for path, tree in trees_of(FILES).items()
         if module_of(path) != f"{PACKAGE}._napari.viewer_sync"
         for node in ast.walk(tree)
         if isinstance(node, ast.Attribute) and node.attr == "events"
@@ -158,7 +158,7 @@ def test_only_one_module_connects_to_events_of_napari():
 def classes_by_field() -> dict[str, list[str]]:
     """Classes that declare a field, by its name."""
     classes: dict[str, list[str]] = {}
-    for tree in TREES.values():
+    for tree in trees_of(FILES).values():
         for node in ast.walk(tree):
             for part in node.body if isinstance(node, ast.ClassDef) else ():
                 if (
@@ -192,7 +192,7 @@ def names_declared() -> Counter[tuple[str, str]]:
     """Names of steps and sources, as a class declares them: ``step: Literal["bin"] = "bin"``."""
     return Counter(
         (part.target.id, ast.literal_eval(part.value))
-        for tree in TREES.values()
+        for tree in trees_of(FILES).values()
         for node in ast.walk(tree)
         if isinstance(node, ast.ClassDef)
         for part in node.body
@@ -210,7 +210,7 @@ def test_a_step_and_a_source_are_declared_once():
     assert names_declared() == steps | sources
     classes = Counter(
         node.name
-        for tree in TREES.values()
+        for tree in trees_of(FILES).values()
         for node in ast.walk(tree)
         if isinstance(node, ast.ClassDef)
     )
@@ -253,5 +253,9 @@ def dispatches_of(tree: ast.AST) -> Iterator[int]:
 
 
 def test_few_places_treat_kinds_of_results_differently():
-    places = [f"{path.name}:{line}" for path, tree in TREES.items() for line in dispatches_of(tree)]
+    places = [
+        f"{path.name}:{line}"
+        for path, tree in trees_of(FILES).items()
+        for line in dispatches_of(tree)
+    ]
     assert len(places) <= MAX_DISPATCHES, places

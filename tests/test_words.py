@@ -15,6 +15,7 @@ import pytest
 from pydantic import BaseModel
 
 from helpers.pages import PAGES, ROOT, WRITTEN_PAGES
+from helpers.sources import tree_of, trees_of
 from napari_shadowinv.film.pack import Pack
 from napari_shadowinv.options import FitChoices, FitOptions, InversionOptions
 from napari_shadowinv.physics.setup import SETUPS
@@ -23,7 +24,6 @@ from napari_shadowinv.preprocessing import Recipe
 SOURCES = sorted((ROOT / "src").rglob("*.py"))
 FACES = {"cli", "_napari"}
 FILES = [*SOURCES, *sorted((ROOT / "tests").rglob("*.py"))]
-TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in FILES}
 
 VAGUE_WORDS = """
 one own other others found known told given kept made left whole rest asked held seen here there
@@ -68,7 +68,7 @@ def docstrings() -> dict[str, str]:
     return {
         f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)}": text
         for path in SOURCES
-        for node in ast.walk(TREES[path])
+        for node in ast.walk(tree_of(path))
         if isinstance(node, DOCUMENTED) and (text := ast.get_docstring(node))
     }
 
@@ -80,12 +80,12 @@ def messages() -> list[tuple[Path, int, str]]:
     for path in SOURCES:
         skipped = {
             id(node.body[0].value)
-            for node in ast.walk(TREES[path])
+            for node in ast.walk(tree_of(path))
             if isinstance(node, DOCUMENTED) and node.body and isinstance(node.body[0], ast.Expr)
         }
         texts += [
             (path, node.lineno, node.value)
-            for node in ast.walk(TREES[path])
+            for node in ast.walk(tree_of(path))
             if isinstance(node, ast.Constant) and isinstance(node.value, str)
             if id(node) not in skipped and " " in node.value
         ]
@@ -95,7 +95,7 @@ def messages() -> list[tuple[Path, int, str]]:
 def test_variables_are_named_by_what_they_hold():
     names = Counter[str]()
     vague = Counter[str]()
-    for path, tree in TREES.items():
+    for path, tree in trees_of(FILES).items():
         for node in ast.walk(tree):
             for name in assigned_names(node):
                 names[name] += 1
