@@ -91,14 +91,11 @@ CASES = {
         " --step='crop x=2:' --source-from 'polynomial degree=1'",
         (f"source {PolynomialEstimate(degree=1).summary}", "beam assumed"),
     ),
-    "free boundary": Case(
-        {"options": FREE},
-        "--boundary free --set=options.margin=5 --set=options.flux=known --set=options.seed=4",
-        ("seed = 4", "n_sites = 100"),
-    ),
     "arrays of HDF5": Case(
-        {"source": MeasuredSource(file=Path("run.h5::day/beam")), "options": FEW},
-        "--source run.h5::day/beam",
+        {"source": MeasuredSource(file=Path("run.h5::day/beam")), "options": FREE},
+        "--source run.h5::day/beam --boundary free --set=options.margin=5"
+        " --set=options.flux=known --set=options.seed=4",
+        ("seed = 4", "n_sites = 100"),
         image="run.h5::day/shot",
     ),
 }

@@ -126,6 +126,7 @@ def test_the_totals_of_the_tables_of_limits_are_those_of_inversions(limits: Any)
         assert share == pytest.approx(float(total), rel=0.06), instrument
 
 
+@pytest.mark.usefixtures("no_causes")
 def test_the_loop_of_the_page_on_fits_names_the_film_that_changed() -> None:
     """The page leaves out each film in turn; with a stronger object in one, its χ² is largest."""
     first, *_, loop = (

@@ -20,6 +20,8 @@ from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline import read_recipe
 from napari_shadowinv.preprocessing import ESTIMATES, STEPS, MeasuredSource
 
+pytestmark = pytest.mark.usefixtures("blank_pages")
+
 PAGE = text_of("docs/recipes.md")
 COMMANDS = commands(PAGE)
 WHOLE, STEPS_SHOWN = blocks(PAGE, "toml")

@@ -130,6 +130,7 @@ def test_two_energies_have_the_numbers_of_their_page(capsys):
     )
 
 
+@pytest.mark.usefixtures("blank_pages")
 def test_the_film_pack_has_the_numbers_of_its_page():
     Path("stopping").mkdir()
     for name in public_names("rcf"):
