@@ -160,10 +160,6 @@ def test_fiducials_are_scaled_with_the_pixels(scene: Scene) -> None:
     np.testing.assert_array_equal(coarse.fiducials.errors, [0.125])
 
 
-def test_pixels_as_they_are_are_the_scene_itself(scene: Scene) -> None:
-    assert coarser(scene, 1) is scene
-
-
 def test_descending_finds_the_field_that_made_the_images(scene: Scene) -> None:
     truth = bump(scene, 0.6)
     images = scene.model(truth, scene.ray_counts(truth))

@@ -31,10 +31,10 @@ from napari_shadowinv.shot import shots_of
 
 pytestmark = pytest.mark.usefixtures("no_causes")
 
-SIZE = (48, 56)
+SIZE = (40, 48)
 STRENGTHS = [1, 0.6]
 NOISE = 0.03
-RING = bump(3.0, 5.5, (23, 29), tall=1.2)
+RING = bump(3.0, 4.6, (19, 25), tall=1.2)
 FEW = FitOptions(samples=4, max_iterations=20, spacing=0.25, threads=1)
 BARE = FEW.model_copy(update={"samples": 0})
 HASTY = FEW.model_copy(update={"samples": 2, "max_iterations": 5})
@@ -114,7 +114,7 @@ def test_an_instrument_without_numbers_changes_no_bit(assumed: Fit) -> None:
 
 def test_a_detector_of_which_nothing_is_stated_is_in_the_error() -> None:
     """Unfolded images of a dark level of 10 % are explained by a field that is as much too weak."""
-    weak = bump(0.4, 8, (23, 29))
+    weak = bump(0.4, 6.6, (19, 25))
     clean = np.stack([counted(lambda y, x, a=a: a * weak(y, x), SIZE) for a in STRENGTHS])
     images = noisy(list(0.9 * clean + 0.1), NOISE)
     keywords = {"source": np.ones(SIZE)}
@@ -158,7 +158,7 @@ def test_the_mean_of_an_inexact_beam_is_not_known(instrument: dict[str, float]) 
 
 
 def test_errors_have_a_part_for_all_that_is_stated() -> None:
-    instrument = Instrument(beam_rms=0.02, beam_length=0.5, background=0.02)
+    instrument = Instrument(beam_rms=0.02, beam_length=1.0, background=0.02)
     result = fitted(shots(), instrument, options=HASTY)
     parts = result.errors.shares
     assert parts.keys() - {"edge"} == {"noise", "beam", "background"}

@@ -65,7 +65,6 @@ def nearly_all_masked() -> FloatArray:
         ({"images": [np.ones(40)] * 2}, r"image 1 has shape \(40,\), expected two dimensions"),
         ({"images": np.ones((2, 40, 20))}, r"shape \(40, 20\), expected at least 32 × 32 pixels"),
         ({"images": with_pixel(np.nan)}, "1 pixels that are NaN or infinite.*: mask them"),
-        ({"images": with_pixel(np.inf)}, "image 2 has 1 pixels that are NaN or infinite"),
         ({"images": np.zeros((2, *SIZE))}, "image 1 has no flux: expected a beam"),
         ({"mask": np.ones((51, 40), bool)}, r"mask has shape \(51, 40\), image \(40, 51\)"),
         (
@@ -91,17 +90,11 @@ def nearly_all_masked() -> FloatArray:
             {"strength": None, "setup": [protons(3)] * 2, "fields": ("B", "C")},
             r"fields are \['B', 'C'\]: expected some of B, E, plasma, phase",
         ),
-        (
-            {"strength": None, "setup": [protons(3)] * 2, "fields": ("B", "B")},
-            r"fields are \['B', 'B'\]",
-        ),
         ({"source": "unkown"}, "source is the file unkown, expected an array: read it first"),
         ({"source": np.ones((40, 50))}, r"source has shape \(40, 50\), image \(40, 51\)"),
         ({"source": -np.ones(SIZE)}, "source has 2040 negative pixels"),
-        ({"source": np.full(SIZE, np.nan)}, "source has 2040 pixels that are NaN or infinite"),
         ({"noise": "gauss"}, "noise is 'gauss': expected 'poisson' or 'proportional', standard"),
         ({"noise": 0}, "noise of image 1 is not positive: expected"),
-        ({"noise": np.full(SIZE, np.nan)}, "noise of image 1 is not positive: expected"),
         ({"noise": [0.1, 1e300]}, r"image 2: the noise is \S+e\+\d+ times the beam or more"),
         ({"noise": "poisson", "images": with_pixel(-1)}, "negative pixels, so they are no counts"),
         ({"psf": -1.0}, "psf of image 1 is -1.0: expected a standard deviation in px or a kernel"),
@@ -110,8 +103,6 @@ def nearly_all_masked() -> FloatArray:
             {"psf": np.ones((3, 4))},
             r"psf of image 1 has shape \(3, 4\): expected a kernel with odd sides",
         ),
-        ({"psf": np.zeros((3, 3))}, r"psf of image \d has shape \(3, 3\)"),
-        ({"psf": "wide"}, r"psf of image \d is 'wide': expected numbers"),
         ({"psf": [1.0, "wide"]}, r"psf of image \d is 'wide': expected numbers"),
         ({"strength": "strong"}, "strength is 'strong': expected numbers"),
         ({"strength": [[1, 2], [3]]}, r"strengths are \(1.0, 2.0\), \(3.0,\) for 1 field"),
@@ -129,7 +120,6 @@ def nearly_all_masked() -> FloatArray:
         ),
         ({"fiducials": np.ones((2, 4))}, r"fiducials have shape \(2, 4\): expected rows of y, x"),
         ({"fiducials": [[45, 5, 0, 0, 1]]}, "fiducials lie outside the image or have no positive"),
-        ({"fiducials": [[5, 5, 0, 0, 0]]}, "fiducials lie outside the image or have no positive"),
         ({"fiducials": [[5, 5, 0, -1e300, 1]]}, "displaced by more than the image's 51 px"),
         ({"fiducials": [[5, 5, 0, 0, 1e-300]]}, "σ below 1e-06 px"),
         ({"images": images(1), "strength": [1], "source": "unknown"}, "one image and an unknown"),
@@ -160,12 +150,6 @@ def test_one_image_and_an_unknown_source_are_taken_if_asked_for() -> None:
     assert alone.unknown
     assert alone.scene.imperfect.keys == {"beam"}
     assert alone.scene.free_brightness
-
-
-def test_a_known_source_leaves_no_beam_to_be_found() -> None:
-    data = given(source=np.full(SIZE, 4.0))
-    assert not data.scene.imperfect.keys
-    assert not data.scene.free_brightness
 
 
 def test_a_source_in_other_units_is_refused_unless_gains_are_free() -> None:
@@ -264,14 +248,11 @@ def test_kernels_have_the_sum_one_and_each_image_may_have_its_own() -> None:
     assert data.scene.psf[0] == 1.5
     np.testing.assert_allclose(data.scene.psf[1], np.full((3, 5), 1 / 15))
     assert given(psf=0.7).scene.psf == [0.7, 0.7]
-
-
-def test_one_kernel_is_for_all_images_and_kernels_may_differ_in_size() -> None:
-    for kernel in (np.ones((3, 5)), np.ones((5, 3))):
-        data = given(psf=kernel)
-        assert [np.shape(psf) for psf in data.scene.psf] == [np.shape(kernel)] * 2
-    data = given(psf=[np.ones((3, 3)), np.ones((5, 5))])
-    assert [np.shape(psf) for psf in data.scene.psf] == [(3, 3), (5, 5)]
+    for psf, shapes in (
+        (np.ones((3, 5)), [(3, 5)] * 2),
+        ([np.ones((3, 3)), np.ones((5, 5))], [(3, 3), (5, 5)]),
+    ):
+        assert [np.shape(kernel) for kernel in given(psf=psf).scene.psf] == shapes
 
 
 @pytest.mark.parametrize(("align", "free"), [("none", 0), ("shift", 2), ("affine", 6)])

@@ -48,12 +48,6 @@ def dense_hessian(scene: Scene, unknowns: Unknowns) -> tuple[FloatArray, FloatAr
     return matrix, np.flatnonzero(np.diag(matrix))
 
 
-def half_log_determinant(matrix: FloatArray) -> float:
-    """Without what nothing holds: fixed unknowns, and the potential's constant."""
-    values = np.linalg.eigvalsh(matrix)
-    return float(np.log(values[values > 1e-9 * values.max()]).sum() / 2)
-
-
 def imperfect_scene() -> tuple[Scene, Unknowns]:
     """Two images of a lens that focuses, with a background and a blur; the fields and numbers."""
     scene = replace(

@@ -132,17 +132,6 @@ def test_cells_hold_the_flux_of_the_source_to_the_residual(image, boundary):
         assert inversion.cells.flux.sum() == pytest.approx(inversion.image.sum(), rel=1e-3)
 
 
-def test_both_read_outs_agree_on_a_smooth_object(phantom, image):
-    options = InversionOptions(lloyd_iterations=30)
-    dual = invert(image, options=options)
-    centroid = invert(image, options=options.model_copy(update={"readout": "centroid"}))
-    inner = np.s_[:, 3:-3, 3:-3]  # the corners are distorted by the sites moved there
-    assert relative_error(centroid.displacement[inner], dual.displacement[inner]) < 0.05
-    assert relative_error(dual.displacement, phantom.displacement) < relative_error(
-        centroid.displacement, phantom.displacement
-    )
-
-
 def test_the_papers_own_route_agrees_with_ours_on_a_smooth_object():
     blob = gaussian_blob((40, 40), 12.0, 7.0)
     image = synthetic_image(blob.displacement)
@@ -370,7 +359,6 @@ WITH_NAN = np.where(np.arange(400).reshape(20, 20) == 64, np.nan, 1.0)
         ),
         ({"image": np.ones((1, 20))}, r"image has shape \(1, 20\), expected at least 4 × 4"),
         ({"image": np.ones((20, 20), complex)}, "complex128, expected real numbers"),
-        ({"image": WITH_NAN}, "image has 1 pixels that are NaN or infinite"),
         ({"image": 0 * FLAT}, "image has no positive pixel"),
         ({"image": -FLAT, "options": {"negative": "clip"}}, "image has no positive pixel"),
         ({"image": FLAT - 2 * np.eye(20)}, "image has 20 negative pixels"),
@@ -385,7 +373,6 @@ WITH_NAN = np.where(np.arange(400).reshape(20, 20) == 64, np.nan, 1.0)
         ({"source": -FLAT}, "source has 400 negative pixels"),
         ({"source": FLAT, "plan": plan_sites(FLAT)}, "expected only one"),
         ({"image": 1e305 * FLAT}, r"image has a brightest pixel of 1e\+305, expected one between"),
-        ({"image": 1e-305 * FLAT}, "image has a brightest pixel of 1e-305, expected one between"),
         ({"source": 1e305 * FLAT}, r"source has a brightest pixel of 1e\+305"),
         (
             {"image": 1e300 * FLAT, "source": 1e-300 * FLAT},
