@@ -24,7 +24,7 @@ from napari_shadowinv.preprocessing import (
 )
 from napari_shadowinv.provenance import Provenance
 
-IMAGES, SOURCE = make_shots(4)
+IMAGES, SOURCE = make_shots(2)
 LIGHT = OpticalSetup(wavelength=532e-9, object_image_distance=0.3, pixel_size=12e-6)
 FREE = OPTIONS.model_copy(update={"boundary": "free"})
 KNOWN = OPTIONS.model_copy(update={"boundary": "free", "margin": 5, "flux": "known"})
@@ -78,10 +78,10 @@ def test_a_shot_of_a_stack_is_as_alone(name, tmp_path):
     names = (*STORED, *of_sites)
     stack = inverted_stack(shots, tmp_path, recipe, *names)
     assert (stack.status == DONE).all()
-    assert stack.potential.chunks[0] == (1,) * 4
+    assert stack.potential.chunks[0] == (1,) * 2
     assert Provenance.of(stack.attrs).recipe.steps == recipe.steps
     assert setup_from_dataset(stack) == run(recipe, replace(shots, image=shots.image[0])).setup
-    for index in (1, 3):
+    for index in range(2):
         inversion = run(recipe, replace(shots, image=shots.image[index]))
         alone = inversion.to_dataset()
         if tolerance:  # fluxes are relative to the mean

@@ -119,12 +119,12 @@ def test_a_run_killed_at_any_change_of_a_file_is_resumed_bit_by_bit(night, out, 
     np.save(night.folder / "source.npy", night.source)
     codes = []
     # While it creates the store, and writes its shots.
-    for change in (30, 60, 85, 100, 20, 30, 5, 35, 25, 12, 18, 22, 10, 20, 15, 0):
+    for change in (30, 85, 100, 20, 5, 35, 25, 12, 18, 15, 0):
         run = forked.Process(target=run_files, args=(night.folder, out, "synchronous", change))
         run.start()
         run.join()
         codes.append(run.exitcode)
-    assert codes.count(-signal.SIGKILL) > 10
+    assert codes.count(-signal.SIGKILL) > 6
     assert codes[-1] == 0
     assert whole_content(out) == whole_content(undisturbed)
     assert {path.name for path in tmp_path.iterdir()} == {"shots", out.name, undisturbed.name}

@@ -11,7 +11,6 @@ import pytest
 import xarray as xr
 
 from helpers.command_line import done, shadowinv
-from helpers.results import provenance_in
 from napari_shadowinv import InputError, read
 from napari_shadowinv.io.store import DONE, FAILED
 
@@ -103,18 +102,13 @@ def test_batch_and_info_take_arrays_of_hdf5(any_night, run_file, out, tmp_path, 
     with h5py.File(run_file, "r+") as file:
         file["entry/beam"], file["entry/usable"] = any_night.source, usable
     (tmp_path / "table.csv").write_text(f"file, mask\n{data}[1], run.h5::/entry/usable\n")
-    common = ("--source", "run.h5::/entry/beam", "--set=options.n_sites=100", "--out")
-    shadowinv("batch", data, "--mask", "run.h5::/entry/usable", *common, out)
-    shadowinv("batch", "table.csv", *common, "table.shadowinv.zarr")
-    many, row = read(out), read("table.shadowinv.zarr")
-    assert (many.status == DONE).all()
+    common = ("--source", "run.h5::/entry/beam", "--set=options.n_sites=100", "--out", out)
+    shadowinv("batch", "table.csv", *common)
+    row = read(out)
     expected = any_night.run(out.with_name("expected.shadowinv.zarr"), mask=usable > 0)
-    np.testing.assert_array_equal(many.displacement, expected.displacement)
-    np.testing.assert_array_equal(many.mask, 6 * [usable != 0])
-    np.testing.assert_array_equal(row.displacement[0], many.displacement[1])
+    np.testing.assert_array_equal(row.displacement[0], expected.displacement[1])
+    np.testing.assert_array_equal(row.mask, [usable != 0])
     assert list(row.name.values) == [f"{data}[1]"]
-    source = provenance_in(many).image.source
-    assert (source.file, source.variable) == ("run.h5", "/entry/beam")
 
     listed = done("info", data)
     assert "6 frames, run.h5[0] to run.h5[5]" in listed

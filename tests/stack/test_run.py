@@ -11,7 +11,6 @@ import xarray as xr
 from helpers.slow_reading import log_and_read
 from helpers.store_content import content
 from napari_shadowinv import (
-    FileFormatError,
     InversionOptions,
     invert,
     read,
@@ -139,10 +138,3 @@ def test_overwriting_begins_anew_and_an_old_writer_writes_nothing(night, out):
     with pytest.raises(OSError, match="is not the store the run started with"):
         old.write(0, {"potential": np.zeros(night.source.shape)}, {})
     assert content(out) == before
-
-
-def test_store_with_truncated_names_is_refused(night, out):
-    night.run(out, shots=night.images)
-    (out / "name" / "c" / "0").write_bytes(b"")
-    with pytest.raises(FileFormatError, match="is damaged"):
-        read(out)

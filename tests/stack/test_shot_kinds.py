@@ -43,12 +43,6 @@ def write_files(images: np.ndarray, folder: Path) -> list[Path]:
     return paths
 
 
-def write_pages(images: np.ndarray, folder: Path) -> Path:
-    path = folder / "shots.tif"
-    tifffile.imwrite(path, images, photometric="minisblack")
-    return path
-
-
 def write_table(images: np.ndarray, folder: Path) -> Path:
     names = [path.name for path in write_files(images, folder)]
     path = folder / "shots.csv"
@@ -68,11 +62,6 @@ def write_folder(images: np.ndarray, folder: Path) -> Path:
     return write_files(images, folder)[0].parent
 
 
-def open_netcdf(images: np.ndarray, folder: Path) -> xr.DataArray:
-    xr.Dataset({"image": (("shot", "y", "x"), images)}).to_netcdf(folder / "run.nc")
-    return xr.open_dataset(folder / "run.nc").image
-
-
 KINDS = {
     "numpy": lambda images, _: images,
     "dask of one shot": lambda images, _: da.from_array(images, chunks=(1, -1, -1)),
@@ -80,14 +69,12 @@ KINDS = {
     "xarray": lambda images, _: xr.DataArray(images, dims=("shot", "y", "x")),
     "xarray of dask": lambda images, _: xr.DataArray(images, dims=("shot", "y", "x")).chunk(),
     "dataset": lambda images, _: xr.Dataset({"image": (("shot", "y", "x"), images)}),
-    "pages": write_pages,
     "files": write_files,
     "glob": lambda images, folder: str(write_files(images, folder)[0].parent / "shot_*.tif"),
     "table": write_table,
     "array of HDF5": lambda images, folder: f"{write_hdf5(images, folder)}::/entry/data/data",
     "folder": write_folder,
     "lazy frames": lambda images, folder: read(f"{write_hdf5(images, folder)}::flat"),
-    "xarray of a file": open_netcdf,
     "h5py": lambda images, folder: h5py.File(write_hdf5(images, folder))["flat"],
     "zarr": lambda images, _: zarr.array(images),
 }

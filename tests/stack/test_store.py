@@ -76,7 +76,7 @@ def test_status_shows_names_and_reasons_as_they_are(any_night, tmp_path, monkeyp
 def test_damage_at_random_ends_in_one_of_two_errors(store, tmp_path):
     reader = fuzz.Reader()
     (tmp_path / "bad").mkdir()
-    tally = fuzz.fuzz("run.shadowinv.zarr", 30, 1, tmp_path / "bad", reader, store)
+    tally = fuzz.fuzz("run.shadowinv.zarr", 20, 1, tmp_path / "bad", reader, store)
     reader.close()
     assert tally.failures == []
     assert tally.refused >= 3

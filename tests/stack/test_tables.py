@@ -171,13 +171,10 @@ def test_what_changed_in_a_table_is_noticed(pack: Path, out: Path) -> None:
         inverted(pack, out)
     table(*ROWS)
     nearer = SETUP.model_copy(update={"object_image_distance": 0.2})
-    for changes, words in (
-        ({"setup": nearer}, r"object_image_distance: 0.3 there, 0.2 now"),
-        ({"source": beam()[:, ::-1]}, "different source image"),
-        ({"shots": [f"film{k}.npy" for k in range(3)]}, "different table of shots"),
-    ):
-        with pytest.raises(InputError, match=words):
-            inverted(**{"shots": pack, "out": out, **changes})
+    with pytest.raises(InputError, match=r"object_image_distance: 0.3 there, 0.2 now"):
+        inverted(pack, out, setup=nearer)
+    with pytest.raises(InputError, match="different table of shots"):
+        inverted([f"film{k}.npy" for k in range(3)], out)
     np.save("film1.npy", beam())
     with pytest.raises(InputError, match=r"shot 1 \(film1.npy\) has changed"):
         inverted(pack, out)

@@ -193,8 +193,8 @@ def test_a_batch_goes_on_with_the_store_of_a_watch(folder, out, tmp_path):
     assert list(read(out).name.values) == [f"shot_{i}.npy" for i in (3, 4, 1, 0)]
 
 
-def test_a_hundred_frames_cost_alike_and_leave_no_thread(folder, out, opened_paths):
-    count = 100
+def test_many_frames_cost_alike_and_leave_no_thread(folder, out, opened_paths):
+    count = 60
     opened: list[int] = []  # files, before each shot that ends
     with Watched(folder, out) as watch:
         opened_paths.clear()
