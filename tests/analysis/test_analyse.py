@@ -218,12 +218,12 @@ def test_a_wrong_choice_is_refused(
 
 
 def test_texts_and_tables_describe_the_same_products(exact: RetrievedField):
-    text = "profile 10,20 60,20"
-    table = {"product": "profile", "path": [(10, 20), (60, 20)]}
-    (alone,) = analyse(exact, text)
-    for result in analyse(exact, [text, table]):
-        assert result.product == alone.product
-        np.testing.assert_array_equal(result["magnitude"].value, alone["magnitude"].value)
+    table = {"product": "profile", "path": [(31.5, 10), (31.5, 53)], "width": 3}
+    for result in analyse(exact, ["profile 31.5,10 31.5,53 width=3", table]):
+        assert result.product == LINE
+    assert product_from_text("current center=31.5,31.5 radius=8") == CIRCLES[0]
+    corners = product_from_text("region rectangle=1,2 3,4")
+    assert corners == Region(rectangle=((1, 2), (3, 4)))
 
 
 @pytest.mark.parametrize(
@@ -293,14 +293,6 @@ def test_a_stack_is_refused(exact: RetrievedField):
 def test_a_wrong_line_of_text_is_refused(text: str, message: str):
     with pytest.raises(InputError, match=message):
         product_from_text(text)
-
-
-def test_text_describes_the_same_products():
-    circle = product_from_text("current center=31.5,31.5 radius=8")
-    assert circle == CIRCLES[0]
-    assert product_from_text("profile 31.5,10 31.5,53 width=3") == LINE
-    corners = product_from_text("region rectangle=1,2 3,4")
-    assert corners == Region(rectangle=((1, 2), (3, 4)))
 
 
 def test_masked_pixels_under_a_line_are_reported(ring: Phantom):

@@ -27,14 +27,14 @@ def test_a_plane_is_sampled_exactly_at_its_place_in_the_world() -> None:
     assert np.isnan(interpolate(plane, np.array([[-1.0, 0.0]]), lambda at: at)).all()
 
 
-def test_a_table_names_each_unit_once() -> None:
+def test_a_table_names_each_unit_once_and_what_is_averaged() -> None:
     profiles = [
-        Profile("a potential (nm)", "nm", np.array([1.0, 2.0])),
+        Profile("a potential (nm)", "nm", np.array([1.0, 2.0]), "mean over 5 px"),
         Profile("re-projection", "flux/px²", np.array([np.nan, 4.0])),
     ]
     text = table_text(np.array([0.0, 1.5]), "µm", profiles)
     assert text.splitlines() == [
-        "distance (µm),a potential (nm),re-projection (flux/px²)",
+        'distance (µm),"a potential (nm), mean over 5 px",re-projection (flux/px²)',
         "0,1,nan",
         "1.5,2,4",
     ]
@@ -75,13 +75,6 @@ def test_a_strip_of_whole_pixels_is_the_mean_of_their_rows() -> None:
     strip = sample_strip(path, distance, 3.0, 1.0)
     np.testing.assert_allclose(np.ptp(strip[:, distance < 9.5, 0], axis=0), 2)
     np.testing.assert_allclose(np.ptp(strip[:, distance > 10.5, 1], axis=0), 2)
-
-
-def test_the_table_tells_what_is_averaged() -> None:
-    profile = Profile("height", "nm", np.array([1.0]), "mean over 5 px")
-    assert table_text(np.zeros(1), "µm", [profile]).splitlines()[0] == (
-        'distance (µm),"height (nm), mean over 5 px"'
-    )
 
 
 def test_measures_of_a_gaussian_are_those_of_its_formula() -> None:

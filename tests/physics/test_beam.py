@@ -50,8 +50,6 @@ def test_setup_with_units_equals_the_one_in_si() -> None:
         ("-.5 km", "m", -500.0),
         ("700 keV", "MeV", 0.7),
         ("1 GeV", "MeV", 1000.0),
-        ("14.7 MeV", "MeV", 14.7),
-        ("25 m", "m", 25.0),
         ("0.28", "m", 0.28),
         ("inf", "m", math.inf),
         ("Infinity", "m", math.inf),  # of JSON
@@ -126,16 +124,11 @@ WRONG = {
     "pixel in um": ({**FILM, "pixel_size": 5.0}, "a pixel is 5 m"),
     "pixel in mm": ({**FILM, "pixel_size": 5e-3}, "a pixel is 5 mm"),
     "pixel in pm": ({**FILM, "pixel_size": 5e-9}, "a pixel is 5 nm"),
-    "scan in mm": ({**SCAN, "detector_pixel_size": 0.145}, "a pixel is 5 mm"),
     "detector as object": ({**FILM, "pixel_size": 145e-6}, "field of view of 2.9 cm"),
     "object as detector": ({**SCAN, "detector_pixel_size": 1.5e-6}, "1.5 µm at the detector"),
     "distances in mm": (
         {**FILM, "source_object_distance": 10.0, "object_image_distance": 280.0},
         "280 m behind",
-    ),
-    "distances in cm": (
-        {**FILM, "source_object_distance": 1.0, "object_image_distance": 28.0},
-        "28 m behind",
     ),
     "source in mm": ({**FILM, "source_object_distance": 10.0}, "magnification is 1.03"),
     "detector in cm": ({**FILM, "object_image_distance": 28.0}, "magnification is 2.8e+03"),
@@ -145,7 +138,6 @@ WRONG = {
     ),
     "to detector": ({**FILM, "source_object_distance": 0.29}, "source to object, not to"),
     "energy in keV": ({**FILM, "energy": 14.7e3}, "protons of 14700 MeV"),
-    "energy times ten": ({**FILM, "energy": 147.0}, "protons of 147 MeV"),
     "energy in GeV": ({**FILM, "energy": 0.0147}, "protons of 0.0147 MeV"),
     "wavelength in mm": ({**LIGHT, "wavelength": 532e-6}, "wavelength is 532 µm"),
     "light in mm": ({**LIGHT, "object_image_distance": 300.0}, "300 m behind"),

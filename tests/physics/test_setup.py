@@ -150,14 +150,6 @@ def test_potential_in_metres_gives_the_displacement_in_pixels(proton: ProtonSetu
         displacement_from_potential(np.zeros(7))
 
 
-def test_megagauss_micrometres(proton: ProtonSetup) -> None:
-    """1 MG is 100 T and 1 µm is 1e-6 m."""
-    displacement = np.ones((2, 2, 2))
-    in_tesla_metres = proton.path_integrated_b(displacement, "T m")
-    in_megagauss = proton.path_integrated_b(displacement, "MG um")
-    np.testing.assert_allclose(in_tesla_metres, in_megagauss * 1e-4)
-
-
 def test_known_uniform_electric_field(proton: ProtonSetup) -> None:
     """A field along +x of 1 GV/m over 1 mm pushes a proton to +x by q E L / (p v)."""
     momentum = 166.74e6 * ELECTRONVOLT / LIGHT_SPEED
