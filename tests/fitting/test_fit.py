@@ -256,27 +256,21 @@ def test_a_shot_without_the_object_is_one_more_image() -> None:
 
 
 @pytest.mark.usefixtures("no_causes")
-@pytest.mark.parametrize("boundary", ["fading", "free"])
-def test_an_object_that_the_edge_cuts_is_told(boundary: Any) -> None:
+@pytest.mark.parametrize(
+    ("size", "middle", "boundary"),
+    # 61 px are filled to 64, all on the right.
+    [(SIZE, (0, 30), "fading"), (SIZE, (0, 30), "free"), ((40, 61), (20, 60), "fading")],
+)
+def test_an_object_that_the_edge_cuts_is_told(
+    size: tuple[int, int], middle: tuple[int, int], boundary: Any
+) -> None:
     """A converged answer that explains both images, and is off by a quarter and more."""
-    cut = bump(0.7, 8, (0, 30))
-    images = [counted(lambda y, x: s * cut(y, x), SIZE) for s in (1, 0.7)]  # noqa: B023
+    cut = bump(0.7, 8, middle)
+    images = [counted(lambda y, x: s * cut(y, x), size) for s in (1, 0.7)]  # noqa: B023
     options = FitOptions(samples=2, spacing=0.25, boundary=boundary)
-    shots = shots_of(noisy(images, 0.02), strength=[1, 0.7], source=np.ones(SIZE), noise=0.02)
+    shots = shots_of(noisy(images, 0.02), strength=[1, 0.7], source=np.ones(size), noise=0.02)
     result = fit(shots, options=options)
     assert result.chi2.max() < 1.3
-    assert result.verdict is Verdict.EDGE
-    assert "larger field of view" in result.explanation
-
-
-@pytest.mark.usefixtures("no_causes")
-def test_an_object_cut_by_the_end_of_a_filled_side_is_reported() -> None:
-    """61 px are filled to 64, all on the right."""
-    size = (40, 61)
-    cut = bump(0.7, 8, (20, 60))
-    images = [counted(lambda y, x: s * cut(y, x), size) for s in (1, 0.7)]  # noqa: B023
-    options = PLAIN.model_copy(update={"samples": 2})
-    result = fit(shots_of(noisy(images, 0.02), strength=[1, 0.7], noise=0.02), options=options)
     assert result.verdict is Verdict.EDGE
     assert "larger field of view" in result.explanation
 

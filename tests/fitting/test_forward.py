@@ -150,6 +150,7 @@ def test_masked_pixels_do_not_matter(scene: Scene) -> None:
     spoilt_value, slope_there = spoilt.value_and_gradient(unknowns, counts)
     assert spoilt_value == value
     np.testing.assert_array_equal(slope_there.flat(), slope.flat())
+    assert scene.value(unknowns, counts) == value
 
 
 def test_pushed_is_the_change_of_residuals(scene: Scene) -> None:
@@ -173,12 +174,6 @@ def test_pulled_is_the_transpose_of_pushed(scene: Scene) -> None:
     pushed = scene.linear(unknowns, counts).push(change) * residuals
     pulled = scene.linear(unknowns, counts).pull(residuals)
     assert abs(pushed.sum() - along(pulled, change)) < 1e-12 * np.abs(pushed).sum()
-
-
-def test_the_value_alone_is_that_with_the_gradient(scene: Scene) -> None:
-    unknowns = some(scene)
-    counts = scene.ray_counts(unknowns)
-    assert scene.value(unknowns, counts) == scene.value_and_gradient(unknowns, counts)[0]
 
 
 @pytest.mark.parametrize("everything", [True, False])

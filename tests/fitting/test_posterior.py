@@ -223,18 +223,16 @@ def test_the_likeliest_smoothness_is_that_of_the_field(true: float) -> None:
     assert 0.5 < smoothness[0, 0] / true < 2
 
 
-def test_moved_by_beams_is_the_response_of_the_best_field() -> None:
+def test_moved_by_beams_is_the_response_of_the_best_field(
+    tiny: tuple[Scene, Unknowns, FloatArray, FloatArray],
+) -> None:
     """Against a dense solution, with the images' change by differences."""
-    scene = weak_scene((12, 16), (30.0, 100.0))
-    unknowns = scene.nothing()
-    y, x = np.indices(scene.rays.shape)
-    unknowns.potentials[0] = 2 * np.exp(-((y - 6) ** 2 + (x - 7) ** 2) / 6)
+    scene, unknowns, matrix, free = tiny
     wave = np.cos(np.arange(scene.beams.shape[2]) / 4) * np.ones(scene.beams.shape)
     counts = scene.ray_counts(unknowns)
     brighter = replace(scene, beams=scene.beams * (1 + 0.01 * wave))
     change = brighter.model(unknowns, counts) - scene.model(unknowns, counts)
     residuals = np.sqrt(scene.weights) * change
-    matrix, free = dense_hessian(scene, unknowns)
     slope = scene.linear(unknowns, counts).pull(residuals).flat()[free]
     expected = unknowns.flat() * 0
     expected[free] = np.linalg.pinv(matrix[np.ix_(free, free)], rcond=1e-10, hermitian=True) @ slope

@@ -54,6 +54,9 @@ def random_grid(seed=0, strength=50.0, nodes=12, electric=0.0):
     )
 
 
+EMPTY = FieldGrid(np.zeros((3, 4, 4, 4)), spacing=(1e-4,) * 3)
+
+
 def aims(count=50, spread=20.0, seed=1):
     return np.random.default_rng(seed).uniform(-spread, spread, (2, count))
 
@@ -191,7 +194,7 @@ def test_free_flight_is_magnified_exactly():
     outside = np.abs(particles.aim).max(axis=0) > 30
     np.testing.assert_array_equal(particles.landing[:, outside], particles.aim[:, outside])
     np.testing.assert_array_equal(particles.landing, particles.aim)
-    traced = trace(FieldGrid(np.zeros((3, 4, 4, 4)), spacing=(1e-4,) * 3), SETUP, (20, 30))
+    traced = trace(EMPTY, SETUP, (20, 30))
     np.testing.assert_array_equal(traced.displacement, 0)
     np.testing.assert_allclose(traced.image, 1, rtol=1e-12)
 
@@ -282,49 +285,38 @@ def test_results_depend_on_the_seed_and_not_on_the_number_of_threads():
 
 def test_source_size_spreads_by_the_magnification_less_one():
     options = TraceOptions(output="counts", counts=100, source_size=4e-5, keep_particles=True)
-    traced = trace(
-        FieldGrid(np.zeros((3, 4, 4, 4)), spacing=(1e-4,) * 3), SETUP, (50, 50), options=options
-    )
-    particles = traced.particles
+    particles = trace(EMPTY, SETUP, (50, 50), options=options).particles
     spread = np.std(particles.landing - particles.aim, axis=1)
     magnification = SETUP.magnification
     expected = 4e-5 * (magnification - 1) / magnification / SETUP.object_pixel_size
     np.testing.assert_allclose(spread, expected, rtol=5e-3)
 
 
-def test_spectrum_is_drawn_as_tabulated():
+def test_energies_are_those_of_a_table_or_gaussian():
     options = TraceOptions(output="counts", counts=100, keep_particles=True)
-    grid = FieldGrid(np.zeros((3, 4, 4, 4)), spacing=(1e-4,) * 3)
-    traced = trace(
-        grid, SETUP, (50, 50), options=options, spectrum=[[1.0, 3.0, 4.0], [0.0, 2.0, 0.0]]
-    )
-    energy = traced.particles.energy  # a triangle from 1 over 3 to 4
+    spectrum = [[1.0, 3.0, 4.0], [0.0, 2.0, 0.0]]  # a triangle from 1 over 3 to 4
+    energy = trace(EMPTY, SETUP, (50, 50), options=options, spectrum=spectrum).particles.energy
     assert energy.mean() == pytest.approx(8 / 3, rel=2e-3)
     assert energy.var() == pytest.approx((1 + 9 + 16 - 3 - 4 - 12) / 18, rel=5e-3)
     assert (energy < 3).mean() == pytest.approx(2 / 3, rel=2e-3)
-
-
-def test_energy_spread_is_gaussian():
-    options = TraceOptions(output="counts", counts=100, keep_particles=True, energy_spread=0.5)
-    grid = FieldGrid(np.zeros((3, 4, 4, 4)), spacing=(1e-4,) * 3)
-    energy = trace(grid, SETUP, (50, 50), options=options).particles.energy
+    options = options.model_copy(update={"energy_spread": 0.5})
+    energy = trace(EMPTY, SETUP, (50, 50), options=options).particles.energy
     assert energy.mean() == pytest.approx(SETUP.energy, rel=1e-3)
     assert energy.std() == pytest.approx(0.5, rel=5e-3)
 
 
 def test_profile_shapes_the_beam():
-    grid = FieldGrid(np.zeros((3, 4, 4, 4)), spacing=(1e-4,) * 3)
     plane = np.arange(1.0, 401.0).reshape(20, 20)
-    np.testing.assert_allclose(trace(grid, SETUP, (20, 20), profile=plane).image, plane)
+    np.testing.assert_allclose(trace(EMPTY, SETUP, (20, 20), profile=plane).image, plane)
 
     def tilted(y, x):
         return 2 + x / 1e-3 + 3 * y / 1e-3
 
-    traced = trace(grid, SETUP, (20, 20), profile=tilted)
+    traced = trace(EMPTY, SETUP, (20, 20), profile=tilted)
     y, x = (np.mgrid[:20, :20] - 9.5) * 2e-5
     np.testing.assert_allclose(traced.image, tilted(y, x), rtol=1e-9)
     options = TraceOptions(output="counts", counts=400)
-    counts = trace(grid, SETUP, (20, 20), profile=plane, options=options)
+    counts = trace(EMPTY, SETUP, (20, 20), profile=plane, options=options)
     assert counts.source.mean() == pytest.approx(400)
     chi2 = np.mean((counts.image - counts.source) ** 2 / counts.source)
     assert 0.8 < chi2 < 1.2
