@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import tomllib
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,6 @@ import yaml
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / ".github" / "workflows"
 NAMES = ("containers", "docs", "lint", "nightly", "release", "tests", "wheels")
-
-RUNNERS = {"ubuntu-latest", "macos-latest", "windows-latest"}
 
 
 def loaded(path: Path) -> Any:
@@ -76,10 +73,10 @@ def test_the_tests_run_on_every_system_python_and_binding() -> None:
     pythons = [
         match[1] for name in classifiers if (match := re.search(r"Python :: (3\.\d+)$", name))
     ]
-    assert set(matrix["os"]) == RUNNERS
-    assert matrix["python"] == pythons == ["3.11", "3.12", "3.13", "3.14"]
+    assert set(matrix["os"]) == {"ubuntu-latest", "macos-latest", "windows-latest"}
+    assert matrix["python"] == pythons
     assert matrix["qt"] == ["pyqt6", "pyside6"]
-    assert len(list(product(*matrix.values()))) == 24
+    assert len(matrix) == 3
     assert job["env"] == dict.fromkeys(("QT_API", "PYTEST_QT_API"), "${{ matrix.qt }}")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from napari_shadowinv.geometry.density import Density
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 
@@ -11,6 +12,13 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 def power_diagram(sites, density, weights=None) -> PowerDiagram:
     triangulation = RegularTriangulation(sites, weights, region=density.region)
     return PowerDiagram(triangulation, density, with_moments=True)
+
+
+def residual(level, weights, image) -> float:
+    """Return the largest relative flux error of a cell of a level's sites."""
+    triangulation = RegularTriangulation(level.sites, weights)
+    masses = PowerDiagram(triangulation, Density.from_image(image)).masses
+    return np.max(np.abs(masses - level.mass) / level.mass)
 
 
 def clipped(polygon: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:

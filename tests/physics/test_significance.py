@@ -41,13 +41,10 @@ def test_one_component_is_its_ratio_to_its_own_deviation():
     np.testing.assert_array_equal(deviation_along(displacement, std), 0.5)
 
 
-def test_equal_deviations_count_in_every_direction_alike():
+def test_significance_is_linear_in_the_field_and_has_no_unit_and_direction():
     angle = np.linspace(0, 2 * np.pi, 17)
     displacement = 3 * np.stack([np.sin(angle), np.cos(angle)])
     np.testing.assert_allclose(significance(displacement, np.full((2, 17), 0.6)), 5.0)
-
-
-def test_significance_is_linear_in_the_field_and_has_no_unit():
     displacement, std = smooth_noise(0), 0.1 + np.abs(smooth_noise(1))
     np.testing.assert_allclose(
         significance(-3e-9 * displacement, 1e-9 * std), 3 * significance(displacement, std)
@@ -68,14 +65,11 @@ def test_structures_are_numbered_by_their_significance():
     assert structures.largest == 20.0
 
 
-def test_patches_below_the_level_of_chance_are_no_structures():
+def test_patches_below_the_level_of_chance_or_too_small_are_no_structures():
     limit = np.sqrt(2 * np.log(20 * 2000))
     structures = find_structures(patches(limit - 0.01, limit + 0.01))
     assert structures.limit == pytest.approx(limit)
     assert structures.peaks == (limit + 0.01,)
-
-
-def test_small_regions_are_no_structures():
     plane = patches(20.0)
     plane[20:22, 20:24] = 20.0  # 8 px
     assert find_structures(plane).peaks == (20.0,)

@@ -5,6 +5,7 @@ import re
 import numpy as np
 import pytest
 
+from helpers.polygons import residual
 from napari_shadowinv import InversionOptions, invert
 from napari_shadowinv.geometry.density import Density, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
@@ -74,12 +75,6 @@ HARD = {
 
 def planned(source, n_sites=2000):
     return plan_levels(source / source.mean(), n_sites, lloyd_iterations=5)
-
-
-def residual(level, weights, image):
-    triangulation = RegularTriangulation(level.sites, weights)
-    masses = PowerDiagram(triangulation, Density.from_image(image)).masses
-    return np.max(np.abs(masses - level.mass) / level.mass)
 
 
 def residual_when_blurred(level, weights, image, width, parts=8):

@@ -5,10 +5,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from helpers.polygons import residual
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv.errors import InputError, InversionCancelled
 from napari_shadowinv.geometry.density import Density
-from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.options import InversionOptions
 from napari_shadowinv.physics.forward import synthetic_image
@@ -27,12 +27,6 @@ def bright_spot(shape=(40, 50)):
 @pytest.fixture(scope="module")
 def plan():
     return plan_levels(np.ones((40, 50)), 2000, lloyd_iterations=5)
-
-
-def residual(level, weights, image):
-    triangulation = RegularTriangulation(level.sites, weights)
-    masses = PowerDiagram(triangulation, Density.from_image(image)).masses
-    return np.max(np.abs(masses - level.mass) / level.mass)
 
 
 @pytest.mark.parametrize("tolerance", [1e-1, 1e-3, 1e-8])

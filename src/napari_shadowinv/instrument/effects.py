@@ -173,7 +173,7 @@ class Background(PixelResponse):
         return light + size * number, 1.0, np.full(light.shape, size)
 
     def light(self, recorded: FloatArray, size: float, number: float) -> Derived:
-        light = recorded + size * number
+        light = recorded - size * number
         is_lit, light = light > DARKEST, np.maximum(light, DARKEST)
         return light, is_lit * recorded / light, np.where(is_lit, -size / light, 0.0)
 
