@@ -72,6 +72,14 @@ def assumed() -> Fit:
         return fitted(shots(), Instrument(), options=HASTY)
 
 
+@pytest.fixture(scope="module")
+def unsure() -> Fit:
+    """Fit of the same images, which may have a background of 5 %."""
+    options = FEW.model_copy(update={"sampling": "linear"})
+    with without_causes():
+        return fitted(shots(), Instrument(**EXACT_BEAM, background=0.05), options=options)
+
+
 def error(result: Fit) -> float:
     return distance(result.fields[0].displacement, on_pixels(RING, SIZE))
 
@@ -172,13 +180,10 @@ def test_errors_have_a_part_for_all_that_is_stated() -> None:
     assert restored.report.numbers == result.report.numbers
 
 
-def test_fitted_samples_are_compared_with_those_to_first_order() -> None:
+def test_fitted_samples_are_compared_with_those_to_first_order(unsure: Fit) -> None:
     """A background of 5 % acts almost linearly; what does not is reported with its remedy."""
-    instrument = Instrument(**EXACT_BEAM, background=0.05)
-    fits = [
-        fitted(shots(), instrument, options=FEW.model_copy(update={"sampling": sampling}))
-        for sampling in ("linear", "resolve")
-    ]
+    options = FEW.model_copy(update={"sampling": "resolve"})
+    fits = [unsure, fitted(shots(), unsure.instrument, options=options)]
     linear, solved = (each.report for each in fits)
     assert (linear.sampling, solved.sampling) == ("linear", "resolve")
     totals = [each.total_error for each in fits]
@@ -226,7 +231,7 @@ def test_stated_correlation_of_noise_widens_the_errors(assumed: Fit) -> None:
     assert by_noise[0] == pytest.approx(np.sqrt(4 * np.pi) * by_noise[1])
 
 
-def test_each_fit_states_its_sensitivities(plain: Fit) -> None:
+def test_each_fit_states_its_sensitivities(plain: Fit, unsure: Fit) -> None:
     """By as much as fits of changed images move."""
     names = {name.partition(",")[0] for name in plain.errors.sensitivities}
     assert names == {"gamma", "blur", "background", "absorption"}
@@ -237,7 +242,6 @@ def test_each_fit_states_its_sensitivities(plain: Fit) -> None:
     assert stated == pytest.approx(size, rel=0.35)
     text = {fact.title: fact.text for fact in plain.facts}["Sensitivity"]
     assert "(background, 5 %)" in text
-    unsure = fitted(shots(), Instrument(**EXACT_BEAM, background=0.05), options=HASTY)
     assert "background" not in {fact.title: fact.text for fact in unsure.facts}["Sensitivity"]
 
 
