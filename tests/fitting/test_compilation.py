@@ -94,17 +94,17 @@ of_transport.ensure_compiled()
 compiled = count()
 assert sum(compiled.values()) > 10
 LaplacianSolver.__init__.__kwdefaults__["nodes_per_block"] = 700  # blocks of nodes on two levels
-y, x = np.indices((120, 100)) / 100
-for rows in (40, 120):
+y, x = np.indices((100, 100)) / 100
+for rows in (40, 100):
     source = 1 + x[:rows]
     invert(1 + y[:rows] * x[:rows], source=source, options=InversionOptions(n_sites=source.size))
 print(added(compiled))
 
-compilation.is_compiled = lambda: False
+compilation.is_compiled, of_transport.is_compiled = lambda: False, lambda: True
 compilation.ensure_compiled()
-compilation.is_compiled = of_transport.is_compiled = lambda: True
+compilation.is_compiled = lambda: True
 compiled = count()
-y, x = np.indices((36, 48)) / 10
+y, x = np.indices((32, 40)) / 10
 image = 1 + 0.1 * np.sin(y) * np.cos(x)
 shots = shots_of([image, 1 + 0.5 * (image - 1)], strength=[1, 0.5], noise=0.02)
 fit(shots, options=FitOptions(samples=2, max_iterations=2, align="affine"))
