@@ -35,7 +35,6 @@ from napari_shadowinv.preprocessing import (
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
-    TotalVariationEstimate,
     UniformEstimate,
     remove_hot_pixels,
 )
@@ -103,11 +102,6 @@ def patchy_beam(width: float, seed: int = 2) -> FloatArray:
     noise = np.random.default_rng(seed).normal(size=SHAPE)
     patches = LowPassFilter(width=width).filter_image(noise)
     return np.exp(0.28 * (patches - patches.mean()) / patches.std())
-
-
-def clipped_beam() -> FloatArray:
-    y, x = grid()
-    return np.where(x + 0.35 * y < 150, 1.0, 0.3)
 
 
 def displacement_error(shot: Scene, source: FloatArray) -> float:
@@ -202,13 +196,6 @@ def source_pictures() -> None:
         "low-pass, width 10 px",
         patchy,
         LowPassEstimate(width=10).source(patchy.shot),
-    )
-    clipped = scene(clipped_beam(), small_objects(), row=67)
-    source_picture(
-        "total-variation",
-        "total-variation, weight 1 px",
-        clipped,
-        TotalVariationEstimate(weight=1.0).source(clipped.shot),
     )
     mask = np.hypot((y - 78) / 38, (x - 102) / 50) > 1
     uneven = scene(patchy_beam(22, seed=9), big_object())

@@ -11,7 +11,6 @@ from napari_shadowinv import InputError, invert
 from napari_shadowinv._napari import commands, jobs
 from napari_shadowinv._napari.layer_metadata import (
     KEY,
-    is_estimate,
     result_of,
     role_of,
     setup_of,
@@ -77,15 +76,6 @@ def test_filters_take_hot_pixels_and_slopes(viewer, noisy):
     assert abs(slope) < 60  # 167 before
 
 
-def test_the_estimate_is_a_source_of_the_same_flux(viewer, shot, proton_setup):
-    ((data, keywords, _),) = commands.estimate_source(add_shot(viewer, shot, proton_setup))
-    assert role_of(keywords) == "source"
-    assert is_estimate(keywords)
-    assert setup_of(keywords) == proton_setup
-    assert data.sum() == pytest.approx(shot.sum())
-    assert data.std() < 0.5 * shot.std()
-
-
 def test_a_wrong_layer_is_one_sentence(viewer, shot):
     points = viewer.add_points(np.zeros((2, 2)))
     colours = viewer.add_image(np.zeros((5, 6, 3)), rgb=True, name="colours")
@@ -94,7 +84,7 @@ def test_a_wrong_layer_is_one_sentence(viewer, shot):
         points: "'Points' is of type Points: select a grey image",
         colours: "'colours' is a colour image: select a grey image",
     }
-    for command in (commands.invert_uniform, commands.high_pass, commands.estimate_source):
+    for command in (commands.invert_uniform, commands.high_pass):
         for layer, words in grey.items():
             with pytest.raises(InputError, match=words):
                 command(layer)

@@ -24,7 +24,6 @@ from napari_shadowinv.preprocessing import (
     LowPassFilter,
     PolynomialEstimate,
     Recipe,
-    TotalVariationEstimate,
     UniformEstimate,
 )
 from napari_shadowinv.shot import Shot
@@ -137,14 +136,3 @@ def test_a_quick_estimate_is_close_to_the_exact_one(estimate: Estimate) -> None:
     exact = estimate.source(beam, usable)
     assert quick[usable].sum() == pytest.approx(beam[usable].sum(), rel=1e-9)
     assert abs(quick - exact)[usable].max() < 0.03 * exact.max()
-
-
-def test_a_quick_total_variation_removes_the_object_and_keeps_the_edge() -> None:
-    y, x = np.mgrid[:90, :120]
-    beam = np.where(x < 60, 100.0, 60.0)
-    shot = beam + 30 * (np.hypot(y - 45, x - 30) < 5)
-    estimate = TotalVariationEstimate(weight=1.0)
-    quick, exact = quick_source(estimate, shot, None, 3000), estimate.source(shot, None)
-    away = abs(x - 59.5) > 6
-    assert abs(quick - exact)[away].max() < 3
-    assert abs(quick - beam)[away].max() < 5

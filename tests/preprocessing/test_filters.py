@@ -12,7 +12,6 @@ from napari_shadowinv.preprocessing import (
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
-    TotalVariationEstimate,
     fit_polynomial,
     remove_hot_pixels,
 )
@@ -253,7 +252,6 @@ WRONG_VALUES = [
     (ButterworthFilter, {"kind": "band"}), (BackgroundFilter, {"degree": 2.5}),
     (BackgroundFilter, {"degree": 11}), (BackgroundFilter, {"kind": "add"}),
     (PolynomialEstimate, {"degree": -1}), (LowPassEstimate, {"width": 0}),
-    (TotalVariationEstimate, {"weight": -1}), (TotalVariationEstimate, {"iterations": 0}),
 ]  # fmt: skip
 
 

@@ -16,7 +16,6 @@ from napari_shadowinv.preprocessing import (
     IsotropicEstimate,
     LowPassEstimate,
     PolynomialEstimate,
-    TotalVariationEstimate,
     UniformEstimate,
     remove_hot_pixels,
     uniform_cautions,
@@ -32,7 +31,6 @@ SOURCES = {
     "gaussian": GaussianEstimate().source,
     "polynomial": PolynomialEstimate().source,
     "low pass": LowPassEstimate(width=6).source,
-    "total variation": TotalVariationEstimate(iterations=200).source,
 }
 ALL = pytest.mark.parametrize("estimate", SOURCES.values(), ids=SOURCES.keys())
 
@@ -152,28 +150,6 @@ def test_blurring_under_a_mask_keeps_a_flat_beam_flat_far_from_any_usable_pixel(
     )
 
 
-def test_total_variation_lowers_a_disc_by_twice_the_weight_over_its_radius():
-    y, x = np.mgrid[:80, :80] - 39.5
-    disc = np.hypot(y, x) < 10
-    image = 700 * (1 + 0.5 * disc)
-    for weight in (0.5, 1.0):
-        beam = TotalVariationEstimate(weight=weight, iterations=2000).source(image)
-        height = beam[38:42, 38:42].mean() - beam[:10, :10].mean()
-        lowered = 350 - height
-        assert lowered == pytest.approx(2 * weight / 10 * image.mean(), rel=0.1)
-
-
-def test_total_variation_keeps_an_edge_that_a_blur_washes_out():
-    edge = np.where(np.arange(80) < 40, 1.0, 3.0) * np.ones((80, 1))
-    edge[20:26, 20:26] *= 1.3
-    with_edge = TotalVariationEstimate().source(edge)
-    washed_out = LowPassEstimate(width=10.0).source(edge)
-    assert with_edge[60, 40] - with_edge[60, 39] > 1.4
-    assert washed_out[60, 40] - washed_out[60, 39] < 0.1
-    for beam in (with_edge, washed_out):
-        assert abs(beam[22, 22] / beam[60, 22] - 1) < 0.1
-
-
 def gap(shape, radius):
     y, x = (np.arange(side) - 0.5 * side for side in shape)
     return np.hypot(y[:, None], x) > radius
@@ -252,12 +228,10 @@ class Stop:
         (lambda image, _, stop: GaussianEstimate().source(image, None, stop), 8),
         (lambda image, _, stop: PolynomialEstimate(degree=10).source(image, None, stop), 5),
         (LowPassEstimate(width=200).source, 2),
-        (TotalVariationEstimate().source, 40),
         (lambda image, _, stop: BackgroundFilter(degree=10).filter_image(image, None, stop), 5),
         (lambda image, _, stop: remove_hot_pixels(image, should_stop=stop), 4),
     ],
-    ids=["gaussian", "polynomial", "low pass", "total variation", "background",
-         "hot pixels"],
+    ids=["gaussian", "polynomial", "low pass", "background", "hot pixels"],
 )  # fmt: skip
 def test_work_ends_at_the_look_that_asks_to_stop(work, min_looks):
     shape = (128, 128)

@@ -97,16 +97,6 @@ def high_pass(selection: _Selection, _: ShouldStop) -> results.LayerData:
     return [_derived(selection, image, f"high-pass σ={width:.3g} px")]
 
 
-@_in_thread("Estimating the source of")
-def estimate_source(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
-    """Estimate the undisturbed beam as the image of least total variation near the selected one."""
-    estimate = preprocessing.TotalVariationEstimate()
-    source = estimate.source(selection.shot.image, should_stop=should_stop)
-    made_from = {"image": selection.name, "estimate": "total variation"}
-    title = "source by total variation"
-    return [_derived(selection, source, title, role=about.SOURCE, made_from=made_from)]
-
-
 @viewer_sync.notify_errors(otherwise=list)
 def crop(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None

@@ -6,7 +6,6 @@ from .estimates import (
     KrigedEstimate,
     LowPassEstimate,
     PolynomialEstimate,
-    TotalVariationEstimate,
     UniformEstimate,
     uniform_cautions,
 )
@@ -61,7 +60,6 @@ __all__ = [
     "Rotate",
     "Shift",
     "Step",
-    "TotalVariationEstimate",
     "UniformEstimate",
     "check_masks",
     "estimate_source",

@@ -7,7 +7,6 @@ none was recorded, or the beam changes from shot to shot, it must be estimated f
 - a point shines evenly in all directions: `IsotropicEstimate`; how far away: `point_distance`
 - the beam is a Gaussian spot: `GaussianEstimate`
 - the beam varies slowly, in no known way: `PolynomialEstimate`, `LowPassEstimate`
-- the beam has edges that matter: `TotalVariationEstimate`
 - the beam is smooth and random, and visible around the object: `KrigedEstimate`
 - their base class: `Estimate`
 
@@ -78,7 +77,7 @@ class Estimate(Choice):
             True where a pixel is usable; the others (dead areas, handwriting, a shadow) may hold
             anything, NaN too, and are filled in. Default: all are usable.
         should_stop : callable, optional
-            Asked at each step of estimates that take long, of total variation before the first.
+            Asked at each step of estimates that take long.
         on_caution : callable, optional
             Receives a `Caution` if the source is doubtful. Default: `warnings.warn` with its text.
 
@@ -207,57 +206,6 @@ def _blur_masked(
     report("source", 1, 2)
     blurred = blur(np.where(usable, values, 0.0))
     return blurred / np.maximum(support, least), support >= least
-
-
-class TotalVariationEstimate(Estimate):
-    """The shot without small structures, but with its edges.
-
-    A disc of radius r px is lowered by 2·weight/r of the image's mean. Unusable pixels are first
-    filled in from around them. The iterations take 10 s a megapixel and cannot be stopped.
-
-    References
-    ----------
-    A. Chambolle, "An algorithm for total variation minimization and applications", Journal
-    of Mathematical Imaging and Vision 20, 89 (2004).
-    """
-
-    title = "total variation"
-    place = 60
-    method: Literal["total-variation"] = "total-variation"
-    weight: float = Field(
-        default=2.0,
-        gt=0,
-        allow_inf_nan=False,
-        title="Weight (px)",
-        description="Strength of the smoothing, in px: c·r/2 removes a disc of radius r px and "
-        "contrast c.",
-        json_schema_extra={"slider": [0.05, 20.0]},
-    )
-    iterations: int = Field(
-        default=1000,
-        ge=1,
-        description="Maximum iterations; an object of radius r px needs about r².",
-    )
-
-    def _estimate(
-        self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
-    ) -> FloatArray:
-        from skimage.restoration import denoise_tv_chambolle
-
-        complete = values if usable.all() else pixels.fill_masked(values, usable, report)
-        mean = values[usable].mean()
-        report("source", 0)
-        relative = (complete / mean).astype(np.float32)
-        # By scikit-image's own tolerance, fields would change by 17 to 64 times their noise error.
-        smooth: FloatArray = denoise_tv_chambolle(  # type: ignore[no-untyped-call]
-            relative, self.weight, eps=1e-7, max_num_iter=self.iterations
-        )
-        return pixels.with_flux_of(mean * smooth.astype(np.float64), values, usable)
-
-    def coarsen(self, factor: int) -> Estimate:
-        # A step reaches one pixel farther: fewer steps go as far in larger pixels.
-        steps = max(1, self.iterations // factor**2)
-        return super().coarsen(factor).model_copy(update={"iterations": steps})
 
 
 class KrigedEstimate(Estimate):
