@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
-from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
+from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution, OnCaution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
@@ -57,16 +57,11 @@ from napari_shadowinv.transport.sites import SitePlan
 
 @dataclass
 class Cache:
-    """Sites and estimated source of the last run, for the next one with the same beam or image."""
+    """Sites of the last run, for the next one with the same beam."""
 
     hits: int = 0  # how often sites were used again
-    _plan: tuple[str, FloatArray, BoolArray | None, SitePlan] | None = field(
-        default=None, repr=False
-    )
+    _plan: tuple[str, FloatArray, BoolArray, SitePlan] | None = field(default=None, repr=False)
     _solved: tuple[SitePlan, Inversion] | None = field(default=None, repr=False)
-    _estimated: (
-        tuple[tuple[Estimate, bool], FloatArray, BoolArray | None, FloatArray, list[Caution]] | None
-    ) = field(default=None, repr=False)
 
     def plan(
         self,
@@ -80,9 +75,11 @@ class Cache:
     ) -> SitePlan:
         """Return the sites for a source, computed only if anything about them has changed."""
         key = f"{options.site_key()}{measured}"
+        usable = np.ones(source.shape, bool) if mask is None else mask
         if self._plan is not None:
-            last_key, last_source, last_mask, plan = self._plan
-            if key == last_key and _is_close(source, last_source) and same_array(mask, last_mask):
+            last_key, last_source, last_usable, plan = self._plan
+            is_same = key == last_key and _is_close(source, last_source)
+            if is_same and np.array_equal(usable, last_usable):
                 self.hits += 1
                 return plan
         plan = plan_sites(
@@ -94,7 +91,7 @@ class Cache:
             should_stop=should_stop,
         )
         # At once: a run that was cancelled may still be about to do the same.
-        self._plan = key, source, mask, plan
+        self._plan = key, source, usable, plan
         return plan
 
     def last_inversion(self, plan: SitePlan) -> Inversion | None:
@@ -105,32 +102,6 @@ class Cache:
     def keep(self, plan: SitePlan, inversion: Inversion) -> None:
         """Store an inversion with these sites as start of the next one."""
         self._solved = plan, inversion
-
-    def source(
-        self,
-        estimate: Estimate,
-        image: FloatArray,
-        mask: BoolArray | None,
-        most_pixels: int | None = None,
-        should_stop: ShouldStop | None = None,
-        on_caution: OnCaution | None = None,
-    ) -> FloatArray:
-        """Return an estimated source; with `most_pixels`, quickly, from merged pixels."""
-        key = (estimate, most_pixels is not None)
-        source: FloatArray | None = None
-        doubts: list[Caution] = []
-        if self._estimated is not None:
-            last_key, last_image, last_mask, last_source, last_doubts = self._estimated
-            if key == last_key and same_array(image, last_image) and same_array(mask, last_mask):
-                source, doubts = last_source, last_doubts
-        if source is None:
-            pixels = image.size if most_pixels is None else most_pixels
-            source = quick_source(estimate, image, mask, pixels, should_stop, doubts.append)
-            self._estimated = key, image, mask, source, doubts
-        if on_caution is not None:
-            for doubt in doubts:
-                on_caution(doubt)
-        return source
 
 
 def quick_source(
@@ -162,13 +133,6 @@ def quick_source(
     places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")
     fine = map_coordinates(beam, places, order=1, mode="nearest")
     return np.asarray(fine * (image[usable].sum() / fine[usable].sum()))
-
-
-def same_array(first: AnyArray | None, second: AnyArray | None) -> bool:
-    """Return whether two arrays are equal, or both are None."""
-    if first is None or second is None:
-        return first is second
-    return first is second or np.array_equal(first, second)
 
 
 def _is_close(first: FloatArray, second: FloatArray) -> bool:
@@ -219,7 +183,7 @@ def run(
     on_progress, should_stop : callable, optional
         As for `napari_shadowinv.invert`.
     cache : Cache, optional
-        Sites and estimates of earlier runs.
+        Sites of earlier runs.
     preview : bool, default False
         Be quick rather than exact: few sites, and an estimate from merged pixels.
 
@@ -301,7 +265,7 @@ def run_prepared(
     # Before an estimate is made, and before sites are spread: mistakes are reported at once.
     if shot.source is None:
         prepare(shot.image, None, options, shot.mask)
-    source = _source(inputs, shot, report, cache, doubts, preview=preview)
+    source = _source(inputs, shot, report, doubts, preview=preview)
     instrument, estimate = inputs.recipe.instrument, inputs.recipe.estimate
     measured = estimate is None and shot.measured
     if estimate is not None:
@@ -354,7 +318,6 @@ def _source(
     inputs: Inputs,
     shot: Shot,
     report: Reporter,
-    cache: Cache,
     doubts: list[Caution],
     *,
     preview: bool,
@@ -369,8 +332,8 @@ def _source(
     estimate = inputs.estimate_for(shot)
     assert estimate is not None
     report("source", 0, None, estimate.title)
-    cached = partial(cache.source, estimate, most_pixels=PREVIEW_PIXELS if preview else None)
-    return estimate_source(estimate, shot, report.should_stop, doubts.append, by=cached)
+    by = partial(quick_source, estimate, most_pixels=PREVIEW_PIXELS) if preview else None
+    return estimate_source(estimate, shot, report.should_stop, doubts.append, by=by)
 
 
 def _remaining_source(inputs: Inputs, shot: Shot, should_stop: ShouldStop | None) -> FloatArray:

@@ -243,7 +243,7 @@ def estimate_source(
 ) -> FloatArray:
     """Estimate the source of a shot after its steps, from the pixels that neither mask hides.
 
-    `by` is called instead of `Estimate.source`, such as a cached one.
+    `by` is called instead of `Estimate.source`, such as a quick one.
     """
     beam, usable = _for_estimate(shot)
     source = (by or estimate.source)(beam, usable, should_stop=should_stop, on_caution=on_caution)
