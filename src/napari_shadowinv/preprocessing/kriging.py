@@ -2,10 +2,10 @@
 
 The logarithm of the beam is a Gaussian process: smooth, random, correlated by exp(-r²/2L²). Blocks
 of pixels without the object give its r.m.s., its length L and the noise by their marginal
-likelihood; lengths count in proportion to it, as does a quadratic about which the process may vary,
-such as the logarithm of a Gaussian spot. The conditional mean is the source, the conditional
-variance the prior of the error that remains. The process is a sum of cosines over a domain half as
-large again as the image, so that the border needs no slope of its own.
+likelihood; lengths count in proportion to it. The process varies about a quadratic, such as the
+logarithm of a Gaussian spot. The conditional mean is the source, the conditional variance the prior
+of the error that remains. The process is a sum of cosines over a domain half as large again as the
+image, so that the border needs no slope of its own.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from napari_shadowinv.preprocessing.pixels import beam_pixels, complete_blocks, 
 _LENGTHS = np.geomspace(0.1, 1.2, 12)  # shorter sides; errors are too small with half of them
 _RATIOS = np.geomspace(1e-4, 1e8, 97)  # variance of the beam over the noise of a block
 _LOG_2PI = math.log(2 * math.pi)
-_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of y and x
+_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of y and x in the quadratic
 _LEAST_CHANGE = 1e-4  # of the logarithm, as smooth beams are no exact sums of waves
 
 
@@ -88,7 +88,7 @@ def kriged_prior(
     rms = math.sqrt(float((light * variance).sum() / light.sum()))
     height, width = blocks.values.shape
     components = BeamComponents(patterns, blocks.block, (height, width), 0.0, "outside")
-    length = float(np.exp(weights @ np.log(np.repeat(_LENGTHS, 2))))
+    length = float(np.exp(weights @ np.log(_LENGTHS)))
     return BeamPrior(rms=min(rms, 0.99), length=min(length, 1.0)).with_components(components)
 
 
@@ -139,9 +139,8 @@ class _Blocks:
         fits = []
         for length in _LENGTHS * min(self.values.shape):
             report("source", 0)
-            for terms in (1, len(_TERMS)):
-                waves = _Waves(self.values.shape, self.block, length, terms)
-                fits.append(_Fit.to(waves, self.bare, self.logs[self.bare], self.counts[self.bare]))
+            waves = _Waves(self.values.shape, self.block, length)
+            fits.append(_Fit.to(waves, self.bare, self.logs[self.bare], self.counts[self.bare]))
         return fits
 
 
@@ -191,7 +190,6 @@ class _Waves:
     shape: tuple[int, ...]
     block: int
     length: float
-    terms: int  # of a quadratic about which they vary
     domain: float = 1.5  # sides of the image
     shortest: float = 3.6  # wave number in units of 1/L, where the spectrum has fallen to 1/650
 
@@ -235,8 +233,7 @@ class _Waves:
     def terms_at_blocks(self) -> FloatArray:
         """Terms of a quadratic at the middles of blocks, shape (h, w, terms)."""
         along_y, along_x = self.powers(self.block)
-        powers = _TERMS[: self.terms]
-        return np.stack([np.outer(along_y[:, i], along_x[:, j]) for i, j in powers], axis=2)
+        return np.stack([np.outer(along_y[:, i], along_x[:, j]) for i, j in _TERMS], axis=2)
 
 
 def _middles(side: int, block: int) -> FloatArray:
@@ -246,7 +243,7 @@ def _middles(side: int, block: int) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Process of one length about a constant or a quadratic, conditioned on the bare blocks."""
+    """Process of one length about a quadratic, conditioned on the bare blocks."""
 
     waves: _Waves
     trend: FloatArray  # (terms,), of the logarithms
@@ -280,8 +277,7 @@ class _Fit:
         along_y, along_x = self.waves.cosines(1)
         waves = along_y @ table @ along_x.T
         table = np.zeros((3, 3))
-        terms = tuple(np.transpose(_TERMS[: self.waves.terms]))
-        table[terms] = self.trend - self.trend_of_waves @ self.coefficients
+        table[tuple(np.transpose(_TERMS))] = self.trend - self.trend_of_waves @ self.coefficients
         along_y, along_x = self.waves.powers(1)
         return np.asarray(waves + along_y @ table @ along_x.T)
 
@@ -308,9 +304,6 @@ class _Fit:
         )
         best = int(evidences.argmax())
         coefficients = turned @ (gain[best] * pull)
-        evidence = evidences[best] + _evidence_of_trend(
-            roots * terms, trend - trend_of_waves @ coefficients
-        )
         variances, shapes = scipy.linalg.eigh(noise[best] * (inverse @ inverse.T))
         return cls(
             waves,
@@ -319,18 +312,8 @@ class _Fit:
             coefficients,
             turned * np.sqrt(noise[best] * gain[best]),
             shapes * np.sqrt(np.maximum(variances, 0.0)),
-            float(evidence),
+            float(evidences[best]),
         )
-
-
-def _evidence_of_trend(terms: FloatArray, trend: FloatArray, size: float = 1.0) -> float:
-    """Return the log-density of data under a trend with terms of a size, over the constant's."""
-    constant, slopes = terms[:, :1], terms[:, 1:]
-    slopes = slopes - constant @ (constant.T @ slopes) / (constant**2).sum()
-    _, log_volume = np.linalg.slogdet(size**2 * slopes.T @ slopes)
-    count = slopes.shape[1]
-    square = float((trend[1:] ** 2).sum()) / size**2
-    return float(-0.5 * (log_volume + count * _LOG_2PI + square))
 
 
 def _weights(fits: list[_Fit], least: float = 0.02) -> FloatArray:
