@@ -213,14 +213,6 @@ def test_a_caustic_is_no_row_of_hot_pixels():
     assert not dead.any()
 
 
-def test_a_larger_neighbourhood_finds_a_larger_cluster():
-    image = np.random.default_rng(11).normal(100, 2, (40, 40))
-    image[20:22, 10:12] = 300
-    cluster = image > 200
-    assert not remove_hot_pixels(image, size=3)[1].any()
-    np.testing.assert_array_equal(remove_hot_pixels(image, size=5)[1], cluster)
-
-
 def test_an_image_without_noise_shows_its_hot_pixel():
     image = np.full((20, 20), 7.0)
     image[4, 5] = 8.0
@@ -275,8 +267,6 @@ def test_values_out_of_range_are_refused(choice, values):
         (lambda: fit_polynomial(ANY, 11), "degree is 11, expected a whole number from 0 to 10"),
         (lambda: remove_hot_pixels(ANY, threshold=0), "threshold is 0"),
         (lambda: remove_hot_pixels(ANY, threshold="6"), "threshold is '6'"),
-        (lambda: remove_hot_pixels(ANY, size=4), "size is 4, expected an odd number from 3"),
-        (lambda: remove_hot_pixels(ANY, size=1), "size is 1, expected an odd number from 3"),
     ],
 )
 def test_masks_and_numbers_that_make_no_sense_are_refused(call, words):

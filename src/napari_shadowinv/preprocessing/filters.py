@@ -271,11 +271,10 @@ def remove_hot_pixels(
     image: ArrayLike,
     *,
     threshold: float = 6.0,
-    size: int = 3,
     peers: float = 0.5,
     should_stop: ShouldStop | None = None,
 ) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """Replace outlying pixels by the median of their neighbourhood.
+    """Replace outlying pixels, alone or in pairs, by the median of their eight neighbours.
 
     Parameters
     ----------
@@ -283,9 +282,6 @@ def remove_hot_pixels(
         An image or a potential, any unit.
     threshold : float, default 6
         Standard deviations of the noise from the median of the neighbours.
-    size : int, default 3
-        Side of the neighbourhood in px, odd. Clusters of up to an eighth of its area plus one
-        are found: pairs with 3, four pixels with 5.
     peers : float, default 0.5
         Share of the threshold by which a pixel differs from its neighbours, see the notes.
     should_stop : callable, optional
@@ -314,9 +310,9 @@ def remove_hot_pixels(
     a slope of several deviations per pixel, the slope as well.
 
     Caustics and foci also stand out, but span several pixels. A broken pixel must therefore
-    also differ, by half the threshold, from all of its neighbours except as many as could
-    be broken with it. The peak of a focus or line of less than some 4 px is still replaced,
-    if its brightness is many deviations: compare `hot` with the image, raise the threshold.
+    also differ, by half the threshold, from all of its neighbours except one. The peak of a
+    focus or line of less than some 4 px is still replaced, if its brightness is many
+    deviations: compare `hot` with the image, raise the threshold.
 
     A dead pixel among N counts stands out by √N standard deviations: below threshold² counts
     it cannot be distinguished from noise.
@@ -333,9 +329,7 @@ def remove_hot_pixels(
     values, _ = pixels.checked_pixels(image)
     if not (isinstance(threshold, Real) and 0 < threshold < np.inf):
         raise InputError(f"threshold is {threshold!r}, expected a number of deviations above 0")
-    if size not in range(3, 100, 2):
-        raise InputError(f"size is {size!r}, expected an odd number from 3 to 99")
-    local, bright, dark = _neighbours(values, size, Reporter(None, should_stop))
+    local, bright, dark = _neighbours(values, Reporter(None, should_stop))
     difference = values - local
     limit = threshold * _noise(difference, local)
     hot = (difference > limit) & (values - bright > peers * limit)
@@ -343,15 +337,11 @@ def remove_hot_pixels(
     return np.where(hot | dead, local, values), hot, dead
 
 
-def _neighbours(
-    values: FloatArray, size: int, report: Reporter
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return each pixel's median neighbour, and its brightest and darkest sound ones."""
+def _neighbours(values: FloatArray, report: Reporter) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return each pixel's median neighbour, and its second brightest and second darkest."""
     # The pixel itself does not count: with it, the noise would seem smaller than it is.
-    footprint = np.ones((size, size), dtype=np.bool_)
-    footprint[size // 2, size // 2] = False
-    n = size * size - 1
-    broken = n // 8
+    footprint = np.ones((3, 3), dtype=np.bool_)
+    footprint[1, 1] = False
 
     def rank_filter(rank: int, mode: Literal["mirror", "reflect"]) -> FloatArray:
         report("hot pixels", 0)
@@ -359,8 +349,8 @@ def _neighbours(
 
     # 'reflect' lets no neighbour of a corner pixel fill half of its neighbourhood; 'mirror'
     # does not make a pixel at the border its own peer.
-    median = (rank_filter(n // 2 - 1, "reflect") + rank_filter(n // 2, "reflect")) / 2
-    return median, rank_filter(n - 1 - broken, "mirror"), rank_filter(broken, "mirror")
+    median = (rank_filter(3, "reflect") + rank_filter(4, "reflect")) / 2
+    return median, rank_filter(6, "mirror"), rank_filter(1, "mirror")
 
 
 def _noise(
