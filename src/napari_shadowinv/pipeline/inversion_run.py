@@ -49,7 +49,7 @@ from napari_shadowinv.preprocessing import (
     uniform_cautions,
     with_prior_of,
 )
-from napari_shadowinv.preprocessing.estimates import IsotropicEstimate, centre_within
+from napari_shadowinv.preprocessing.estimates import IsotropicEstimate, axis_place
 from napari_shadowinv.provenance import ImageOrigin, MaskOrigin, Origin, Provenance, index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.transport.sites import SitePlan
@@ -324,7 +324,7 @@ def _source(
 ) -> FloatArray:
     if isinstance(inputs.recipe.estimate, UniformEstimate):
         recorded = inputs.shot.shape
-        centre = centre_within(recorded, inputs.recipe.matrix(recorded))
+        centre = axis_place(recorded, inputs.recipe.matrix(recorded))
         doubts.extend(uniform_cautions(shot.shape, shot.setup, centre=centre))
     if shot.source is not None:
         usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask

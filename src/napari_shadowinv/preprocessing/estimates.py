@@ -21,12 +21,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
-from typing import Any, ClassVar, Literal, Self
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike
-from pydantic import Field, PrivateAttr
+from pydantic import PrivateAttr
 
 from napari_shadowinv._system.progress import Reporter, ShouldStop
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -35,7 +35,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent, to_figures
 from napari_shadowinv.options import BeamPrior
 from napari_shadowinv.physics.arrays import block_means
-from napari_shadowinv.physics.setup import Setup, bin_setup
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.preprocessing import filters, pixels
 from napari_shadowinv.preprocessing.kriging import kriged_prior, kriged_source
 from napari_shadowinv.preprocessing.noise import NORMAL_MAD
@@ -236,8 +236,7 @@ class KrigedEstimate(Estimate):
 class GaussianEstimate(Estimate):
     """An elliptical Gaussian plus a constant, fitted to the shot.
 
-    There is a caution if it rises under the mask to 1.5 times the brightest pixel that was fitted;
-    a rise to ten times makes the source uniform.
+    There is a caution if it rises under the mask to 1.5 times the brightest pixel that was fitted.
 
     Notes
     -----
@@ -263,20 +262,14 @@ class GaussianEstimate(Estimate):
         rows, columns = (np.arange(n) / side for n in values.shape)
         beam = _gaussian(parameters, rows[:, None], columns)
         rise = float(beam.max() / sample.max())
-        if rise > pixels.MAX_EXTRAPOLATION:
-            text = (
-                "no Gaussian beam can be fitted to the unmasked pixels, so the source is assumed "
-                "uniform: mask less, or choose another estimate"
-            )
-            on_caution(Caution("source", text))
-            return np.full(values.shape, mean)
+        source = pixels.with_flux_of(mean * beam, values, usable)
         if rise > self.notable:
             text = (
                 f"the Gaussian beam rises to {to_figures(rise)} times the fitted data under the "
                 "mask: compare it with another estimate, or mask less"
             )
             on_caution(Caution("source", text))
-        return pixels.with_flux_of(mean * beam, values, usable)
+        return source
 
 
 def _block_samples(
@@ -350,17 +343,12 @@ def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArra
     return np.asarray(height * np.exp(-0.5 * (u**2 + v**2)) + constant)
 
 
-def centre_within(
-    shape: tuple[int, ...],
-    matrix: FloatArray | None = None,
-    y: float | None = None,
-    x: float | None = None,
-) -> tuple[float, float]:
-    """Return the coordinates of a pixel of the recorded image, by default its centre, in a part."""
-    recorded = [(n - 1) / 2 if c is None else c for n, c in zip(shape, (y, x), strict=True)]
+def axis_place(shape: tuple[int, int], matrix: FloatArray | None = None) -> tuple[float, float]:
+    """Return the middle (y, x) of the recorded image, which faces the source, in a part of it."""
+    middle = [(side - 1) / 2 for side in shape]
     if matrix is not None:
-        recorded = [float(v) for v in np.linalg.solve(matrix, [*recorded, 1.0])[:2]]
-    return recorded[0], recorded[1]
+        middle = [float(v) for v in np.linalg.solve(matrix, [*middle, 1.0])[:2]]
+    return middle[0], middle[1]
 
 
 def uniform_cautions(
@@ -391,7 +379,7 @@ def uniform_cautions(
     if setup is None or setup.is_collimated:
         return ()
     distance = point_distance(setup)
-    axis = centre_within(shape) if centre is None else centre
+    axis = axis_place(shape) if centre is None else centre
     places = list(zip(axis, shape, strict=True))
     near = [max(0.0, place - (side - 1), -place) for place, side in places]
     far = [max(place, side - 1 - place) for place, side in places]
@@ -407,20 +395,8 @@ def uniform_cautions(
     return (Caution("source", text),)
 
 
-def _centre_field(axis: str, line: str) -> Any:
-    return Field(
-        default=None,
-        allow_inf_nan=False,
-        title=f"Centre {axis} (px)",
-        description=(
-            f"{line} of the recorded image at which the detector faces the source. Default: its "
-            "centre."
-        ),
-    )
-
-
 class IsotropicEstimate(Estimate):
-    """A point that shines evenly in all directions, on a flat detector.
+    """A point that shines evenly in all directions, on a flat detector that faces it in its middle.
 
     It needs a setup with a point source, by `adapt_to`, for the distance of the point and the side
     of a pixel.
@@ -443,41 +419,37 @@ class IsotropicEstimate(Estimate):
     uses_mask = False
     place = 20
     method: Literal["isotropic"] = "isotropic"
-    centre_y: float | None = _centre_field("y", "Row")
-    centre_x: float | None = _centre_field("x", "Column")
-    # Not a parameter: the user gives the setup elsewhere.
-    _setup: Any = PrivateAttr(default=None)
+    # Distance of the point and place of the axis, px: the user gives the setup elsewhere.
+    _point: tuple[float, tuple[float, float]] | None = PrivateAttr(default=None)
 
     def adapt_to(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
     ) -> Estimate:
-        point_distance(setup)  # refuses a collimated beam before any work
-        return self._at(*centre_within(shape, matrix, self.centre_y, self.centre_x), setup)
+        return self._with(point_distance(setup), *axis_place(shape, matrix))
 
     def coarsen(self, factor: int) -> Estimate:
-        if self._setup is None or self.centre_y is None or self.centre_x is None:
+        if self._point is None:
             return self
-        y, x = ((c + 0.5) / factor - 0.5 for c in (self.centre_y, self.centre_x))
-        return self._at(y, x, bin_setup(self._setup, factor))
+        distance, axis = self._point
+        return self._with(distance / factor, *((c + 0.5) / factor - 0.5 for c in axis))
+
+    def _with(self, distance: float, y: float, x: float) -> Self:
+        estimate = self.model_copy()
+        estimate._point = distance, (y, x)
+        return estimate
 
     def _estimate(
         self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
     ) -> FloatArray:
-        distance = point_distance(self._setup)
-        centre = centre_within(values.shape, y=self.centre_y, x=self.centre_x)
+        distance, axis = self._point or (point_distance(None), ())  # refused without a setup
         # Solid angle of the rectangle between the axis and each corner of the pixels.
         y, x = (
             (np.arange(-0.5, side) - place) / distance
-            for side, place in zip(values.shape, centre, strict=True)
+            for side, place in zip(values.shape, axis, strict=True)
         )
         angles = np.arctan2(y[:, None] * x, np.sqrt(1 + y[:, None] ** 2 + x**2))
         beam = np.diff(np.diff(angles, axis=0), axis=1)
         return np.asarray(beam * (values[usable].mean() / beam[usable].mean()))
-
-    def _at(self, y: float, x: float, setup: Setup | None) -> Self:
-        estimate = self.model_copy(update={"centre_y": y, "centre_x": x})
-        estimate._setup = setup
-        return estimate
 
 
 def point_distance(setup: Setup | None) -> float:
