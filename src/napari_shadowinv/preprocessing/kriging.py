@@ -5,7 +5,7 @@ of pixels without the object give its r.m.s., its length L and the noise by thei
 likelihood; lengths count in proportion to it. The process varies about a quadratic, such as the
 logarithm of a Gaussian spot. The conditional mean is the source, the conditional variance the prior
 of the error that remains. The process is a sum of cosines over a domain half as large again as the
-image, so that the border needs no slope of its own.
+image, so that the border needs no slope of its own, and of a quadratic of any size.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from napari_shadowinv.preprocessing.pixels import beam_pixels, complete_blocks, 
 _LENGTHS = np.geomspace(0.1, 1.2, 12)  # shorter sides; errors are too small with half of them
 _RATIOS = np.geomspace(1e-4, 1e8, 97)  # variance of the beam over the noise of a block
 _LOG_2PI = math.log(2 * math.pi)
-_TERMS = ((0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2))  # powers of y and x in the quadratic
+_FREE = 6  # terms of a quadratic
 _LEAST_CHANGE = 1e-4  # of the logarithm, as smooth beams are no exact sums of waves
 
 
@@ -139,8 +139,8 @@ class _Blocks:
         fits = []
         for length in _LENGTHS * min(self.values.shape):
             report("source", 0)
-            waves = _Waves(self.values.shape, self.block, length)
-            fits.append(_Fit.to(waves, self.bare, self.logs[self.bare], self.counts[self.bare]))
+            functions = _Functions(self.values.shape, self.block, length)
+            fits.append(_Fit.to(functions, self.bare, self.logs[self.bare], self.counts[self.bare]))
         return fits
 
 
@@ -161,7 +161,7 @@ def _halo_caution(blocks: _Blocks, fit: _Fit, check: HaloCheck = HaloCheck()) ->
     farther = blocks.bare & (distance > max(check.rim * float(depth.max()), check.rim_blocks))
     if farther.sum() < _least_blocks(farther):
         return None
-    without_rim = _Fit.to(fit.waves, farther, blocks.logs[farther], blocks.counts[farther])
+    without_rim = _Fit.to(fit.functions, farther, blocks.logs[farther], blocks.counts[farther])
     change = (fit.mean - without_rim.mean)[places]
     # Of nested data, the change of a mean has the variance that the data take away.
     spread, wider = (each.deviations[places] for each in (fit, without_rim))
@@ -184,14 +184,18 @@ def _halo_caution(blocks: _Blocks, fit: _Fit, check: HaloCheck = HaloCheck()) ->
 
 
 @dataclass(frozen=True, eq=False)
-class _Waves:
-    """Cosines over the domain with the spectrum of a length, px, whose variances sum to 1."""
+class _Functions:
+    """Functions whose random sum is the logarithm of a beam of a length, px.
+
+    Cosines over the domain with the length's spectrum, whose variances sum to 1, and a quadratic.
+    """
 
     shape: tuple[int, ...]
     block: int
     length: float
     domain: float = 1.5  # sides of the image
     shortest: float = 3.6  # wave number in units of 1/L, where the spectrum has fallen to 1/650
+    quadratic: float = 100.0  # deviation of its terms, over that of the sum of cosines
 
     @cached_property
     def _numbers(self) -> list[FloatArray]:
@@ -201,117 +205,89 @@ class _Waves:
         return [step * np.arange(float(n)) for step, n in zip(steps, counts, strict=True)]
 
     @cached_property
-    def spectrum(self) -> FloatArray:
-        """Variance of each product of cosines, 0 for those that are not used."""
+    def deviations(self) -> FloatArray:
+        """Deviations of the products of functions along y and x, 0 for those that are not used."""
         along_y, along_x = self._numbers
         squares = self.length**2 * (along_y[:, None] ** 2 + along_x**2)
-        variances = np.where(squares <= self.shortest**2, np.exp(-0.5 * squares), 0.0)
-        return np.asarray(variances / variances.sum())
+        spectrum = np.where(squares <= self.shortest**2, np.exp(-0.5 * squares), 0.0)
+        degrees = np.add.outer(np.arange(3), np.arange(3))
+        return np.asarray(
+            scipy.linalg.block_diag(
+                np.sqrt(spectrum / spectrum.sum()), self.quadratic * (degrees <= 2)
+            )
+        )
 
-    def cosines(self, block: int) -> list[FloatArray]:
-        """Return cosines with a mean square of 1 at blocks along y and x, shape (blocks, waves)."""
-        return [
-            np.where(numbers > 0, math.sqrt(2), 1.0)
-            * np.cos(np.outer(_middles(side, block) + 0.5 + (self.domain - 1) / 2 * side, numbers))
-            for side, numbers in zip(self.shape, self._numbers, strict=True)
-        ]
+    def along(self, block: int) -> list[FloatArray]:
+        """Return the functions at blocks along y and x, shape (blocks, functions).
 
-    def powers(self, block: int) -> list[FloatArray]:
-        """Return the powers 0 to 2 of places from -1 to 1 at blocks along y and x, (blocks, 3)."""
-        places = [(2 * _middles(side, block) + 1) / side - 1 for side in self.shape]
-        return [place[:, None] ** np.arange(3) for place in places]
+        Cosines with a mean square of 1, then the powers 0 to 2 of places from -1 to 1.
+        """
+        bases = []
+        for side, numbers in zip(self.shape, self._numbers, strict=True):
+            middles = block * (np.arange(-(-side // block)) + 0.5)  # px from the edge
+            places = middles + (self.domain - 1) / 2 * side
+            cosines = np.where(numbers > 0, math.sqrt(2), 1.0) * np.cos(np.outer(places, numbers))
+            powers = (2 * middles[:, None] / side - 1) ** np.arange(3)
+            bases.append(np.hstack([cosines, powers]))
+        return bases
 
     @cached_property
     def at_blocks(self) -> FloatArray:
-        """Waves of one standard deviation at the middles of blocks, shape (h, w, waves)."""
-        along_y, along_x = self.cosines(self.block)
-        rows, columns = np.nonzero(self.spectrum)
-        waves = along_y[:, None, rows] * along_x[None, :, columns]
-        return np.asarray(waves * np.sqrt(self.spectrum[rows, columns]))
-
-    @cached_property
-    def terms_at_blocks(self) -> FloatArray:
-        """Terms of a quadratic at the middles of blocks, shape (h, w, terms)."""
-        along_y, along_x = self.powers(self.block)
-        return np.stack([np.outer(along_y[:, i], along_x[:, j]) for i, j in _TERMS], axis=2)
-
-
-def _middles(side: int, block: int) -> FloatArray:
-    """Return the middles of blocks along a side, px."""
-    return block * (np.arange(-(-side // block), dtype=np.float64) + 0.5) - 0.5
+        """Functions of one standard deviation at the middles of blocks, (h, w, functions)."""
+        along_y, along_x = self.along(self.block)
+        rows, columns = np.nonzero(self.deviations)
+        products = along_y[:, None, rows] * along_x[None, :, columns]
+        return np.asarray(products * self.deviations[rows, columns])
 
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Process of one length about a quadratic, conditioned on the bare blocks."""
+    """Sum of the functions of one length, conditioned on the bare blocks."""
 
-    waves: _Waves
-    trend: FloatArray  # (terms,), of the logarithms
-    trend_of_waves: FloatArray  # (terms, waves), which the quadratic takes from them
-    coefficients: FloatArray  # (waves,), mean amplitudes, in standard deviations of the waves
-    spread: FloatArray  # (waves, waves), columns whose squares sum to the amplitudes' covariance
-    trend_spread: FloatArray  # (terms, terms), columns of the quadratic's covariance likewise
+    functions: _Functions
+    coefficients: FloatArray  # (functions,), mean amplitudes, in their standard deviations
+    spread: FloatArray  # (functions, functions), columns whose squares sum to the covariance
     evidence: float  # logarithm of the marginal likelihood, up to a constant
 
     @property
     def mean(self) -> FloatArray:
         """Mean of the logarithm of the beam in each block."""
-        return np.asarray(self.rows @ self.coefficients + self.waves.terms_at_blocks @ self.trend)
-
-    @property
-    def rows(self) -> FloatArray:
-        """Waves in each block, less their quadratics."""
-        return np.asarray(self.waves.at_blocks - self.waves.terms_at_blocks @ self.trend_of_waves)
+        return np.asarray(self.functions.at_blocks @ self.coefficients)
 
     @property
     def deviations(self) -> FloatArray:
-        """Shapes whose squares sum to the variance in each block, (h, w, waves + terms)."""
-        parts = [self.rows @ self.spread, self.waves.terms_at_blocks @ self.trend_spread]
-        return np.concatenate(parts, axis=2)
+        """Shapes whose squares sum to the variance in each block, (h, w, functions)."""
+        return np.asarray(self.functions.at_blocks @ self.spread)
 
     @property
     def at_pixels(self) -> FloatArray:
         """Mean of the logarithm of the beam in each pixel."""
-        table = np.sqrt(self.waves.spectrum)
+        table = self.functions.deviations.copy()
         table[table > 0] *= self.coefficients
-        along_y, along_x = self.waves.cosines(1)
-        waves = along_y @ table @ along_x.T
-        table = np.zeros((3, 3))
-        table[tuple(np.transpose(_TERMS))] = self.trend - self.trend_of_waves @ self.coefficients
-        along_y, along_x = self.waves.powers(1)
-        return np.asarray(waves + along_y @ table @ along_x.T)
+        along_y, along_x = self.functions.along(1)
+        return np.asarray(along_y @ table @ along_x.T)
 
     @classmethod
-    def to(cls, waves: _Waves, bare: BoolArray, logs: FloatArray, counts: FloatArray) -> _Fit:
+    def to(
+        cls, functions: _Functions, bare: BoolArray, logs: FloatArray, counts: FloatArray
+    ) -> _Fit:
         """Fit the logarithms of bare blocks, whose noise has a variance of σ² / counts."""
-        rows, terms = waves.at_blocks[bare], waves.terms_at_blocks[bare]
-        roots = np.sqrt(counts / counts.mean())[:, None]
-        inverse = np.linalg.pinv(roots * terms)
-        by_terms = inverse * roots[:, 0]
-        trend, trend_of_waves = by_terms @ logs, by_terms @ rows
-        data = roots[:, 0] * (logs - terms @ trend)
-        centred = roots * (rows - terms @ trend_of_waves)
-        powers, turned = scipy.linalg.eigh(centred.T @ centred)
+        roots = np.sqrt(counts / counts.mean())
+        rows, data = roots[:, None] * functions.at_blocks[bare], roots * logs
+        powers, turned = scipy.linalg.eigh(rows.T @ rows)
         powers = np.maximum(powers, 0.0)
-        pull = turned.T @ (centred.T @ data)
+        pull = turned.T @ (rows.T @ data)
         gain = _RATIOS[:, None] / (1 + _RATIOS[:, None] * powers)
-        freedom = len(data) - terms.shape[1]
-        noise = (data @ data - gain @ pull**2) / freedom
-        noise = np.maximum(noise, _LEAST_CHANGE**2)
-        evidences = -0.5 * (
-            np.log1p(_RATIOS[:, None] * powers).sum(axis=1)
-            + freedom * (np.log(noise) + 1 + _LOG_2PI)
-        )
+        freedom = len(data) - _FREE
+        noise = np.maximum((data @ data - gain @ pull**2) / freedom, _LEAST_CHANGE**2)
+        # The quadratic is as good as free, so its size does not count.
+        volume = np.log1p(_RATIOS[:, None] * powers).sum(axis=1) - _FREE * np.log(_RATIOS)
+        evidences = -0.5 * (volume + freedom * (np.log(noise) + 1 + _LOG_2PI))
         best = int(evidences.argmax())
-        coefficients = turned @ (gain[best] * pull)
-        variances, shapes = scipy.linalg.eigh(noise[best] * (inverse @ inverse.T))
         return cls(
-            waves,
-            trend,
-            trend_of_waves,
-            coefficients,
+            functions,
+            turned @ (gain[best] * pull),
             turned * np.sqrt(noise[best] * gain[best]),
-            shapes * np.sqrt(np.maximum(variances, 0.0)),
             float(evidences[best]),
         )
 
