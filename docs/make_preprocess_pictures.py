@@ -30,13 +30,13 @@ from napari_shadowinv.preprocessing import (
     ButterworthFilter,
     GaussianEstimate,
     HighPassFilter,
+    HotPixelFilter,
     IsotropicEstimate,
     KrigedEstimate,
     LowPassEstimate,
     LowPassFilter,
     PolynomialEstimate,
     UniformEstimate,
-    remove_hot_pixels,
 )
 from napari_shadowinv.preprocessing.estimates import point_distance
 from napari_shadowinv.preprocessing.kriging import kriged_prior
@@ -330,11 +330,12 @@ def hot_pixels_picture() -> None:
     places = [tuple(rng.integers(0, SHAPE, 2)) for _ in range(60)]
     for number, place in enumerate(places):
         shot[place] = 0 if number % 3 == 0 else rng.uniform(7000, 16000)
-    clean, hot, dead = remove_hot_pixels(shot)
+    clean = HotPixelFilter().filter_image(shot)
+    hot, dead = clean < shot, clean > shot
     broken = np.zeros(SHAPE, dtype=bool)
     broken[tuple(np.transpose(places))] = True
     mean = np.median(shot)
-    figure, axes = page("remove_hot_pixels, threshold 6", [1, 1, 1])
+    figure, axes = page("hot-pixels, threshold 6", [1, 1, 1])
     limits = (0.0, float(np.percentile(spot.shot, 99.9) / mean))
     show(axes[0], shot / mean, "Shot with broken pixels", "Intensity / median", limits)
     show(axes[1], clean / mean, "Repaired", "Intensity / median", limits)

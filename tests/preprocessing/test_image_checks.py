@@ -16,7 +16,6 @@ from napari_shadowinv.preprocessing import (
     Crop,
     Dark,
     Recipe,
-    ReferencePair,
     image_cautions,
     image_checks,
     measure_shift,
@@ -24,6 +23,7 @@ from napari_shadowinv.preprocessing import (
 from napari_shadowinv.preprocessing.image_checks import (
     CheckedImage,
     dark_level,
+    is_negative,
     mask_dark,
     mask_gaps,
 )
@@ -437,4 +437,4 @@ def test_images_without_noise_and_dark_objects_are_no_negatives():
     wide, shadow = np.exp(-3.56 * (y**2 + x**2)), 1 - 0.95 * np.exp(-4.23 * (y**2 + x**2))
     image, source = (rng.poisson(COUNTS * plane) for plane in (wide * shadow, wide))
     assert np.corrcoef(image.ravel(), source.ravel())[0, 1] < -0.4
-    assert not ReferencePair(image, source, np.ones(SHAPE, bool)).is_negative
+    assert not is_negative(image, source, np.ones(SHAPE, bool))

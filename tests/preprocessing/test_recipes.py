@@ -66,9 +66,9 @@ def test_an_isotropic_estimate_is_that_of_its_experiment() -> None:
 
 def test_an_isotropic_estimate_needs_the_setup_of_a_point_source() -> None:
     isotropic = preprocessing.IsotropicEstimate()
-    with pytest.raises(InputError, match="'isotropic' without a setup"):
+    with pytest.raises(InputError, match="'isotropic' and no setup"):
         isotropic.adapt_to(None, (4, 4))
-    with pytest.raises(InputError, match="'isotropic' without a setup"):
+    with pytest.raises(InputError, match="'isotropic' and no setup"):
         isotropic.source(np.ones((4, 4)), None)
     collimated = NEAR.model_copy(update={"source_object_distance": np.inf})
     with pytest.raises(InputError, match="collimated beam"):

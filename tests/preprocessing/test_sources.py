@@ -13,11 +13,11 @@ from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.preprocessing import (
     BackgroundFilter,
     GaussianEstimate,
+    HotPixelFilter,
     IsotropicEstimate,
     LowPassEstimate,
     PolynomialEstimate,
     UniformEstimate,
-    remove_hot_pixels,
     uniform_cautions,
 )
 from napari_shadowinv.preprocessing.estimates import point_distance
@@ -229,7 +229,7 @@ class Stop:
         (lambda image, _, stop: PolynomialEstimate(degree=10).source(image, None, stop), 5),
         (LowPassEstimate(width=200).source, 2),
         (lambda image, _, stop: BackgroundFilter(degree=10).filter_image(image, None, stop), 5),
-        (lambda image, _, stop: remove_hot_pixels(image, should_stop=stop), 4),
+        (lambda image, _, stop: HotPixelFilter().filter_image(image, None, stop), 4),
     ],
     ids=["gaussian", "polynomial", "low pass", "background", "hot pixels"],
 )  # fmt: skip
@@ -305,15 +305,16 @@ def test_a_point_source_makes_a_weak_object_wrong_unless_it_is_taken_for_one():
 def test_a_wide_image_of_a_point_source_is_warned_of():
     """The fluence in the corner, r from the middle, falls by 1.5 (r / distance)² if little."""
     for side, warned in ((22, False), (26, True)):  # by 0.8 and 1.2 %
-        cautions = uniform_cautions((side, side), NEAR)
+        cautions = uniform_cautions(NEAR, (side, side), (side, side), np.eye(3))
         assert bool(cautions) == warned
     assert "'isotropic'" in cautions[0].text
     # A part of an image, far from the axis.
-    assert uniform_cautions((20, 20), NEAR, centre=(100.0, 9.5))
-    assert not uniform_cautions((20, 20), NEAR, centre=(9.5, 9.5))
-    assert uniform_cautions((500, 500), None) == ()
+    beside = np.array([[1.0, 0, -90], [0, 1, 0], [0, 0, 1]])
+    assert uniform_cautions(NEAR, (20, 20), (20, 20), beside)
+    assert not uniform_cautions(NEAR, (20, 20), (20, 20), np.eye(3))
+    assert uniform_cautions(None, (500, 500), (500, 500), np.eye(3)) == ()
     collimated = NEAR.model_copy(update={"source_object_distance": np.inf})
-    assert uniform_cautions((500, 500), collimated) == ()
+    assert uniform_cautions(collimated, (500, 500), (500, 500), np.eye(3)) == ()
 
 
 @pytest.fixture(scope="module")

@@ -45,7 +45,7 @@ NONSENSE: dict[str, tuple[dict[str, Any], str]] = {
         {"source": PolynomialEstimate(), "source_mask": X > 9, "mask": X > 9},
         "excluded from the inversion",
     ),
-    "no setup": ({"source": IsotropicEstimate()}, "'isotropic' without a setup"),
+    "no setup": ({"source": IsotropicEstimate()}, "'isotropic' and no setup"),
     "a small source mask": (
         {"source": LowPassEstimate(width=6), "source_mask": np.ones((3, 3), bool)},
         r"mask has shape \(3, 3\)",

@@ -49,7 +49,7 @@ from napari_shadowinv.preprocessing import (
     uniform_cautions,
     with_prior_of,
 )
-from napari_shadowinv.preprocessing.estimates import IsotropicEstimate, axis_place
+from napari_shadowinv.preprocessing.estimates import IsotropicEstimate
 from napari_shadowinv.provenance import ImageOrigin, MaskOrigin, Origin, Provenance, index_masks
 from napari_shadowinv.shot import Shot
 from napari_shadowinv.transport.sites import SitePlan
@@ -324,8 +324,8 @@ def _source(
 ) -> FloatArray:
     if isinstance(inputs.recipe.estimate, UniformEstimate):
         recorded = inputs.shot.shape
-        centre = axis_place(recorded, inputs.recipe.matrix(recorded))
-        doubts.extend(uniform_cautions(shot.shape, shot.setup, centre=centre))
+        matrix = inputs.recipe.matrix(recorded)
+        doubts.extend(uniform_cautions(shot.setup, shot.shape, recorded, matrix))
     if shot.source is not None:
         usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
         return check_source(shot.source, usable)

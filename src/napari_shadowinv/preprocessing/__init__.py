@@ -1,10 +1,9 @@
 """Preparation of a shot for its inversion, and the recipe of it.
 
 - the shot: `Shot`; the recipe: `Recipe`
-- whether image and source look right: `image_cautions`, `ReferencePair`; a source in register with
-  its image: `register_source`
-- steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`; the broken pixels that
-  one of them replaces: `remove_hot_pixels`
+- whether image and source look right: `image_cautions`; a source in register with its image:
+  `register_source`
+- steps: `Dark`, `Rotate`, `Crop`, `Bin`, and filters by name in `FILTERS`
 - estimates of the source by name in `ESTIMATES`
 """
 

@@ -16,10 +16,8 @@ from .filters import (
     HighPassFilter,
     HotPixelFilter,
     LowPassFilter,
-    remove_hot_pixels,
 )
-from .image_checks import ReferencePair, image_cautions
-from .pixels import fit_polynomial
+from .image_checks import image_cautions
 from .recipe import (
     ESTIMATES,
     FILTERS,
@@ -56,19 +54,16 @@ __all__ = [
     "MeasuredSource",
     "PolynomialEstimate",
     "Recipe",
-    "ReferencePair",
     "Rotate",
     "Shift",
     "Step",
     "UniformEstimate",
     "check_masks",
     "estimate_source",
-    "fit_polynomial",
     "image_cautions",
     "measure_shift",
     "move",
     "register_source",
-    "remove_hot_pixels",
     "uniform_cautions",
     "with_prior_of",
 ]

@@ -158,7 +158,8 @@ def move(source: FloatArray, shift: FloatArray) -> FloatArray:
     width = min(int(np.ceil(np.abs(shift).max())) + 2, min(source.shape) - 1)
     padded = np.pad(source, width, mode="reflect", reflect_type="odd")
     inside = np.s_[width:-width, width:-width]
-    return np.maximum(ndimage.shift(padded, shift, mode="mirror")[inside], 0.0)
+    moved = ndimage.shift(padded, shift, mode="mirror")
+    return np.asarray(np.maximum(moved[inside], 0.0))
 
 
 def measure_shift(

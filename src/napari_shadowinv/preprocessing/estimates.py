@@ -96,11 +96,6 @@ class Estimate(Choice):
         InversionCancelled
             If `should_stop` returned true.
         """
-        if self.needs_mask and mask is None:
-            raise InputError(
-                f"got the estimate '{self.title}' without a mask: it fills in the masked pixels; "
-                "choose a mask that covers the object"
-            )
         values, usable = pixels.beam_pixels(image, mask)
         return self._estimate(values, usable, Reporter(None, should_stop), on_caution or warn_of)
 
@@ -117,12 +112,7 @@ class Estimate(Choice):
 
     def coarsen(self, factor: int) -> Estimate:
         """Return the estimate for an image with pixels `factor` times as large."""
-        lengths = {
-            name: getattr(self, name) / factor
-            for name, field in self.parameters().items()
-            if (field.title or "").endswith("(px)")
-        }
-        return self.model_copy(update=lengths)
+        return self
 
 
 class UniformEstimate(Estimate):
@@ -159,9 +149,7 @@ class PolynomialEstimate(Estimate):
     def _estimate(
         self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
     ) -> FloatArray:
-        fit = pixels.fit_polynomial(
-            values, self.degree, mask=usable, should_stop=report.should_stop
-        )
+        fit = pixels.fit_polynomial(values, usable, self.degree, report)
         return pixels.with_flux_of(fit, values, usable)
 
 
@@ -192,6 +180,9 @@ class LowPassEstimate(Estimate):
             wider, reached = _blur_masked(values, usable, width, report)
             beam, support = np.where(support, beam, wider), support | reached
         return pixels.with_flux_of(beam, values, usable)
+
+    def coarsen(self, factor: int) -> Estimate:
+        return self.model_copy(update={"width": self.width / factor})
 
 
 def _blur_masked(
@@ -308,7 +299,9 @@ def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Repo
         return np.asarray(fit.x)
 
     # A plain fit first: the robust loss, from far away, would call the whole beam an outlier.
-    parameters = fitted(np.clip(_guess_gaussian(y, x, sample), *bounds), "linear", 1.0)
+    constant, peak = np.percentile(sample, [2, 98])
+    guess = [peak - constant, constant, y.mean(), x.mean(), 4.0, 0.0, 4.0]
+    parameters = fitted(np.maximum(guess, bounds[0] + 1e-3), "linear", 1.0)
     scale = 0.0
     for _ in range(10):
         residual = _gaussian(parameters, y, x) - sample
@@ -317,21 +310,6 @@ def _fit_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray, report: Repo
             break
         parameters = fitted(parameters, "soft_l1", scale)
     return parameters
-
-
-def _guess_gaussian(y: FloatArray, x: FloatArray, sample: FloatArray) -> FloatArray:
-    """Return parameters of `_gaussian` by the moments of the image above its dark corners."""
-    constant, peak = (float(level) for level in np.percentile(sample, [2, 98]))
-    weights = np.maximum(sample - constant, 0) + 1e-9
-    centre_y, centre_x = np.average(y, weights=weights), np.average(x, weights=weights)
-    widths = [
-        max(float(np.sqrt(np.average((axis - centre) ** 2, weights=weights))), 1e-3)
-        for axis, centre in ((y, centre_y), (x, centre_x))
-    ]
-    height = max(peak - constant, 1e-3)
-    return np.array(
-        [height, max(constant, 1e-3), centre_y, centre_x, 1 / widths[0], 0.0, 1 / widths[1]]
-    )
 
 
 def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArray:
@@ -343,48 +321,23 @@ def _gaussian(parameters: FloatArray, y: FloatArray, x: FloatArray) -> FloatArra
     return np.asarray(height * np.exp(-0.5 * (u**2 + v**2)) + constant)
 
 
-def axis_place(shape: tuple[int, int], matrix: FloatArray | None = None) -> tuple[float, float]:
-    """Return the middle (y, x) of the recorded image, which faces the source, in a part of it."""
-    middle = [(side - 1) / 2 for side in shape]
-    if matrix is not None:
-        middle = [float(v) for v in np.linalg.solve(matrix, [*middle, 1.0])[:2]]
-    return middle[0], middle[1]
-
-
 def uniform_cautions(
-    shape: tuple[int, int],
     setup: Setup | None,
+    shape: tuple[int, int],
+    recorded: tuple[int, int],
+    matrix: FloatArray,
     *,
-    centre: tuple[float, float] | None = None,
     notable: float = 0.01,
 ) -> tuple[Caution, ...]:
-    """Warn if a point source would light an image too unevenly to count as uniform.
+    """Warn if an isotropic point source would light an image too unevenly to count as uniform.
 
-    Parameters
-    ----------
-    shape : tuple of int
-        Height and width of the image.
-    setup : Setup or None
-        The experiment; no warning if it is unknown.
-    centre : tuple of float, optional
-        Pixel (y, x) in which the detector faces the point. Default: the middle of the image.
-    notable : float, default 0.01
-        Fall of the fluence of an isotropic point source, from the brightest pixel to the dimmest.
-
-    Returns
-    -------
-    tuple of Caution
-        Empty where it does not fall by more.
+    The fluence may fall by a `notable` share from the brightest pixel of the image, (H, W), to the
+    dimmest; the recorded image and the matrix to it are those of `Estimate.adapt_to`.
     """
     if setup is None or setup.is_collimated:
         return ()
-    distance = point_distance(setup)
-    axis = axis_place(shape) if centre is None else centre
-    places = list(zip(axis, shape, strict=True))
-    near = [max(0.0, place - (side - 1), -place) for place, side in places]
-    far = [max(place, side - 1 - place) for place, side in places]
-    highest, lowest = ((1 + (math.hypot(*r) / distance) ** 2) ** -1.5 for r in (near, far))
-    fall = 1 - lowest / highest
+    point = IsotropicEstimate().adapt_to(setup, recorded, matrix)
+    fall = point.fall_over(shape)
     if fall <= notable:
         return ()
     text = (
@@ -424,8 +377,20 @@ class IsotropicEstimate(Estimate):
 
     def adapt_to(
         self, setup: Setup | None, shape: tuple[int, int], matrix: FloatArray | None = None
-    ) -> Estimate:
-        return self._with(point_distance(setup), *axis_place(shape, matrix))
+    ) -> Self:
+        middle = [(side - 1) / 2 for side in shape]
+        if matrix is not None:
+            middle = [float(v) for v in np.linalg.solve(matrix, [*middle, 1.0])[:2]]
+        return self._with(point_distance(setup), *middle)
+
+    def fall_over(self, shape: tuple[int, int]) -> float:
+        """Return the fall of the fluence from the brightest pixel of an image to the dimmest."""
+        distance, axis = self._point or (point_distance(None), ())
+        places = list(zip(axis, shape, strict=True))
+        near = [max(0.0, place - (side - 1), -place) for place, side in places]
+        far = [max(place, side - 1 - place) for place, side in places]
+        highest, lowest = ((1 + (math.hypot(*r) / distance) ** 2) ** -1.5 for r in (near, far))
+        return float(1 - lowest / highest)
 
     def coarsen(self, factor: int) -> Estimate:
         if self._point is None:
@@ -454,16 +419,11 @@ class IsotropicEstimate(Estimate):
 
 def point_distance(setup: Setup | None) -> float:
     """Return the distance from the point source to the detector, in px of the detector."""
-    if setup is None:
+    if setup is None or setup.is_collimated:
+        received = "a setup with a collimated beam" if setup else "no setup"
         raise InputError(
-            "got the source 'isotropic' without a setup, which is needed for the distance of the "
-            "point source and the pixel size: give a setup, or choose the source 'uniform'"
-        )
-    if setup.is_collimated:
-        raise InputError(
-            "got the source 'isotropic' and a setup with a collimated beam (the distance from "
-            "source to object is inf): give the distance of the point source, or choose the source "
-            "'uniform'"
+            f"got the source 'isotropic' and {received}, but it needs the distance of a point "
+            "source and the pixel size: give a setup with them, or choose the source 'uniform'"
         )
     # The magnification enlarges distance and pixel alike.
     return setup.source_object_distance / setup.object_pixel_size

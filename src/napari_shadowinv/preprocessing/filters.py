@@ -2,7 +2,7 @@
 
 - keep only small or only large structures: `HighPassFilter`, `LowPassFilter`, `ButterworthFilter`
 - flatten an uneven beam: `BackgroundFilter`
-- replace broken pixels: `HotPixelFilter`; which they are: `remove_hot_pixels`
+- replace broken pixels: `HotPixelFilter`
 - their base class: `Filter`
 
 Each is a step of a recipe, and filters one image by `Filter.filter_image`: an image or a potential
@@ -21,7 +21,6 @@ by exactly its gain.
 from __future__ import annotations
 
 from dataclasses import replace
-from numbers import Real
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -57,8 +56,8 @@ class Filter(Step):
         values, usable = pixels.checked_pixels(image, mask)
         report = Reporter(None, should_stop)
         if not usable.all():
-            beam, _ = pixels.beam_pixels(image, mask)
-            values = np.where(usable, values, pixels.with_filled_part(beam, usable, report))
+            pixels.beam_pixels(image, mask)  # refuses one without flux
+            values = np.where(usable, values, pixels.with_filled_part(values, usable, report))
         return self._filter(values, usable, report)
 
     def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
@@ -216,9 +215,7 @@ class BackgroundFilter(Filter):
     )
 
     def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
-        background = pixels.fit_polynomial(
-            values, self.degree, mask=usable, should_stop=report.should_stop
-        )
+        background = pixels.fit_polynomial(values, usable, self.degree, report)
         if self.kind == "subtract":
             return np.asarray(values - background + background.mean())
         if background.min() <= 0 or values.mean() <= 0:
@@ -239,7 +236,33 @@ def blur(values: FloatArray, width: float) -> FloatArray:
 
 
 class HotPixelFilter(Filter):
-    """Replace broken pixels."""
+    """Replace outlying pixels, alone or in pairs, by the median of their eight neighbours.
+
+    Notes
+    -----
+    The noise is read off the image: the differences to the local median are sorted by
+    brightness into groups of equal number, each group's variance is estimated by the median
+    absolute deviation, and a + b·brightness with a, b ≥ 0 (read-out and Poisson-like noise)
+    is fitted to them. The estimate includes the noise of the median itself, some 10 %; in
+    a slope of several deviations per pixel, the slope as well.
+
+    Caustics and foci also stand out, but span several pixels. A broken pixel must therefore
+    also differ, by half the threshold, from all of its neighbours except one. The peak of a
+    focus or line of less than some 4 px is still replaced, if its brightness is many
+    deviations: compare the image with the one before, raise the threshold.
+
+    A dead pixel among N counts stands out by √N standard deviations: below threshold² counts
+    it cannot be distinguished from noise.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> image = np.random.default_rng(0).normal(100, 2, (40, 40))
+    >>> image[3, 5], image[20, 0] = 200, 0
+    >>> clean = HotPixelFilter().filter_image(image)
+    >>> np.argwhere(clean != image).tolist()
+    [[3, 5], [20, 0]]
+    """
 
     title = "remove hot pixels"
     primary = "threshold"
@@ -254,9 +277,12 @@ class HotPixelFilter(Filter):
     )
 
     def _filter(self, values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
-        return remove_hot_pixels(values, threshold=self.threshold, should_stop=report.should_stop)[
-            0
-        ]
+        local, bright, dark = _neighbours(values, report)
+        difference = values - local
+        limit = self.threshold * _noise(difference, local)
+        is_hot = (difference > limit) & (values - bright > limit / 2)
+        is_dead = (difference < -limit) & (dark - values > limit / 2)
+        return np.where(is_hot | is_dead, local, values)
 
     def note(self, before: FloatArray, after: FloatArray, mask: BoolArray | None) -> str:
         usable = True if mask is None else mask
@@ -265,76 +291,6 @@ class HotPixelFilter(Filter):
             f"{hot} hot and {dead} dead pixels replaced (beyond {self.threshold:g} standard "
             "deviations)"
         )
-
-
-def remove_hot_pixels(
-    image: ArrayLike,
-    *,
-    threshold: float = 6.0,
-    peers: float = 0.5,
-    should_stop: ShouldStop | None = None,
-) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """Replace outlying pixels, alone or in pairs, by the median of their eight neighbours.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-        An image or a potential, any unit.
-    threshold : float, default 6
-        Standard deviations of the noise from the median of the neighbours.
-    peers : float, default 0.5
-        Share of the threshold by which a pixel differs from its neighbours, see the notes.
-    should_stop : callable, optional
-        Asked at each step; when it returns true the search ends.
-
-    Returns
-    -------
-    image : ndarray of float64, shape (H, W)
-        The image with those pixels replaced, all others untouched.
-    hot, dead : ndarray of bool, shape (H, W)
-        Which pixels were too bright, which too dark.
-
-    Raises
-    ------
-    InputError
-        If the image is not two-dimensional and finite, or a parameter out of range.
-    InversionCancelled
-        If `should_stop` returned true.
-
-    Notes
-    -----
-    The noise is read off the image: the differences to the local median are sorted by
-    brightness into groups of equal number, each group's variance is estimated by the median
-    absolute deviation, and a + b·brightness with a, b ≥ 0 (read-out and Poisson-like noise)
-    is fitted to them. The estimate includes the noise of the median itself, some 10 %; in
-    a slope of several deviations per pixel, the slope as well.
-
-    Caustics and foci also stand out, but span several pixels. A broken pixel must therefore
-    also differ, by half the threshold, from all of its neighbours except one. The peak of a
-    focus or line of less than some 4 px is still replaced, if its brightness is many
-    deviations: compare `hot` with the image, raise the threshold.
-
-    A dead pixel among N counts stands out by √N standard deviations: below threshold² counts
-    it cannot be distinguished from noise.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> image = np.random.default_rng(0).normal(100, 2, (40, 40))
-    >>> image[3, 5], image[20, 0] = 200, 0
-    >>> clean, hot, dead = remove_hot_pixels(image)
-    >>> np.argwhere(hot).tolist(), np.argwhere(dead).tolist()
-    ([[3, 5]], [[20, 0]])
-    """
-    values, _ = pixels.checked_pixels(image)
-    if not (isinstance(threshold, Real) and 0 < threshold < np.inf):
-        raise InputError(f"threshold is {threshold!r}, expected a number of deviations above 0")
-    local, bright, dark = _neighbours(values, Reporter(None, should_stop))
-    difference = values - local
-    limit = threshold * _noise(difference, local)
-    hot = (difference > limit) & (values - bright > peers * limit)
-    dead = (difference < -limit) & (dark - values > peers * limit)
-    return np.where(hot | dead, local, values), hot, dead
 
 
 def _neighbours(values: FloatArray, report: Reporter) -> tuple[FloatArray, FloatArray, FloatArray]:

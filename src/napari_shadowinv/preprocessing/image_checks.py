@@ -2,7 +2,7 @@
 
 - all of them, as cautions: `image_cautions`
 - of one image: `CheckedImage`, `stray_pixels`
-- of an image and its reference: `dark_level`, `ReferencePair`
+- of an image and its reference: `dark_level`, `is_negative`
 - pixels that carry no light, and are masked: `mask_gaps`, `mask_dark`
 
 An image must be linear in the fluence, without offset, and on the same pixels as its reference.
@@ -43,18 +43,6 @@ _INDEPENDENT_SHARE = 4 / 9  # of the differences in them, which share pixels
 
 
 @dataclass(frozen=True)
-class GapCheck:
-    """Limits of the marks by which a detector shows its gaps (`benchmarks/wrong_inputs.py`)."""
-
-    # Of types whose largest numbers mark gaps, and three below bad pixels
-    bits: tuple[int, ...] = (15, 16, 20, 24, 31, 32)
-    light: float = 0.5  # most of all other pixels, over the mark
-    marks: int = 3  # most negative ones, in one image
-    filled: float = 0.5  # least share of the pixels with a mark, in squares
-    side: int = 3  # of these squares, px
-
-
-@dataclass(frozen=True)
 class DarkCheck:
     """Limits of pixels without light, over the light elsewhere (`benchmarks/wrong_inputs.py`)."""
 
@@ -67,17 +55,6 @@ class DarkCheck:
     # Without a source a beam may fall smoothly, and an object pile up light around a hollow.
     sharp_edge: tuple[int, int] = (2, 4)
     sharply_lit: tuple[float, float] = (0.4, 1.5)
-
-
-@dataclass(frozen=True)
-class SaturationCheck:
-    """Limits of a plateau at the maximum (`benchmarks/wrong_inputs.py`)."""
-
-    pixels: int = 10  # fewest on it
-    share: float = 5e-4  # least of all pixels
-    rise: float = 1.15  # of the maximum over the median
-    below: float = 0.02  # of the range from median to maximum, that counts as just below
-    excess: float = 4.0  # pixels at the maximum over those just below
 
 
 @dataclass(frozen=True)
@@ -101,7 +78,6 @@ class CheckedImage:
 
     image: FloatArray  # 0 at pixels that are not usable
     usable: BoolArray
-    saturation: SaturationCheck = SaturationCheck()
     bins: int = 20  # of brightness, in which noise is measured
     left_out: float = 0.05  # share of the brightest pixels there: bright lines are not smooth
     least_noise: float = 1e-4  # of the brightness; less are the bends of an image without noise
@@ -113,11 +89,6 @@ class CheckedImage:
         return cls(image if usable.all() else np.where(usable, image, 0.0), usable)
 
     @cached_property
-    def is_uniform(self) -> bool:
-        """Whether all usable pixels are the same."""
-        return not np.ptp(self.image[self.usable]) > 0
-
-    @cached_property
     def stray(self) -> BoolArray:
         """The `stray_pixels`, shape (H, W)."""
         return stray_pixels(self.image, self.usable)
@@ -125,17 +96,8 @@ class CheckedImage:
     @cached_property
     def saturated(self) -> float:
         """Share of the other pixels on a plateau at the maximum; 0 if there is none."""
-        used, check = self.usable & ~self.stray, self.saturation
-        values = self.image.ravel() if used.all() else self.image[used]
-        top = float(values.max())
-        at_top = int((values == top).sum())
-        if at_top < max(check.pixels, check.share * values.size):
-            return 0.0
-        median = float(np.median(values))
-        if not top > check.rise * median:
-            return 0.0
-        just_below = int((values > top - check.below * (top - median)).sum()) - at_top
-        return at_top / values.size if at_top > check.excess * just_below else 0.0
+        used = self.usable & ~self.stray
+        return _saturated(self.image.ravel() if used.all() else self.image[used])
 
     @cached_property
     def _local(self) -> tuple[FloatArray, FloatArray]:
@@ -194,13 +156,11 @@ class CheckedImage:
         is_noise = (noise > 0).all() and np.median(noise) > self.least_noise * levels.mean()
         if not (is_noise and np.ptp(levels) > 0):
             return 0.0
-        weights = 1 / (noise * uncertainty)
-        levels = levels - np.average(levels, weights=weights**2)
-        variances = noise**2 - np.average(noise**2, weights=weights**2)
-        information = float(((levels * weights) ** 2).sum())
-        slope = float((levels * variances * weights**2).sum()) / information
-        misfit = float((((variances - slope * levels) * weights) ** 2).sum()) / (len(levels) - 2)
-        return slope * math.sqrt(information / max(misfit, 1.0))
+        variances, weights = noise**2, 1 / (noise * uncertainty)
+        line, covariance = np.polyfit(levels, variances, 1, w=weights, cov="unscaled")
+        misfit = float((((variances - np.polyval(line, levels)) * weights) ** 2).mean())
+        freedom = (len(levels) - 2) / len(levels)
+        return float(line[0]) / math.sqrt(covariance[0, 0] * max(misfit / freedom, 1.0))
 
     @cached_property
     def relative_differences(self) -> FloatArray:
@@ -211,18 +171,35 @@ class CheckedImage:
         return np.clip(values, -limit, limit)
 
 
+def _saturated(
+    values: FloatArray,
+    *,
+    pixels: int = 10,  # fewest on the plateau
+    share: float = 5e-4,  # least of all pixels
+    rise: float = 1.15,  # of the maximum over the median
+    below: float = 0.02,  # of the range from median to maximum, that counts as just below
+    excess: float = 4.0,  # pixels at the maximum over those just below
+) -> float:
+    top = float(values.max())
+    at_top = int((values == top).sum())
+    if at_top < max(pixels, share * values.size):
+        return 0.0
+    median = float(np.median(values))
+    just_below = int((values > top - below * (top - median)).sum()) - at_top
+    is_plateau = top > rise * median and at_top > excess * just_below
+    return at_top / values.size if is_plateau else 0.0
+
+
 def mask_gaps(
     plane: FloatArray, mask: BoolArray | None, name: str
 ) -> tuple[BoolArray | None, list[Caution]]:
     """Mask the pixels that a detector has marked, as gaps between its modules.
 
-    Marks are the largest numbers of an integer type, if no light comes near, and negative whole
-    numbers that fill areas. Returns the mask, and a caution if it has changed.
+    Marks are the largest numbers of an integer type, if no light comes near, and up to three
+    negative whole numbers that fill areas. Returns the mask, and a caution if it has changed.
     """
     usable = np.ones(plane.shape, bool) if mask is None else mask
-    gaps = np.zeros(plane.shape, bool)
-    while (marked := _marked_pixels(plane, usable & ~gaps)) is not None:
-        gaps |= marked
+    gaps = _marked_pixels(plane, usable)
     if not gaps.any() or not (usable & ~gaps).any():
         return mask, []
     marks = ", ".join(f"{value:.0f}" for value in np.unique(plane[gaps]))
@@ -235,30 +212,26 @@ def mask_gaps(
 
 
 def _marked_pixels(
-    plane: FloatArray, usable: BoolArray, check: GapCheck = GapCheck()
-) -> BoolArray | None:
-    """Return the usable pixels with one more mark; None if there is none."""
-    if not usable.any():
-        return None
-    values = plane[usable]
-    highest, lowest = float(values.max()), float(values.min())
-    if any(-1 <= 2.0**bits - highest <= 3 for bits in check.bits):
-        marked = usable & (plane > highest - 3)
-        others = values[values <= highest - 3]
-        is_gap = ndimage.binary_erosion(marked, np.ones((2, 2))).any()
-        if is_gap and others.size and others.max() < check.light * highest:
-            return marked
-    if not lowest < 0:
-        return None
-    negative = np.unique(values[values < 0])
-    for mark in (negative[-1], lowest):
-        marked = usable & (plane <= mark)
-        marks = negative[negative <= mark]
-        if len(marks) <= check.marks and (marks == np.rint(marks)).all():
-            filled = ndimage.binary_opening(marked, np.ones((check.side, check.side)))
-            if filled.sum() >= check.filled * marked.sum():
-                return marked
-    return None
+    plane: FloatArray,
+    usable: BoolArray,
+    *,
+    bits: tuple[int, ...] = (15, 16, 20, 24, 31, 32),  # of types whose three largest are marks
+    light: float = 0.5,  # most of all other pixels, over these
+    marks: int = 3,  # most negative ones
+    filled: float = 0.5,  # least share of the pixels with a negative mark, in squares of 3 px
+) -> BoolArray:
+    gaps = usable & (plane < 0)
+    values = np.unique(plane[gaps])
+    is_mark = 0 < len(values) <= marks and (values == np.rint(values)).all()
+    squares = ndimage.binary_opening(gaps, np.ones((3, 3))) if is_mark else gaps
+    gaps &= bool(is_mark and squares.sum() >= filled * gaps.sum())
+    highest = float(plane.max(where=usable, initial=-np.inf))
+    if any(-1 <= 2.0**each - highest <= 3 for each in bits):
+        top = usable & (plane > highest - 3)
+        others = float(plane.max(where=usable & ~top, initial=-np.inf))
+        is_area = ndimage.binary_erosion(top, np.ones((2, 2))).any()
+        gaps |= top & bool(is_area and -np.inf < others < light * highest)
+    return gaps
 
 
 def mask_dark(
@@ -387,7 +360,7 @@ def image_cautions(
     """
     if isinstance(source, np.ndarray):
         source = CheckedImage.of(source, mask)
-    if source is not None and source.is_uniform:
+    if source is not None and not np.ptp(source.image[source.usable]) > 0:
         source = None  # an assumed beam
     return tuple(_cautions(CheckedImage.of(image, mask), source))
 
@@ -419,15 +392,15 @@ def _cautions(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
     if source is None:
         return
     used = image.usable & ~(image.stray | source.stray)
-    pair = ReferencePair(image.image, source.image, used)
-    if sign := _sign_of_negative(image, source, pair):
+    pair = _pair_in_blocks(image.image, source.image, used)
+    if sign := _sign_of_negative(image, source, is_negative(*pair)):
         yield Caution(
             "negative",
             f"negative: {sign}, as in a negative or a scan of film: the field would have the wrong "
             "sign and size; convert the film to dose, or subtract its pixels from those of "
             "unexposed film",
         )
-    elif pair.is_swapped:
+    elif _is_swapped(*pair):
         yield Caution(
             "swapped",
             "swapped: the source has far more structure than the image, so the two seem to be "
@@ -436,10 +409,10 @@ def _cautions(image: CheckedImage, source: CheckedImage | None) -> Iterator[Caut
 
 
 def _sign_of_negative(
-    image: CheckedImage, source: CheckedImage, pair: ReferencePair, *, least_fall: float = 4.0
+    image: CheckedImage, source: CheckedImage, is_reversed: bool, *, least_fall: float = 4.0
 ) -> str:
     """Return what shows that an image, or it and its source, is a negative; empty if nothing."""
-    if pair.is_negative:
+    if is_reversed:
         return "the image is dark where it should be bright"
     # A modelled or smoothed source has no noise, but bends, which are steepest beside its peak. The
     # fall of the noise with the brightness is in standard deviations.
@@ -478,7 +451,7 @@ def stray_pixels(
 ) -> BoolArray:
     """Return the pixels that are far brighter, or darker, than each of their neighbours.
 
-    A quick look for broken pixels; `remove_hot_pixels` searches more thoroughly. Pixels with a
+    A quick look for broken pixels; `HotPixelFilter` searches more thoroughly. Pixels with a
     neighbour that is not usable are left out.
     """
     stray = np.zeros(image.shape, bool)
@@ -494,21 +467,20 @@ def stray_pixels(
     if not rows.size:
         return stray
     rows, columns = rows + 1, columns + 1
-    next_to = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x]
-    neighbours = np.stack([image[rows + y, columns + x] for y, x in next_to])
-    centre, highest, lowest = image[rows, columns], neighbours.max(axis=0), neighbours.min(axis=0)
+    padded = np.pad(image, 1, mode="edge")
+    around = sliding_window_view(padded, (5, 5))[rows - 1, columns - 1]
+    is_next = np.pad(np.ones((3, 3), bool), 1)
+    centre, ring = around[:, 2, 2], around[:, ~is_next]
+    is_next[2, 2] = False
+    neighbours = around[:, is_next]
+    highest, lowest = neighbours.max(axis=1), neighbours.min(axis=1)
     # Noise of counting grows with the brightness.
     limit = deviations * noise * np.sqrt(np.maximum(highest / mean, 1.0))
     is_hot = centre - highest > np.maximum(limit, (ratio - 1) * highest)
     is_dead = (lowest - centre > limit) & (lowest > ratio * centre)
     # A focus lifts its neighbours, too; a broken pixel is alone.
-    height, width = image.shape
-    ring = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if max(abs(y), abs(x)) == 2]
-    inside = [
-        (np.clip(rows + y, 0, height - 1), np.clip(columns + x, 0, width - 1)) for y, x in ring
-    ]
-    level = np.median([image[place] for place in inside], axis=0)
-    most = np.abs(neighbours - level).max(axis=0)
+    level = np.median(ring, axis=1)
+    most = np.abs(neighbours - level[:, None]).max(axis=1)
     alone = most < limit / 3 + difference * np.abs(level)
     stray[rows, columns] = (is_hot | is_dead) & alone
     if not usable.all():
@@ -516,71 +488,65 @@ def stray_pixels(
     return stray
 
 
-@dataclass(frozen=True, eq=False)
-class ReferencePair:
-    """An image and its reference, compared in blocks of pixels.
+def _pair_in_blocks(
+    image: FloatArray, source: FloatArray, mask: BoolArray, side: int = 128
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return image and source in `side` blocks or fewer, of mean 1, and the blocks to use."""
+    step = max(1, -(-max(image.shape) // side))
+    usable = complete_blocks(mask, step)
+    planes = [complete_block_means(plane, step) for plane in (image, source)]
+    shot, beam = (plane / max(float(plane[usable].mean()), 1e-300) for plane in planes)
+    return shot, beam, usable
 
-    Attributes
-    ----------
-    image, source : ndarray, shape (H, W)
-        In any units.
-    mask : ndarray of bool, shape (H, W)
-        True at usable pixels.
+
+def is_negative(
+    shot: FloatArray,
+    beam: FloatArray,
+    usable: BoolArray,
+    *,
+    least_blocks: int = 16,
+    least_contrast: float = 0.01,  # of the structure, over the mean
+    correlation: float = -0.4,
+) -> bool:
+    """Return whether the image is dark at its borders where its beam is bright, both in blocks."""
+    ring = usable & border_ring(usable.shape)
+    if ring.sum() < least_blocks:
+        return False
+    # Structure that neighbouring blocks share is free of noise.
+    if math.sqrt(max(_neighbour_covariance(beam, beam, ring), 0.0)) < least_contrast:
+        return False
+    shot, beam = (plane[ring] - plane[ring].mean() for plane in (shot, beam))
+    # Not by BLAS, whose threads would wait in circles.
+    product = float((shot * beam).sum())
+    size = float(np.sqrt((shot**2).sum() * (beam**2).sum()))
+    return product / max(size, 1e-300) < correlation
+
+
+def _is_swapped(
+    shot: FloatArray,
+    beam: FloatArray,
+    usable: BoolArray,
+    *,
+    least_blocks: int = 16,
+    least_contrast: float = 0.01,  # of the structure, over the mean
+    detail: int = 9,  # blocks, of the structure of an object
+    share: float = 0.75,
+) -> bool:
+    """Return whether the source contains the structure that the image lacks, both in blocks.
+
+    An object adds to a beam a difference that is not in the beam. That difference is correlated
+    with the image (by its variance) and not with the source. For a mere shift of a beam it is half
+    and half; where the two are swapped, the source has it all.
     """
-
-    image: FloatArray
-    source: FloatArray
-    mask: BoolArray
-    side: int = 128  # most blocks along the longer side
-    least_blocks: int = 16  # that are usable
-    least_contrast: float = 0.01  # of the structure, over the mean
-    negative_correlation: float = -0.4
-    detail: int = 9  # blocks, of the structure of an object
-    swapped_share: float = 0.75  # see `is_swapped`
-
-    @cached_property
-    def is_negative(self) -> bool:
-        """Whether the image is dark at its borders where its beam is bright."""
-        shot, beam, usable = self._blocks
-        ring = usable & border_ring(usable.shape)
-        if ring.sum() < self.least_blocks:
-            return False
-        # Structure that neighbouring blocks share is free of noise.
-        if math.sqrt(max(_neighbour_covariance(beam, beam, ring), 0.0)) < self.least_contrast:
-            return False
-        shot, beam = (plane[ring] - plane[ring].mean() for plane in (shot, beam))
-        # Not by BLAS, whose threads would wait in circles.
-        product = float((shot * beam).sum())
-        size = float(np.sqrt((shot**2).sum() * (beam**2).sum()))
-        return product / max(size, 1e-300) < self.negative_correlation
-
-    @cached_property
-    def is_swapped(self) -> bool:
-        """Whether the source contains the structure that the image lacks.
-
-        An object adds to a beam a difference that is not in the beam. That difference is
-        correlated with the image (by its variance) and not with the source. For a mere shift of a
-        beam it is half and half; where the two are swapped, the source has it all.
-        """
-        shot, beam, usable = self._blocks
-        if usable.sum() < self.least_blocks:
-            return False
-        difference, beam = (np.where(usable, plane, 0.0) for plane in (shot - beam, beam - 1))
-        difference -= ndimage.uniform_filter(difference, self.detail)
-        beam -= ndimage.uniform_filter(beam, self.detail)
-        size = _neighbour_covariance(difference, difference, usable)
-        if size < self.least_contrast**2:
-            return False
-        return -_neighbour_covariance(difference, beam, usable) > self.swapped_share * size
-
-    @cached_property
-    def _blocks(self) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Image and source in blocks of pixels, of mean 1, and the blocks that are usable."""
-        step = max(1, -(-max(self.image.shape) // self.side))
-        usable = complete_blocks(self.mask, step)
-        planes = [complete_block_means(plane, step) for plane in (self.image, self.source)]
-        shot, beam = (plane / max(float(plane[usable].mean()), 1e-300) for plane in planes)
-        return shot, beam, usable
+    if usable.sum() < least_blocks:
+        return False
+    difference, beam = (np.where(usable, plane, 0.0) for plane in (shot - beam, beam - 1))
+    difference -= ndimage.uniform_filter(difference, detail)
+    beam -= ndimage.uniform_filter(beam, detail)
+    size = _neighbour_covariance(difference, difference, usable)
+    if size < least_contrast**2:
+        return False
+    return -_neighbour_covariance(difference, beam, usable) > share * size
 
 
 def border_ring(shape: tuple[int, ...], share: float = 0.2) -> BoolArray:
@@ -644,13 +610,11 @@ def _offset(bins: FloatArray, max_pattern: float, min_gain: float, check: DarkLe
     distance = freely
     if terms[2] > max_pattern:
         distance = nonnegative_fit(powers[:, :2], weighted - max_pattern * powers[:, 2])[1]
-    # Weighted least squares of v = g (m - D).
-    line = powers[:, [1, 0]] * [1.0, -1.0]
-    (gain, offset), *_ = np.linalg.lstsq(line, weighted, rcond=None)
+    gain, constant = np.polyfit(levels, variances, 1, w=weights)
     if not gain > 0:
         return 0.0
-    with_offset = float(((gain * line[:, 0] + offset * line[:, 1] - weighted) ** 2).sum())
-    dark = float(offset / gain)
+    with_offset = float((((gain * levels + constant) * weights - weighted) ** 2).sum())
+    dark = -float(constant / gain)
     chi2 = max(1.0, with_offset / (len(levels) - 2))
     least = (min_gain if highest > check.wide_range * lowest else check.narrow_gain) * chi2
     # Noise in proportion to the signal that differs between shots, as of speckle, has no line.

@@ -35,18 +35,6 @@ _FREE = 6  # terms of a quadratic
 _LEAST_CHANGE = 1e-4  # of the logarithm, as smooth beams are no exact sums of waves
 
 
-@dataclass(frozen=True)
-class HaloCheck:
-    """Limits of what the beam next to hidden blocks shows (tests/preprocessing/test_kriging.py)."""
-
-    rim: float = 0.15  # its width over the largest distance to a hidden block
-    rim_blocks: float = 1.5  # at least
-    places: int = 400  # most hidden blocks that are compared
-    share: float = 0.9  # of the variance, in shapes that are compared
-    shapes: int = 6  # at most
-    chance: float = 1e-4  # of a larger difference
-
-
 def kriged_source(
     values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution
 ) -> FloatArray:
@@ -149,16 +137,26 @@ def _least_blocks(bare: BoolArray, share: float = 0.1, count: int = 20) -> float
     return max(share * bare.size, count)
 
 
-def _halo_caution(blocks: _Blocks, fit: _Fit, check: HaloCheck = HaloCheck()) -> Caution | None:
+def _halo_caution(
+    blocks: _Blocks,
+    fit: _Fit,
+    *,
+    rim: float = 0.15,  # its width over the largest distance to a hidden block
+    rim_blocks: float = 1.5,  # at least
+    most_places: int = 400,  # hidden blocks that are compared
+    share: float = 0.9,  # of the variance, in shapes that are compared
+    most_shapes: int = 6,
+    least_chance: float = 1e-4,  # of a larger difference; see tests/preprocessing/test_kriging.py
+) -> Caution | None:
     """Warn if blocks next to the hidden ones change their prediction by more than its variance."""
     hidden = ~blocks.bare
     if not hidden.any():
         return None
     rows, columns = np.nonzero(hidden)
-    step = -(-len(rows) // check.places)
+    step = -(-len(rows) // most_places)
     places = rows[::step], columns[::step]
     depth, distance = (scipy.ndimage.distance_transform_edt(part) for part in (hidden, ~hidden))
-    farther = blocks.bare & (distance > max(check.rim * float(depth.max()), check.rim_blocks))
+    farther = blocks.bare & (distance > max(rim * float(depth.max()), rim_blocks))
     if farther.sum() < _least_blocks(farther):
         return None
     without_rim = _Fit.to(fit.functions, farther, blocks.logs[farther], blocks.counts[farther])
@@ -167,13 +165,13 @@ def _halo_caution(blocks: _Blocks, fit: _Fit, check: HaloCheck = HaloCheck()) ->
     spread, wider = (each.deviations[places] for each in (fit, without_rim))
     powers, shapes = scipy.linalg.eigh(wider @ wider.T - spread @ spread.T)
     powers, shapes = powers[::-1], shapes[:, ::-1]
-    share = np.cumsum(np.maximum(powers, 0)) / max(float(powers[powers > 0].sum()), 1e-300)
-    count = min(int(np.searchsorted(share, check.share)) + 1, check.shapes)
+    shares = np.cumsum(np.maximum(powers, 0)) / max(float(powers[powers > 0].sum()), 1e-300)
+    count = min(int(np.searchsorted(shares, share)) + 1, most_shapes)
     amplitudes = shapes[:, :count].T @ change
     least = _LEAST_CHANGE**2 * len(change)  # of an image without noise
     square = float((amplitudes**2 / np.maximum(powers[:count], least)).sum())
     chance = scipy.special.gammaincc(count / 2, square / 2)  # of a larger χ²
-    if chance > check.chance:
+    if chance > least_chance:
         return None
     text = (
         "the image next to the source mask is not as the beam farther away predicts it, by "

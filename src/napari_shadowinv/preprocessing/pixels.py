@@ -12,7 +12,7 @@ import scipy
 from numpy.polynomial.legendre import legvander
 from numpy.typing import ArrayLike
 
-from napari_shadowinv._system.progress import Reporter, ShouldStop
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.physics.arrays import (
@@ -25,18 +25,12 @@ from napari_shadowinv.physics.arrays import (
 from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 
 
-def with_filled_part(values: FloatArray, usable: BoolArray, report: Reporter) -> FloatArray:
-    """Return a beam whose part that is not usable is filled in from its surroundings."""
-    beam = np.where(usable, values, fill_masked(values, usable, report))
-    return with_flux_of(beam, values, usable)
-
-
-def fill_masked(
+def with_filled_part(
     values: FloatArray, usable: BoolArray, report: Reporter, width: float = 5.0
 ) -> FloatArray:
-    """Fit a smoothing spline to the usable pixels and continue it over the others.
+    """Return a beam whose part that is not usable continues a smoothing spline to the others.
 
-    The filling u, a thin plate, minimises ∑(u - value)² over the usable pixels + width⁴ ∑ (Δu)²
+    The spline u, a thin plate, minimises ∑(u - value)² over the usable pixels + width⁴ ∑ (Δu)²
     over all, with mirrored borders, by conjugate gradients preconditioned with the discrete cosine
     transform, from coarse to fine (D. Garcia, Comput. Stat. Data Anal. 54, 1167 (2010)).
     """
@@ -44,7 +38,8 @@ def fill_masked(
     # small spots, fields change by 0.4 to 7 noise errors.
     mean = values[usable].mean()
     weighted = np.where(usable, values / mean, 0.0)
-    return np.asarray(_spline(weighted, usable.astype(float), width, report) * mean)
+    filling = _spline(weighted, usable.astype(float), width, report) * mean
+    return with_flux_of(np.where(usable, values, filling), values, usable)
 
 
 def _spline(weighted: FloatArray, share: FloatArray, width: float, report: Reporter) -> FloatArray:
@@ -141,40 +136,13 @@ def with_flux_of(
 
 
 def fit_polynomial(
-    image: ArrayLike,
-    degree: int,
-    *,
-    mask: ArrayLike | None = None,
-    should_stop: ShouldStop | None = None,
+    values: FloatArray, usable: BoolArray, degree: int, report: Reporter
 ) -> FloatArray:
-    """Fit a polynomial in y and x, of a total degree from 0 to 10, robust against outliers.
+    """Fit a polynomial in y and x, of a total degree, robust against outliers, to usable pixels.
 
     Iteratively reweighted least squares of the soft L1 loss: residuals count squared within the
     noise (the median absolute deviation of the residuals), in proportion beyond.
-
-    Parameters
-    ----------
-    image : array_like, shape (H, W)
-        An image or a potential, any unit.
-    degree : int
-    mask : array_like of bool, shape (H, W), optional
-        True where the fit may look. Default: everywhere.
-    should_stop : callable, optional
-        Called at each step; `InversionCancelled` when it returns true.
-
-    Returns
-    -------
-    ndarray of float64, shape (H, W)
-        The polynomial at all pixels, also where the mask is false.
-
-    Raises
-    ------
-    InputError
-        If image, mask or degree cannot be used, or usable pixels are fewer than coefficients.
     """
-    values, usable = checked_pixels(image, mask)
-    if degree not in range(11):
-        raise InputError(f"degree is {degree!r}, expected a whole number from 0 to 10")
     terms = (degree + 1) * (degree + 2) // 2
     if usable.sum() < terms:
         raise InputError(
@@ -186,7 +154,6 @@ def fit_polynomial(
     )
     fit = _weighted_fit(values, usable.astype(np.float64), rows, columns)
     rounding = 1e-12 * float(np.abs(values).max())
-    report = Reporter(None, should_stop)
     for step in range(50):
         report("fit", step)
         residual = values - fit

@@ -8,9 +8,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
@@ -127,18 +125,7 @@ class Step(Choice):
         return np.eye(3)
 
 
-def _as_level(value: Any) -> Any:
-    """Read a finite number, or else the name of a file."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        return value
-    if not math.isfinite(number):
-        raise ValueError("expected a finite number of counts, or the name of a file")
-    return number
-
-
-Level = Annotated[float | Path, BeforeValidator(_as_level)]
+Level = Annotated[float | Path, Field(union_mode="left_to_right")]
 """A number of counts, or a file with an image of them."""
 
 
@@ -187,69 +174,33 @@ class Dark(Step):
 
 
 class Rotate(Step):
-    """Rotate about the image centre; exact for multiples of 90°.
-
-    Other angles interpolate linearly between pixels and keep the image's size; corners without data
-    are masked.
-    """
+    """Rotate by a multiple of 90° about the image centre."""
 
     title = "rotate"
     primary = "angle"
     place = 10
     step: Literal["rotate"] = "rotate"
-    angle: float = Field(
-        default=90.0,
+    angle: int = Field(
+        default=90,
         ge=-360,
         le=360,
-        allow_inf_nan=False,
+        multiple_of=90,
         title="Angle (°)",
-        description="Counter-clockwise rotation in degrees, about the image centre.",
+        description="Counter-clockwise rotation in degrees, a multiple of 90.",
     )
 
-    @property
-    def _turns(self) -> int | None:
-        turns, remainder = divmod(self.angle, 90)
-        return None if remainder else int(turns) % 4
-
-    @property
-    def smooths(self) -> bool:
-        return self._turns is None
-
     def apply(self, shot: Shot, should_stop: ShouldStop | None = None) -> Shot:
-        turns = self._turns
-
         def turn(array: AnyArray) -> Any:
-            return np.ascontiguousarray(np.rot90(array, turns or 0))
+            return np.ascontiguousarray(np.rot90(array, self.angle // 90))
 
-        rotated = self._interpolate(shot) if turns is None else shot.map_planes(turn, turn)
-        return rotated.add_notes(f"rotated by {self.angle:g}°")
-
-    def _interpolate(self, shot: Shot, least: float = 0.999) -> Shot:
-        """Rotate by any angle; a pixel can be used if a least share of it has data."""
-        from skimage.transform import rotate
-
-        turn: Callable[[AnyArray], FloatArray] = partial(
-            rotate, angle=self.angle, order=1, preserve_range=True
-        )
-        usable = shot.usable
-        share = turn(usable.astype(np.float64))
-        mask = share > least
-
-        def values(image: FloatArray) -> FloatArray:
-            moved = turn(np.where(usable, image, 0.0))
-            return np.where(mask, moved / np.maximum(share, least), 0.0)
-
-        rotated = shot.map_planes(values, lambda bare: turn(bare.astype(np.float64)) > 0.5)
-        return replace(rotated, mask=mask)
+        return shot.map_planes(turn, turn).add_notes(f"rotated by {self.angle}°")
 
     def shape_after(self, shape: tuple[int, int]) -> tuple[int, int]:
-        return shape[::-1] if self._turns in (1, 3) else shape
+        return shape[::-1] if self.angle % 180 else shape
 
     def matrix(self, shape: tuple[int, int]) -> FloatArray:
         angle = math.radians(self.angle)
-        cos, sin = math.cos(angle), math.sin(angle)
-        if self._turns is not None:
-            cos, sin = round(cos), round(sin)
+        cos, sin = round(math.cos(angle)), round(math.sin(angle))
         before, after = ((np.array(sides) - 1) / 2 for sides in (shape, self.shape_after(shape)))
         turn = np.array([[cos, sin], [-sin, cos]])
         matrix = np.eye(3)
