@@ -66,14 +66,6 @@ def test_all_files_are_written(result: Path, setup_file: Path, tmp_path: Path) -
     done("analyse", "a.shadowinv", CIRCLE, *FEW)
 
 
-def test_products_come_from_a_file(result: Path, tmp_path: Path) -> None:
-    file = tmp_path / "products.toml"
-    file.write_text(
-        '[[products]]\nproduct = "region"\ncenter = [23.5, 23.5]\nradius = 9\nlabel = "core"\n'
-    )
-    assert "core (core)" in done("analyse", result, "--products", file, *FEW)
-
-
 def test_every_product_is_listed_with_its_choices(result: Path) -> None:
     text = flat(shadowinv("analyse", result).stderr)
     for name in (*PRODUCTS, "[smoothing="):

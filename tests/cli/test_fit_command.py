@@ -223,8 +223,6 @@ def test_forward_takes_a_field_of_a_fit(make_fit: Callable[..., Fit]) -> None:
     done("forward", "fit.shadowinv", "--out", "seen.npy")
     expected = synthetic_image(fit.fields[0].displacement, fit.source[0])
     np.testing.assert_array_equal(np.load("seen.npy"), expected)
-    write("both.shadowinv", make_fit(names=("B", "E")))
-    done("forward", "both.shadowinv::displacement_E")
 
 
 def test_a_fitted_field_is_predicted_by_its_own_cause(make_fit: Callable[..., Fit]) -> None:

@@ -10,6 +10,7 @@ import pytest
 import xarray as xr
 
 from helpers.command_line import done, flat, shadowinv
+from napari_shadowinv import invert, synthetic_image, write
 from napari_shadowinv.physics.phantoms import gaussian_blob
 
 SETUP = """
@@ -59,10 +60,10 @@ def test_particles_are_traced_through_a_field_on_a_grid(folder):
     assert "would be determined: 2 of 2" in done("plan", "cube.nc", *view, *exact)
 
 
-def test_the_object_of_a_file_is_a_displacement(folder):
-    np.save(folder / "c:field.npy", gaussian_blob((64, 64), 15, 6).displacement)
+def test_the_object_of_a_file_is_that_of_a_result(folder):
+    write("c:field.shadowinv", invert(synthetic_image(gaussian_blob((64, 64), 15, 6).displacement)))
     exact = ("--set=plan.draws=2", "--set=instrument.beam_rms=0", "--counts", 10_000)
-    assert done("plan", "c:field.npy", *exact, "--quiet") == ""
+    assert done("plan", "c:field.shadowinv", *exact, "--quiet") == ""
 
 
 def test_a_field_that_would_not_be_determined_has_an_exit_code(folder):

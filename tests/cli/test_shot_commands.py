@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import h5py
 import imageio.v3 as iio
@@ -150,24 +149,17 @@ def test_an_output_replaces_what_is_no_input(folder: Path) -> None:
 
 
 def test_forward_predicts_the_image(folder: Path, shot: Path) -> None:
-    np.save("d.npy", BLOB.displacement)
+    done("invert", shot)
+    saved = read("shot.shadowinv")
+    done("forward", "shot.shadowinv", "--out", "again.npy")
+    np.testing.assert_allclose(np.load("again.npy"), saved["reprojection"], rtol=1e-12)
     source = np.linspace(1, 2, 24 * 32).reshape(24, 32)
     np.save("beam.npy", source)
-    done("forward", "d.npy", "--source", "beam.npy")
-    image = tifffile.imread("d_image.tif")
+    done("forward", "shot.shadowinv", "--source", "beam.npy")
+    image = tifffile.imread("shot_image.tif")
     assert image.dtype == np.float32
-    np.testing.assert_allclose(image, synthetic_image(BLOB.displacement, source), rtol=1e-6)
-    uniform = synthetic_image(BLOB.displacement)
-    savemat("shots.mat", {"phi": BLOB.potential, "beam": source})
-    with h5py.File("shots.h5", "w") as file:
-        file["day/d"] = BLOB.displacement
-    for field, tolerance in (("shots.mat::phi", 0.05), ("shots.h5::day/d", 0)):
-        done("forward", field, "--out", "seen.npy", "--overwrite")
-        np.testing.assert_allclose(np.load("seen.npy"), uniform, atol=tolerance)
-    done("invert", shot)
-    done("forward", "shot.shadowinv", "--out", "again.npy")
-    saved = read("shot.shadowinv")
-    np.testing.assert_allclose(np.load("again.npy"), saved["reprojection"], rtol=1e-12)
+    expected = synthetic_image(saved["displacement"].values, source)
+    np.testing.assert_allclose(image, expected, rtol=1e-6)
 
 
 def test_forward_traces_a_3d_field(folder: Path) -> None:
@@ -180,13 +172,9 @@ def test_forward_traces_a_3d_field(folder: Path) -> None:
     ).to_netcdf("grid.nc", engine="h5netcdf")
     (folder / "setup.toml").write_text(PROTON_TOML)
     view = ("--set=view.right=-x", "--set=view.height=20", "--set=view.width=30")
-    files = ("--truth", "truth.nc", "--out", "image.tif")
-    traced = done("forward", "grid.nc", "--setup", "setup.toml", *view, *files)
+    traced = done("forward", "grid.nc", "--setup", "setup.toml", *view, "--out", "image.tif")
     assert "faces reaches 100 %" in traced
     assert tifffile.imread("image.tif").shape == (20, 30)
-    with xr.open_dataset("truth.nc", engine="h5netcdf") as truth:
-        field = truth["path_integrated_b"].sel(component="y").values
-    np.testing.assert_allclose(field[10, 15], -0.5 * 4e-4, rtol=1e-6)
 
 
 def test_geometry_in_a_file_is_used_and_shown(folder: Path) -> None:
@@ -195,7 +183,7 @@ def test_geometry_in_a_file_is_used_and_shown(folder: Path) -> None:
     save_pradformat(folder / "half.h5", image, **geometry)
     save_pradformat(folder / "all.h5", image, **geometry, spec_energy=14.7e6)
     text = done("info", "half.h5")
-    for words in ("radiograph", "source object distance (m) 0.01", "not the energy; give it"):
+    for words in ("pradformat image", "source object distance (m) 0.01", "not the energy; give it"):
         assert words in text
     assert "14.7 MeV proton, magnification 31, pixel 10 µm at the object" in done("info", "all.h5")
     # What the file leaves out comes from the setup, with and without a kind.
@@ -229,7 +217,7 @@ DESCRIBED = {
     "a.npy": "(2, 3)|float64|-3, 1.8, 5|negative 1 values|NaN or infinite 1 values",
     "film.tif": "TIFF picture, 16 bits|channels 3|detector pixel size (m) 2e-05"
     "|turned upright as the file says|not proportional to the light",
-    "shots.mat::beam": "array 'beam' of a MATLAB file|90, 100, 110",
+    "shots.mat::beam": "mat image, array 'beam'|90, 100, 110",
     "shots.h5::day/d": "(2, 24, 32)",
     "kept.shadowinv": "another program|14.7 MeV proton",
     "fit.shadowinv": "one of several peak |; 2 different fields explain the data"
@@ -313,23 +301,6 @@ def test_setup_warnings_come_before_the_work(
     lines = shadowinv(*command.split(), "--setup", "swapped.toml").stderr.splitlines()
     assert lines[0].startswith(DOUBT)
     assert lines[-1].endswith("the work began")
-
-
-@pytest.mark.usefixtures("no_causes")
-@pytest.mark.parametrize("command", ["invert shot.npy", "rerun shot.shadowinv", "fit wide.npy"])
-def test_a_doubtful_setup_is_printed_once(command: str, shot: Path) -> None:
-    Path("swapped.toml").write_text(SWAPPED)
-    np.save("wide.npy", np.tile(np.load(shot), (2, 2)))
-    keys = ("samples=0", "max_iterations=1", "spacing=0.5", "smoothness=10")
-    quick = [f"--set=fit.options.{key}" for key in keys] if command.startswith("fit") else []
-    setup = () if command.startswith("rerun") else ("--setup", "swapped.toml", *quick)
-    if not setup:
-        done("invert", shot, "--setup", "swapped.toml", "--set=options.n_sites=200")
-    result = shadowinv(*command.split(), *setup)
-    assert flat(result.stderr).count(DOUBT) == 1
-    assert DOUBT not in flat(result.stdout)
-    written = "wide_fit.shadowinv" if command.startswith("fit") else "shot.shadowinv"
-    assert DOUBT in done("info", written)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names there are text")
@@ -422,29 +393,13 @@ def test_a_full_disk_costs_the_figure_but_not_the_result(
     result = shadowinv(
         "invert", shot, "--set=options.n_sites=300", "--out", out, "--figure", figure
     )
-    assert result.exit_code == (2 if full == "result" else 1)
+    assert result.exit_code == 2
     (line,) = result.stderr.splitlines()
     assert f"{disk}/a." in line
     assert "cannot be written (No space left on device): free some disk space" in line
     assert [path.name for path in disk.iterdir()] == ["other"]
     is_written = full == "figure"
     assert sorted(content(shot.parent)) == ["a.shadowinv"] * is_written + ["shot.npy"]
-
-
-def test_a_figure_that_fails_does_not_cost_the_result(
-    folder: Path, shot: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*arguments: Any, **keywords: Any) -> None:
-        raise RuntimeError("latex was not able to process it")
-
-    monkeypatch.setattr("napari_shadowinv.plotting.figures.report_figure", fail)
-    result = shadowinv("invert", shot, "--set=options.n_sites=300")
-    assert result.exit_code == 1, result.output
-    assert sorted(content(folder)) == ["shot.npy", "shot.shadowinv"]
-    assert "the figure shot.png could not be drawn" in result.stderr
-    assert "latex was not able" in result.stderr
-    assert "shot.shadowinv" in result.stdout
-    assert "shot.png" not in result.stdout
 
 
 SIGNAL_IN_IMPORT = """

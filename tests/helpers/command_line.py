@@ -85,7 +85,7 @@ def pressing_ctrl_c(stage: str, pause: float = 0.0) -> Iterator[None]:
 
         yield show
 
-    with patch("napari_shadowinv.cli._terminal.progress_bars", bars):
+    with patch("napari_shadowinv.cli._terminal.progress_bar", bars):
         yield
     press.join()
 

@@ -1,4 +1,4 @@
-"""The status of a run: numbers of shots, rate and forecast, as all faces show them."""
+"""The status of a run: numbers of shots and rate, as all faces show them."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from napari_shadowinv.stack import RunStatus
 def test_text_names_numbers_above_zero_and_the_rest_follows_from_them(status, text):
     assert status.text == text
     status = RunStatus(total=12, done=8, failed=1, waiting=3, ended=6, seconds=12.0)
-    assert (status.rate, status.remaining) == (0.5, 6.0)
-    assert RunStatus(total=3, waiting=3).remaining is None
+    assert status.rate == 0.5
 
 
 def test_status_counts_shots_of_earlier_runs(make_night, out):

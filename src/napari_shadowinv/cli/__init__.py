@@ -23,8 +23,7 @@ from napari_shadowinv.cli import (
     _shot_commands,
     _stack_commands,
 )
-from napari_shadowinv.cli._terminal import EXIT_MISTAKE, notify_errors
-from napari_shadowinv.errors import InputError
+from napari_shadowinv.cli._terminal import EXIT_MISTAKE
 
 __all__ = ["app"]
 
@@ -44,19 +43,6 @@ def _show_version(is_requested: bool) -> None:
         raise typer.Exit
 
 
-@notify_errors
-def _check_environment() -> None:
-    """Refuse variables that break the import of numba; drop one that figures do not need."""
-    threads = os.environ.get("NUMBA_NUM_THREADS", "")
-    if threads.strip().lstrip("-").isdecimal() and int(threads) < 1:
-        raise InputError(
-            f"the environment variable NUMBA_NUM_THREADS is {threads}: expected 1 or more; unset "
-            "it, or use --set options.threads=1"
-        )
-    # Figures go to files; an unknown backend would break the import of matplotlib.
-    os.environ.pop("MPLBACKEND", None)
-
-
 @app.callback()
 def main(
     ctx: typer.Context,
@@ -68,7 +54,8 @@ def main(
     ] = False,
 ) -> None:
     """Retrieve deflection potentials and fields from shadowgrams and proton radiographs."""
-    _check_environment()
+    # Figures go to files; an unknown backend would break the import of matplotlib.
+    os.environ.pop("MPLBACKEND", None)
     if ctx.invoked_subcommand is None:
         typer.echo(ctx.get_help())
         raise typer.Exit(EXIT_MISTAKE)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,7 +11,7 @@ from typer import Option
 from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._inputs import read_setup
 from napari_shadowinv.cli._outputs import Outputs
-from napari_shadowinv.cli._summary import Rows, fact_rows, two_columns
+from napari_shadowinv.cli._summary import fact_rows, two_columns
 from napari_shadowinv.cli._terminal import notify_errors, say, work_callbacks
 from napari_shadowinv.errors import InputError
 
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
 HELP = {
     "products": "Products in quotes: name, points y,x in px, name=value.",
-    "file": "TOML file with a table 'products' for each.",
     "unit": "T m, MG µm, kG cm, V, m⁻², rad, px … Default: SI.",
     "figure": "Figure of the products: .png, .pdf or .svg.",
 }
@@ -32,29 +30,20 @@ shadowinv analyse night.shadowinv.zarr 'region center=99,99 radius=40' --times 1
 
 Without a product the command lists them.
 
-Exit codes: 0 written; 1 no figure; 2 invalid input; 130 cancelled.
+Exit codes: 0 written; 2 invalid input; 130 cancelled.
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class ProductFlags:
-    """Flags of the products and of their bands."""
-
-    products: Annotated[Path | None, Option(help=HELP["file"])] = None
-    unit: Annotated[str | None, Option(help=HELP["unit"])] = None
-    deflector: Annotated[str | None, Option(help="Field of a fit: B, E, plasma or phase.")] = None
-    samples: Annotated[int, Option(help="Samples of the field for the bands.", metavar="N")] = 100
-    setup: _flags.SetupFile = None
-    shots: _flags.ChosenShots = None
-    times: Annotated[str | None, Option(help="Seconds between shots, or a list for each.")] = None
-
-
 @notify_errors
-@_flags.takes_flags
 def analyse(
     result: Annotated[Path, _flags.argument(help="Result, or store of shots.")],
-    flags: ProductFlags,
     product: Annotated[list[str] | None, _flags.argument(help=HELP["products"])] = None,
+    unit: Annotated[str | None, Option(help=HELP["unit"])] = None,
+    deflector: Annotated[str | None, Option(help="Field of a fit: B, E, plasma or phase.")] = None,
+    samples: Annotated[int, Option(help="Samples of the field for the bands.", metavar="N")] = 100,
+    setup: _flags.SetupFile = None,
+    shots: _flags.ChosenShots = None,
+    times: Annotated[str | None, Option(help="Seconds between shots, or a list for each.")] = None,
     csv: Annotated[Path | None, Option(help="Table of all numbers with their bands.")] = None,
     figure: Annotated[Path | None, Option(help=HELP["figure"])] = None,
     out: Annotated[Path | None, Option(help="Copy of the result with the products.")] = None,
@@ -74,10 +63,10 @@ def analyse(
     from napari_shadowinv.io.store_shots import open_shots
     from napari_shadowinv.physics.beam import numbers_in_unit
 
-    chosen, outputs = _products(product or [], flags.products), Outputs(overwrite, quiet)
+    chosen, outputs = _products(product or []), Outputs(overwrite, quiet)
     outputs.check(
         [(csv, TABLE.suffixes), (figure, FIGURE_SUFFIXES), (out, RESULT.suffixes)],
-        [result, flags.setup, flags.products],
+        [result, setup],
     )
     if is_stack(result):
         if out is not None:
@@ -85,27 +74,27 @@ def analyse(
                 f"received --out {out}, which copies one result with its products, but a store has "
                 "many results: use --csv"
             )
-        dataset = open_shots(result, flags.shots)
-    elif flags.shots is not None or flags.times is not None:
+        dataset = open_shots(result, shots)
+    elif shots is not None or times is not None:
         raise InputError(f"{result} is one result: --shots and --times belong to a store of shots")
     else:
         dataset = read_dataset(result)
     with work_callbacks(quiet) as callbacks:
         common: dict[str, Any] = {
-            "unit": flags.unit,
-            "deflector": flags.deflector,
-            "setup": read_setup(flags.setup),
+            "unit": unit,
+            "deflector": deflector,
+            "setup": read_setup(setup),
             **callbacks,
         }
         if "shot" in dataset.dims:
             seconds = None
-            if flags.times is not None:
-                numbers = numbers_in_unit(flags.times, "s", "--times")
-                shots = dataset["index"].values
-                seconds = shot_times(numbers, shots.tolist(), f"--times is {flags.times!r}")
+            if times is not None:
+                numbers = numbers_in_unit(times, "s", "--times")
+                indices = dataset["index"].values
+                seconds = shot_times(numbers, indices.tolist(), f"--times is {times!r}")
             results = analyse_shots(dataset, chosen, seconds, **common)
         else:
-            results = measure(dataset, chosen, samples=flags.samples, **common)
+            results = measure(dataset, chosen, samples=samples, **common)
     with ExitStack() as stack:  # both files, or none
         if csv is not None:
             temporary = stack.enter_context(replacing(csv, overwrite))
@@ -121,37 +110,20 @@ def analyse(
             say(table)
     if outputs.files:
         outputs.show("Files", [])
-    outputs.exit_unless_drawn()
 
 
-def _products(texts: list[str], file: Path | None) -> list[Product]:
-    from napari_shadowinv.analysis import PRODUCTS, product_from_dict, product_from_text
+def _products(texts: list[str]) -> list[Product]:
+    from napari_shadowinv.analysis import PRODUCTS, product_from_text
     from napari_shadowinv.analysis.kinds import product_syntax
-    from napari_shadowinv.io import read_toml
 
-    entries: Any = [] if file is None else read_toml(file).get("products", [])
-    if not isinstance(entries, list):
-        raise InputError(f"{file}: expected tables [[products]]")
-    listed = [product_from_text(text) for text in texts]
-    listed += [
-        product_from_dict(entry, f"{file}, product {n}") for n, entry in enumerate(entries, 1)
-    ]
-    if not listed:
+    if not texts:
         syntax = "; ".join(map(product_syntax, PRODUCTS.values()))
         raise InputError(f"received no product, expected at least one: {syntax}")
-    return listed
+    return [product_from_text(text) for text in texts]
 
 
 def _tables(results: list[ProductResult]) -> list[Any]:
     """Return a table for each product, and what the image cannot show below the last."""
-    shared = set.intersection(*({(f.key, f.text) for f in each.facts} for each in results))
-    tables = []
-    for each in results:
-        facts = [fact for fact in each.facts if (fact.key, fact.text) not in shared]
-        tables.append(two_columns(f"{each.title} ({each.name})", fact_rows(facts or each.facts)))
-    common = [fact for fact in results[0].facts if (fact.key, fact.text) in shared]
-    rows: Rows = fact_rows(common) if len(results) > 1 else []
+    tables = [two_columns(f"{each.title} ({each.name})", fact_rows(each.facts)) for each in results]
     limits = dict.fromkeys(sentence for each in results for sentence in each.limits)
-    rows += [("note", sentence) for sentence in limits]
-    tables.append(two_columns("All products", rows))
-    return tables
+    return [*tables, two_columns("All products", [("note", sentence) for sentence in limits])]

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -35,7 +35,7 @@ from napari_shadowinv.cli._terminal import (
     work_callbacks,
 )
 from napari_shadowinv.errors import InputError, InversionCancelled
-from napari_shadowinv.facts import Level, Verdict, percent
+from napari_shadowinv.facts import Level, Verdict
 from napari_shadowinv.io.store import (
     DAMAGED,
     DONE,
@@ -45,7 +45,6 @@ from napari_shadowinv.io.store import (
     StackStore,
     check_store_path,
 )
-from napari_shadowinv.physics.setup import beam_quantities
 from napari_shadowinv.provenance import Provenance
 
 if TYPE_CHECKING:
@@ -77,7 +76,8 @@ class _Printer:
         if not status.stage:
             self.status = status
         if self.show is not None:
-            self.show(self._progress(status))
+            stage, ended = status.stage or status.scheduler, status.done + status.failed
+            self.show(Progress(stage, ended, status.total or None, f"{status.text}; {status.name}"))
         if status.outcome is not None and status.outcome.reason:
             say_on_stderr(f"failed: {status.name}: {status.outcome.reason}", "red")
         elif not self.watched:
@@ -92,17 +92,6 @@ class _Printer:
         elif is_first:
             counts = f"{status.text}; " if status.total else ""
             say(f"Watching {self.watched}; {counts}press Ctrl-C to stop.")
-
-    def _progress(self, status: RunStatus) -> Progress:
-        """Return the shots that have ended, the rate, the time that remains, the last shot."""
-        if status.stage:
-            return Progress(status.stage, 0)
-        texts = [status.text]
-        if status.remaining is not None:
-            time_left = timedelta(seconds=round(status.remaining))
-            texts += [_rate_text(status), f"{time_left} left" if status.waiting else "finishing"]
-        message = "; ".join(filter(None, [", ".join(texts), status.name]))
-        return Progress(status.scheduler, status.done + status.failed, status.total, message)
 
     def _print_shot(self, status: RunStatus) -> None:
         assert status.outcome is not None
@@ -178,7 +167,6 @@ def run_batch(
                 for counts in map(left_out_of, folders)
                 if counts
             ),
-            *_site_rows(store),
             *_trouble_rows(store),
             ("written", str(store.path)),
         ]
@@ -214,43 +202,20 @@ def _counts_text(store: StackStore) -> str:
     return ", ".join(f"{counts[name]} {name}" for name in names)
 
 
-def _beam_rows(store: StackStore) -> Rows:
-    """Return the energies or wavelengths of shots that have their own."""
-    rows: Rows = []
-    reports = store.reports()
-    for name, quantity in beam_quantities().items():
-        values = sorted({report[name] for report in reports if name in report})
-        rows += [(quantity.plural, quantity.text(*values, digits=6))] if values else []
-    return rows
-
-
-def _site_rows(store: StackStore) -> Rows:
-    """Return the number of sites with its reason, and the typical errors."""
-    reports = [report for report in store.reports() if "n_sites" in report]
-    if not reports:
-        return []
-    counts = sorted({report["n_sites"] for report in reports})
-    least, most = f"{counts[0]:,}", f"{counts[-1]:,}"
-    reasons = dict.fromkeys(report.get("sites_reason") or "as requested" for report in reports)
-    reason = next(iter(reasons)) if len(reasons) == 1 else "for different reasons"
-    rows: Rows = [("sites", f"{least if least == most else f'{least} to {most}'}; {reason}")]
-    if totals := [total for report in reports if (total := report.get("total_error"))]:
-        median = percent(float(np.median(totals)))
-        rows.append(("errors", f"{median} of the displacement (r.m.s., median of the shots)"))
-    return rows
-
-
 def _troubles(store: StackStore) -> Iterator[tuple[str, str, str, str]]:
     """Yield name, label, code and text of each reason to look at a shot."""
     for name, status, report in zip(store.names, store.statuses(), store.reports(), strict=True):
         if status in (FAILED, DAMAGED):
             reason = report.get("reason", "its report is missing")
             yield name, STATUS_NAMES[status], reason, reason
-        for caution in map(Caution.from_json, report.get("warnings", ())):
-            code = caution.text if caution.code == "other" else caution.code
-            yield name, "warning", code, caution.text
-        if status == DONE and not report.get("converged"):
-            yield name, "warning", "not-converged", "the solver did not converge"
+        elif status == DONE:
+            if not _is_success(verdict := str(report["verdict"])):
+                yield name, "warning", verdict, verdict
+            for caution in map(Caution.from_json, report["warnings"]):
+                code = caution.text if caution.code == "other" else caution.code
+                yield name, "warning", code, caution.text
+            if not report["converged"]:
+                yield name, "warning", "not-converged", "the solver did not converge"
 
 
 def _trouble_rows(store: StackStore) -> Rows:
@@ -258,15 +223,9 @@ def _trouble_rows(store: StackStore) -> Rows:
     troubles: dict[tuple[str, str], tuple[str, dict[str, None]]] = {}
     for name, label, code, text in _troubles(store):
         troubles.setdefault((label, code), (text, {}))[1][name] = None
-    verdicts: dict[str, list[str]] = {Verdict.DETERMINED.value: []}
-    for name, report in zip(store.names, store.reports(), strict=True):
-        if "verdict" in report:
-            verdicts.setdefault(str(report["verdict"]), []).append(name)
-    counts = [f"{len(verdicts[each])} {each}" for each in verdicts if _is_success(each)]
-    rows: Rows = [("verdicts", ", ".join(counts))] if any(verdicts.values()) else []
-    for each, names in verdicts.items():
-        if not _is_success(each):
-            rows.append(("warning", f"{len(names)} {each}: {_list_text(names)}"))
+    verdicts = Counter(report["verdict"] for report in store.reports() if "verdict" in report)
+    counts = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.items())
+    rows: Rows = [("verdicts", counts)] if counts else []
     for label in (STATUS_NAMES[FAILED], STATUS_NAMES[DAMAGED], "warning"):
         listed = [
             f"{_list_text([*names])}: {text}"
@@ -315,8 +274,6 @@ def _store_rows(store: StackStore) -> Rows:
         ("shots", _counts_text(store)),
         ("size", str(attributes["image_size"])),
         *provenance_rows(Provenance.of(attributes)),
-        *_beam_rows(store),
-        *_site_rows(store),
         ("stored", str(attributes["stored"])),
         ("options", options_text(json.loads(attributes["options"]))),
     ]

@@ -31,7 +31,7 @@ HELP = {
 EPILOG = """
 shadowinv film scans/pack.toml --layers layers
 
-Exit codes: 0 written; 1 no figure; 2 invalid input, nothing written; 130 cancelled.
+Exit codes: 0 written; 2 invalid input, nothing written; 130 cancelled.
 """
 
 
@@ -81,7 +81,6 @@ def film(
     if not quiet:
         say(film_table(doses))
     outputs.show("Film pack", fact_rows(doses.facts))
-    outputs.exit_unless_drawn()
 
 
 def film_table(doses: FilmDoses) -> Table:

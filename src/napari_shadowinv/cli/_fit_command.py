@@ -27,7 +27,7 @@ shadowinv fit a.tif b.tif --energies 14.7,30 --setup setup.toml --set fit.fields
 
 shadowinv fit shots.csv --setup setup.toml --source unknown --noise poisson
 
-Exit codes: 0 determined; 1 no figure; 2 invalid input; 3 another verdict; 130 cancelled.
+Exit codes: 0 determined; 2 invalid input; 3 another verdict; 130 cancelled.
 """
 
 
@@ -76,5 +76,5 @@ def fit(
         setups = {shot.setup for shot in shots}
         (common,) = setups if len(setups) == 1 else (None,)
         write_recipe(save_recipe, recipe.model_copy(update={"setup": common}), overwrite=overwrite)
-    outputs.show("Fit", result_rows(result, outputs.printed, names=names))
+    outputs.show("Fit", result_rows(result, names=names))
     outputs.exit_unless_sound(result, file)

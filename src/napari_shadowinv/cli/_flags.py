@@ -16,10 +16,11 @@ from typing import Annotated, Any, get_type_hints
 from typer import Argument, Option
 
 from napari_shadowinv._system.validation import suggestion
-from napari_shadowinv.cli._settings import Sections, complete_sources, complete_steps, completion
+from napari_shadowinv.cli._settings import Sections, completing, keys_of
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io.formats import IMAGE_TITLES
 from napari_shadowinv.options import BEAM_SOURCES, DETECTORS
+from napari_shadowinv.preprocessing import ESTIMATES, STEPS
 
 _KEYWORD = inspect.Parameter.KEYWORD_ONLY
 
@@ -57,7 +58,7 @@ def setting(sections: Sections, example: str, names: Collection[str] = ()) -> An
         "--set",
         metavar="KEY=VALUE",
         help=f"Any other key: {example}.",
-        autocompletion=completion(sections, names),
+        autocompletion=completing(f"{key}=" for key in (*names, *keys_of(sections))),
     )
 
 
@@ -77,7 +78,7 @@ class ShotFlags:
             "--step",
             metavar="TEXT",
             help="Another step, such as 'hot-pixels 6'.",
-            autocompletion=complete_steps,
+            autocompletion=completing(STEPS),
         ),
     ] = None
 
@@ -97,7 +98,7 @@ class InversionFlags(ShotFlags):
         Option(
             metavar="TEXT",
             help="Its estimate: 'polynomial degree=3'.",
-            autocompletion=complete_sources,
+            autocompletion=completing(ESTIMATES),
         ),
     ] = None
     dark: Annotated[str | None, Option(metavar="COUNTS|FILE", help="Dark level or image.")] = None
@@ -138,17 +139,12 @@ class FitFlags(ShotFlags):
 
 def instrument_keys(text: str | None) -> dict[str, tuple[str, Any]]:
     """Return the detector and the source of the beam in a text such as "film,TNSA", by key."""
-    kinds: dict[str, list[str]] = {
-        "instrument.detector": [*DETECTORS],
-        "instrument.beam_source": [*BEAM_SOURCES],
-    }
-    keys = {name: key for key, names in kinds.items() for name in names}
-    spellings = {name.lower().replace(" ", "-"): name for name in keys}
+    keys: dict[str, str] = dict.fromkeys(DETECTORS, "instrument.detector")
+    keys.update((name, "instrument.beam_source") for name in BEAM_SOURCES)
     values: dict[str, tuple[str, Any]] = {}
-    for part in [] if text is None else text.split(","):
-        name = spellings.get(part.strip().lower().replace(" ", "-"), "")
-        if not name:
-            raise InputError(f"--instrument is '{text}': {suggestion(part.strip(), keys)}")
+    for name in [] if text is None else map(str.strip, text.split(",")):
+        if name not in keys:
+            raise InputError(f"--instrument is '{text}': {suggestion(name, keys)}")
         if keys[name] in values:
             raise InputError(f"--instrument is '{text}': expected one detector and one beam")
         values[keys[name]] = ("--instrument", name)

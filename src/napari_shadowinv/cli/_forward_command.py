@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,14 +9,14 @@ from typer import Option
 
 from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._inputs import read_setup
-from napari_shadowinv.cli._objects import HELP, ObjectFlags, file_of, object_of
+from napari_shadowinv.cli._objects import HELP, file_of, object_of
 from napari_shadowinv.cli._outputs import Outputs
 from napari_shadowinv.cli._settings import Sections, settings_of
 from napari_shadowinv.cli._summary import Rows, fact_rows, setup_text, size_text
 from napari_shadowinv.cli._terminal import notify_errors, work_callbacks
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import percent
-from napari_shadowinv.io.formats import IMAGE_WRITERS, NETCDF_SUFFIX, TIFF
+from napari_shadowinv.io.formats import IMAGE_WRITERS, TIFF
 from napari_shadowinv.physics.trace_options import SizedView, TraceOptions
 
 SECTIONS: Sections = {"view": SizedView, "trace": TraceOptions}
@@ -31,75 +29,58 @@ Causes: magnetic-field, electric-field, plasma, refractive-index.
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class ForwardFlags(ObjectFlags):
-    """Flags of the experiment that an image is predicted for."""
-
-    source: _flags.SourceFile = None
-    channel: _flags.Channel = None
-
-
 @notify_errors
-@_flags.takes_flags
 def forward(
     object: Annotated[str, _flags.argument(help=HELP)],
-    flags: ForwardFlags,
+    setup: _flags.SetupFile = None,
+    deflector: _flags.Deflector = None,
+    source: _flags.SourceFile = None,
+    channel: _flags.Channel = None,
     settings: Annotated[list[str] | None, _flags.setting(SECTIONS, "trace.output=counts")] = None,
     out: Annotated[Path | None, Option(help="Image: .tif, .npy or .png.")] = None,
-    truth: Annotated[Path | None, Option(help="NetCDF file of line integrals.")] = None,
     overwrite: _flags.Overwrite = False,
     quiet: _flags.Quiet = False,
 ) -> None:
-    """Predict the image of a displacement field, a 3-D field or a phantom, for any setup.
+    """Predict the image of a result, a 3-D field or a phantom, for any setup.
 
     The source is the result's own if the setup is the same, else uniform.
     """
-    from napari_shadowinv.io import read_shot, replacing, write
+    from napari_shadowinv.io import read_shot, write
     from napari_shadowinv.pipeline.prediction import predict
 
     outputs, file = Outputs(overwrite, quiet), file_of(object)
     stem = object.partition(":")[0] if file is None else file.stem
     path = Path(f"{stem}_image{TIFF.suffix}") if out is None else out
-    outputs.check(
-        [(path, tuple(IMAGE_WRITERS)), (truth, (NETCDF_SUFFIX,))],
-        [file, flags.source, flags.setup, flags.recorded_with],
-    )
+    outputs.check([(path, tuple(IMAGE_WRITERS))], [file, source, setup])
     chosen = settings_of(settings or (), SECTIONS, {})
     view = chosen.change("view", SizedView())
-    setup = read_setup(flags.setup)
-    outputs.warn_of_setups([(setup, None)])
-    source = None
-    if flags.source is not None:
-        source = read_shot(flags.source, channel=flags.channel).image
+    experiment = read_setup(setup)
+    outputs.warn_of_setups([(experiment, None)])
+    beam = None
+    if source is not None:
+        beam = read_shot(source, channel=channel).image
         if {"view.height", "view.width"} & chosen.values.keys():
             raise InputError(
                 "received view.height or view.width, but --source sets the size: leave it out"
             )
-    target = object_of(object, flags, chosen, view)
+    target = object_of(object, deflector, chosen, view)
     original = getattr(target, "setup", None)
-    if flags.deflector is not None and (setup is None or original in (None, setup)):
+    if deflector is not None and (experiment is None or original in (None, experiment)):
         raise InputError(
-            "received --deflector, but only one setup: expected a different one with --setup, and "
-            "for a field in px also --recorded-with"
+            "received --deflector, but only one setup: expected a different one with --setup"
         )
     with work_callbacks(quiet) as callbacks:
         prediction = predict(
             target,
-            setup,
+            experiment,
             (view.height, view.width),
-            source=source,
-            deflector=flags.deflector,
+            source=beam,
+            deflector=deflector,
             options=chosen.change("trace", TraceOptions()),
             **callbacks,
         )
     traced, image = prediction.traced, prediction.image
-    if truth is not None and traced is None:
-        raise InputError(f"received --truth, but {object} is no 3-D field: leave it out")
-    with ExitStack() as both:  # files, or none
-        if truth is not None and traced is not None:
-            temporary = both.enter_context(replacing(truth, overwrite))
-            traced.to_dataset().to_netcdf(temporary, engine="h5netcdf")
-        write(path, image, setup=prediction.setup, overwrite=overwrite)
+    write(path, image, setup=prediction.setup, overwrite=overwrite)
     rows: Rows = [("setup", setup_text(prediction.setup, shape=image.shape))]
     if traced is not None:
         rows += fact_rows(traced.facts)

@@ -35,32 +35,28 @@ def _rows(path: Path) -> _summary.Rows:
     from napari_shadowinv.io.field_grids import is_field_grid
     from napari_shadowinv.io.formats import format_of
     from napari_shadowinv.io.frames import find_frames
-    from napari_shadowinv.io.hdf5_arrays import list_sizes, read_hdf5
+    from napari_shadowinv.io.hdf5_arrays import list_sizes
 
     if is_field_grid(path):
         kind = "fields on a grid: trace particles with shadowinv forward"
         return [("kind", kind), *list_sizes(path)]
     frames = find_frames(path)
     if len(frames) > 1:
-        return _frame_rows(read(path), frames[0].variable)
+        return _frame_rows(read(path))
     path, variable = frames[0].path, frames[0].variable
     form = format_of(path)
-    if variable is not None and form.name in ("pradformat", "shadowinv"):
-        array = read_hdf5(path, variable)
-        return [("kind", f"array {variable!r} of an HDF5 file"), *_array_rows(array)]
     if form.is_scan or form.name in ("b16", "spe"):
         return _picture_rows(path, form)
     content = read(path, variable=variable)
     return _shot_rows(content) if isinstance(content, Shot) else _result_rows(content)
 
 
-def _frame_rows(frames: Shot | xarray.Dataset, array: str | None) -> _summary.Rows:
+def _frame_rows(frames: Shot | xarray.Dataset) -> _summary.Rows:
     """Describe many images by their names and the first."""
     assert not isinstance(frames, Shot)
     names, images = frames["name"].values, frames["image"]
     return [
         ("kind", f"{len(names)} frames, {names[0]} to {names[-1]}"),
-        *([] if array is None else [("array", array)]),
         ("shape", f"{images.shape}, [shot, y, x]"),
         *((f"first: {name}", text) for name, text in _array_rows(images[0].values)[2:]),
     ]
@@ -79,16 +75,10 @@ def _picture_rows(path: Path, form: Format) -> _summary.Rows:
 
 
 def _shot_rows(shot: Shot) -> _summary.Rows:
-    names = {
-        "text": "numbers as text",
-        "pradformat": "pradformat radiograph",
-        "cpsa": "CR-39 tracks",
-        "npy": "NPY array",
-        "hdf5": f"array {shot.metadata.get('variable')!r} of an HDF5 file",
-        "mat": f"array {shot.metadata.get('variable')!r} of a MATLAB file",
-    }
-    kind, cautions = str(shot.metadata["kind"]), shot.cautions
-    rows = [("kind", names.get(kind, kind)), *_array_rows(shot.image, shot.metadata["dtype"])]
+    kind, cautions = f"{shot.metadata['kind']} image", shot.cautions
+    if variable := shot.metadata.get("variable"):
+        kind = f"{kind}, array {variable!r}"
+    rows = [("kind", kind), *_array_rows(shot.image, shot.metadata["dtype"])]
     if shot.mask is not None:
         rows.append(("mask", f"in the same file, {(~shot.mask).sum()} pixels excluded"))
     if shot.setup is not None:

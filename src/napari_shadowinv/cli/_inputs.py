@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,19 +30,20 @@ def recipe_from(flags: InversionFlags | FitFlags, settings: Settings) -> Recipe:
     recipe = Recipe() if flags.recipe is None else read_recipe(flags.recipe)
     files = {name: settings.values[name] for name in FILE_KEYS if name in settings.values}
     changes: dict[str, Any] = {name: Path(file) if file else None for name, file in files.items()}
-    steps: dict[str, Any] = {"bin": flags.bin}
+    steps = [] if flags.bin is None else [f"bin {flags.bin}"]
     if flags.source is not None:
         is_known = flags.source != "unknown"
         changes["source"] = MeasuredSource(file=Path(flags.source)) if is_known else None
     if isinstance(flags, InversionFlags):
-        steps = {"dark": flags.dark, **steps}
+        if flags.dark is not None:
+            steps.append(f"dark level={shlex.quote(flags.dark)}")
         if flags.source_from is not None:
             if flags.source is not None:
                 raise InputError(
                     f"received --source and --source-from {flags.source_from}: choose one of them"
                 )
             changes["source"] = source_from(flags.source_from, recipe.estimate)
-    changes["steps"] = with_steps(recipe.steps, flags.steps or (), steps)
+    changes["steps"] = with_steps(recipe.steps, [*steps, *(flags.steps or ())])
     for section in ("instrument", "options"):
         changes[section] = settings.change(section, getattr(recipe, section))
     if "options.margin" in settings.values and changes["options"].boundary != "free":

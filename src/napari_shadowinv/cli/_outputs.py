@@ -17,9 +17,7 @@ from typer import Exit
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.cli._summary import Rows, two_columns
 from napari_shadowinv.cli._terminal import (
-    EXIT_NO_FIGURE,
     EXIT_NOT_CONVERGED,
-    is_interrupted,
     say,
     say_on_stderr,
 )
@@ -43,13 +41,11 @@ Output = tuple[Path | None, tuple[str, ...]]
 
 @dataclass
 class Outputs:
-    """Files of a command, with the cautions that it has printed."""
+    """Files of a command."""
 
     overwrite: bool
     quiet: bool
-    files: list[Path] = field(default_factory=list)  # to write, without figures that fail
-    printed: list[str] = field(default_factory=list)  # cautions about setups, before the work
-    undrawn: list[Path] = field(default_factory=list)  # figures that fail
+    files: list[Path] = field(default_factory=list)  # to write
 
     def check(self, outputs: Iterable[Output], inputs: Iterable[Path | None]) -> None:
         """Add files to be written; refuse, before any work, one that cannot be, or is read."""
@@ -103,7 +99,6 @@ class Outputs:
         )
         for text in texts:
             say_on_stderr(text, "yellow")
-        self.printed += texts
 
     def write_result(
         self,
@@ -122,20 +117,11 @@ class Outputs:
         self.write_figures({figure: partial(result_figure, result, title=title)})
 
     def write_figures(self, figures: Mapping[Path, Callable[[], Figure]]) -> None:
-        """Draw and write figures; print a caution for each that fails: see `exit_unless_drawn`."""
+        """Draw and write figures."""
         from napari_shadowinv.plotting import save_figure
 
         for path, draw in figures.items():
-            try:
-                save_figure(path, draw(), self.overwrite)
-            except Exception as error:
-                if is_interrupted():
-                    raise
-                self.files.remove(path)
-                self.undrawn.append(path)
-                reason = str(error) or type(error).__name__
-                text = f"the figure {path} could not be drawn: {reason}"
-                say_on_stderr(text, "yellow")
+            save_figure(path, draw(), self.overwrite)
 
     def show(self, title: str, rows: Rows) -> None:
         """Print facts, and below them the files that were written."""
@@ -143,13 +129,8 @@ class Outputs:
             written = [("written", str(path)) for path in self.files]
             say(two_columns(title, [*rows, *written]))
 
-    def exit_unless_drawn(self) -> None:
-        """Exit with an error code if a figure could not be written."""
-        if self.undrawn:
-            raise Exit(EXIT_NO_FIGURE)
-
     def exit_unless_sound(self, result: Any, out: Path) -> None:
-        """Exit with an error code if a result has a flaw, or a figure could not be written."""
+        """Exit with an error code if a result has a flaw."""
         doubts = {each.code: each.text for each in result.cautions}
         if result.kind is ResultKind.INVERSION:
             flaw = flaw_of(result.report.converged, None, doubts)
@@ -166,7 +147,6 @@ class Outputs:
         if flaw:
             say_on_stderr(f"{flaw.upper()}: {out} was written, but {reason}")
             raise Exit(EXIT_NOT_CONVERGED)
-        self.exit_unless_drawn()
 
 
 def flaw_of(converged: bool, verdict: str | None, codes: Collection[str]) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +12,7 @@ from napari_shadowinv._system.tables import write_cells
 from napari_shadowinv.cli import _flags
 from napari_shadowinv.cli._inputs import read_setup
 from napari_shadowinv.cli._objects import HELP as OBJECT
-from napari_shadowinv.cli._objects import ObjectFlags, file_of, object_of
+from napari_shadowinv.cli._objects import file_of, object_of
 from napari_shadowinv.cli._outputs import Outputs, figure_beside
 from napari_shadowinv.cli._settings import Sections, settings_of
 from napari_shadowinv.cli._summary import fact_rows, headline_row
@@ -35,25 +34,19 @@ shadowinv plan shot.shadowinv --setup next.toml --counts 300
 
 Phantoms: toroid, four_toroids, coaxial, wakefield, blob.
 
-Exit codes: 0 determined; 1 no figure; 2 invalid input; 3 not determined; 130 cancelled.
+Exit codes: 0 determined; 2 invalid input; 3 not determined; 130 cancelled.
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlanFlags(ObjectFlags):
-    """Flags of the object and of the experiment."""
-
-    energies: Annotated[str | None, Option(metavar="X,X,…", help=HELP["energies"])] = None
-    instrument: _flags.InstrumentNames = None
-    counts: Annotated[float | None, Option(help="Mean counts a pixel. Default: 1000.")] = None
-    size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None
-
-
 @notify_errors
-@_flags.takes_flags
 def plan(
     object: Annotated[str, _flags.argument(help=OBJECT)],
-    flags: PlanFlags,
+    setup: _flags.SetupFile = None,
+    deflector: _flags.Deflector = None,
+    energies: Annotated[str | None, Option(metavar="X,X,…", help=HELP["energies"])] = None,
+    instrument: _flags.InstrumentNames = None,
+    counts: Annotated[float | None, Option(help="Mean counts a pixel. Default: 1000.")] = None,
+    size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None,
     settings: Annotated[list[str] | None, _flags.setting(SECTIONS, "plan.draws=5")] = None,
     out: Annotated[Path, Option(help="Table (.csv) of draws.")] = Path("plan.csv"),
     figure: _flags.Figure = None,
@@ -70,28 +63,26 @@ def plan(
     page, outputs = figure or figure_beside(out), Outputs(overwrite, quiet)
     outputs.check(
         [(out, TABLE.suffixes), (page, FIGURE_SUFFIXES)],
-        [flags.setup, flags.recorded_with, file_of(object)],
+        [setup, file_of(object)],
     )
-    keys = _flags.instrument_keys(flags.instrument) | {"plan.counts": ("--counts", flags.counts)}
+    keys = _flags.instrument_keys(instrument) | {"plan.counts": ("--counts", counts)}
     stated = settings_of(settings or (), SECTIONS, keys)
-    options = stated.change("plan", ExperimentOptions())
-    instrument = stated.change("instrument", Instrument())
-    setups = setups_of_text(read_setup(flags.setup), flags.energies or "", "--energies")
-    shape = None if flags.size is None else shape_of_text(flags.size, "--size")
-    target = object_of(object, flags, stated, stated.change("view", GridView()))
-    choices: dict[str, Any] = {"shape": shape, "instrument": instrument, "options": options}
+    setups = setups_of_text(read_setup(setup), energies or "", "--energies")
+    shape = None if size is None else shape_of_text(size, "--size")
+    target = object_of(object, deflector, stated, stated.change("view", GridView()))
+    choices: dict[str, Any] = {
+        "shape": shape,
+        "instrument": stated.change("instrument", Instrument()),
+        "options": stated.change("plan", ExperimentOptions()),
+    }
     outputs.warn_of_setups((each, shape) for each in setups or ())
     with work_callbacks(quiet) as callbacks:
         result = plan_experiment(target, setups, **choices, **callbacks)
     with replacing(out, overwrite) as temporary:
-        cells = [
-            {name: f"{v:.6g}" if isinstance(v, float) else v for name, v in row.items()}
-            for row in result.rows()
-        ]
-        write_cells(temporary, [*cells[0]], cells)
+        rows_of_draws = result.rows()
+        write_cells(temporary, [*rows_of_draws[0]], rows_of_draws)
     outputs.write_figures({page: partial(plan_figure, result)})
     rows = [headline_row(result.headline), *fact_rows(result.facts)]
     outputs.show("Plan", rows)
     if not result.is_determined:
         raise Exit(EXIT_NOT_CONVERGED)
-    outputs.exit_unless_drawn()

@@ -111,67 +111,30 @@ def _unknown_key(key: str, keys: Collection[str]) -> str:
     return f"{key}: did you mean {match}?"
 
 
-def completion(sections: Sections, names: Collection[str] = ()) -> Callable[[str], list[str]]:
-    """Return a function that completes keys in a shell."""
-
-    def complete(incomplete: str) -> list[str]:
-        keys = (*names, *keys_of(sections))
-        return [f"{key}=" for key in keys if key.startswith(incomplete)]
-
-    return complete
+def completing(words: Iterable[str]) -> Callable[[str], list[str]]:
+    """Return a function that completes words in a shell."""
+    listed = [*words]
+    return lambda incomplete: [word for word in listed if word.startswith(incomplete)]
 
 
-def complete_steps(incomplete: str) -> list[str]:
-    """Complete the name of a step, and then its parameters."""
-    name, space, _ = incomplete.partition(" ")
-    if not space:
-        return [step for step in STEPS if step.startswith(name)]
-    parameters = STEPS[name].parameters() if name in STEPS else ()
-    texts = (f"{name} {parameter}=" for parameter in parameters)
-    return [text for text in texts if text.startswith(incomplete)]
-
-
-def complete_sources(incomplete: str) -> list[str]:
-    """Complete the method of a source."""
-    return [name for name in ESTIMATES if name.startswith(incomplete)]
-
-
-def with_steps(
-    steps: tuple[Step, ...], texts: Iterable[str], flags: Mapping[str, Any]
-) -> tuple[Step, ...]:
+def with_steps(steps: tuple[Step, ...], texts: Iterable[str]) -> tuple[Step, ...]:
     """Change steps, or insert new ones in the order of the list of steps.
 
-    Texts are such as ``"hot-pixels 6"`` or ``"crop y=10:90"``; flags have values of the main
-    parameters of steps, by the name of the step and of its flag.
+    Texts are such as ``"hot-pixels 6"`` or ``"crop y=10:90"``.
     """
-    result = list(steps)
-    for name, value in flags.items():
-        if value is not None:
-            primary = STEPS[name].primary
-            _put_step(result, STEPS[name], {primary: value}, "", {primary: f"--{name}"})
+    result, order = list(steps), list(STEPS)
     for text in texts:
-        kind, values = parse_choice("--step", text, STEPS)
-        _put_step(result, kind, values, f"--step '{text}'")
+        kind, changes = parse_choice("--step", text, STEPS)
+        index = next((i for i, step in enumerate(result) if isinstance(step, kind)), None)
+        before = {} if index is None else result[index].values()
+        step = validate(kind, {**before, **changes}, f"--step '{text}'")
+        if index is None:
+            rank = order.index(kind.name())
+            later = [i for i, each in enumerate(result) if order.index(each.name()) > rank]
+            result.insert(later[0] if later else len(result), step)
+        else:
+            result[index] = step
     return tuple(result)
-
-
-def _put_step(
-    steps: list[Step],
-    kind: type[Step],
-    changes: Mapping[str, Any],
-    where: str,
-    names: Mapping[str, str] | None = None,
-) -> None:
-    order = list(STEPS)
-    index = next((i for i, step in enumerate(steps) if isinstance(step, kind)), None)
-    before = {} if index is None else steps[index].values()
-    step = validate(kind, {**before, **changes}, where, names)
-    if index is None:
-        rank = order.index(kind.name())
-        later = [i for i, each in enumerate(steps) if order.index(each.name()) > rank]
-        steps.insert(later[0] if later else len(steps), step)
-    else:
-        steps[index] = step
 
 
 def source_from(text: str, before: Estimate | None) -> Estimate:

@@ -47,7 +47,7 @@ shadowinv invert shot.tif --source reference.tif --setup setup.toml --bin 4
 
 shadowinv invert shot.tif --step 'hot-pixels 6' --set options.tolerance=1e-4
 
-Exit codes: 0 success; 1 no figure; 2 invalid input; 3 written, but not converged; 130 cancelled.
+Exit codes: 0 success; 2 invalid input; 3 written, but not converged; 130 cancelled.
 """
 
 
@@ -91,7 +91,7 @@ def invert(
     if save_recipe is not None:
         write_recipe(save_recipe, recipe, overwrite=overwrite)
     title = f"{shot.path}, {size_text(inversion.image.shape)}"
-    outputs.show(title, result_rows(inversion, outputs.printed, shot=shot))
+    outputs.show(title, result_rows(inversion, shot=shot))
     outputs.exit_unless_sound(inversion, result)
 
 
@@ -129,7 +129,7 @@ def rerun(
         *[("changed", text) for text in again.changes or ("nothing",)],
         ("difference", again.difference),
         headline_row(again.content.headline),
-        *fact_rows(again.content.facts, outputs.printed),
+        *fact_rows(again.content.facts),
     ]
     outputs.show("Rerun", rows)
     outputs.exit_unless_sound(again.content, again_out)

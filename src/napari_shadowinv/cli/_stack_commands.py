@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,8 +24,7 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 # Help of options, where it is longer than a line.
 HELP = {
-    "format": "tiff (float32, one file per shot and component), pradformat (one file per shot), or "
-    "csv (a table with a row per shot).",
+    "format": "tiff (float32, one file per shot and component) or csv (one row per shot).",
     "shots": "A quoted glob, a folder, files, a file of frames, an array of frames in HDF5, or a "
     "table (.csv) with a row per shot.",
     "workers": "Shots at once. Default: one per core.",
@@ -53,24 +51,6 @@ Press Ctrl-C to stop; the same command continues. Exit codes as for batch.
 """
 
 
-@dataclass(frozen=True, kw_only=True)
-class RunFlags:
-    """Flags of a run over many shots."""
-
-    scheduler: Annotated[str, Option(help="threads, processes or tcp://host:8786.")] = "threads"
-    workers: Annotated[int | None, Option(metavar="N", help=HELP["workers"])] = None
-    resume: Annotated[bool, Option("--resume", help="Continue a run, append new shots.")] = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class WatchFlags:
-    """Flags of a watched folder."""
-
-    pattern: Annotated[str | None, Option(help="Names of the shots, in quotes.")] = None
-    latest: Annotated[bool, Option("--latest", help=HELP["latest"])] = False
-    idle: Annotated[float | None, Option(metavar="SECONDS", help=HELP["idle"])] = None
-
-
 def _stack_inputs(flags: _flags.InversionFlags, settings: Settings, quiet: bool) -> dict[str, Any]:
     """Return the inputs of `batch` and `watch`."""
     recipe = recipe_from(flags, settings)
@@ -86,7 +66,9 @@ def batch(
     shots: Annotated[list[str], _flags.argument(help=HELP["shots"])],
     out: Store,
     flags: _flags.InversionFlags,
-    run_flags: RunFlags,
+    scheduler: Annotated[str, Option(help="threads, processes or tcp://host:8786.")] = "threads",
+    workers: Annotated[int | None, Option(metavar="N", help=HELP["workers"])] = None,
+    resume: Annotated[bool, Option("--resume", help="Continue a run, append new shots.")] = False,
     settings: Annotated[
         list[str] | None, _flags.setting(BATCH_SECTIONS, _EXAMPLE, FILE_KEYS)
     ] = None,
@@ -96,12 +78,11 @@ def batch(
     """Invert many shots into one store; an interrupted run can be resumed."""
     from napari_shadowinv.cli._batch import run_batch
 
-    run_keys = {"run.workers": ("--workers", run_flags.workers)}
+    run_keys = {"run.workers": ("--workers", workers)}
     chosen = settings_of(settings or (), BATCH_SECTIONS, flags.by_key | run_keys, FILE_KEYS)
     run = chosen.change("run", RunOptions(overwrite=overwrite))
     inputs = _stack_inputs(flags, chosen, quiet)
-    resume = run_flags.resume or run.redo_failed
-    run_batch(shots, out, run, resume=resume, scheduler=run_flags.scheduler, **inputs)
+    run_batch(shots, out, run, resume=resume or run.redo_failed, scheduler=scheduler, **inputs)
 
 
 @notify_errors
@@ -110,7 +91,9 @@ def watch(
     folder: Annotated[Path, _flags.argument(help="Folder in which the shots appear.")],
     out: Store,
     flags: _flags.InversionFlags,
-    watch_flags: WatchFlags,
+    pattern: Annotated[str | None, Option(help="Names of the shots, in quotes.")] = None,
+    latest: Annotated[bool, Option("--latest", help=HELP["latest"])] = False,
+    idle: Annotated[float | None, Option(metavar="SECONDS", help=HELP["idle"])] = None,
     settings: Annotated[
         list[str] | None, _flags.setting(WATCH_SECTIONS, _EXAMPLE, FILE_KEYS)
     ] = None,
@@ -121,9 +104,9 @@ def watch(
     from napari_shadowinv.cli._batch import run_watch
 
     run_keys = {
-        "run.pattern": ("--pattern", watch_flags.pattern),
-        "run.latest": ("--latest", watch_flags.latest or None),
-        "run.idle": ("--idle", watch_flags.idle),
+        "run.pattern": ("--pattern", pattern),
+        "run.latest": ("--latest", latest or None),
+        "run.idle": ("--idle", idle),
     }
     chosen = settings_of(settings or (), WATCH_SECTIONS, flags.by_key | run_keys, FILE_KEYS)
     run = chosen.change("run", WatchOptions(overwrite=overwrite))
@@ -133,7 +116,7 @@ def watch(
 @notify_errors
 def export(
     store: _flags.StoreFolder,
-    form: Annotated[str, Option("--format", metavar="tiff|pradformat|csv", help=HELP["format"])],
+    form: Annotated[str, Option("--format", metavar="tiff|csv", help=HELP["format"])],
     shots: _flags.ChosenShots = None,
     variables: Annotated[str, Option(help=HELP["variables"])] = "potential",
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from napari_shadowinv.cli._terminal import plain
@@ -49,22 +49,20 @@ def headline_row(headline: Headline) -> tuple[str, str, str]:
 
 
 def provenance_rows(provenance: Provenance | None) -> Rows:
-    """Return the files that a result was made from, the steps before it, and its choices."""
+    """Return the files that a result was made from, and what was done to them."""
     if provenance is None:
         return []
     rows: Rows = []
     for number, image in enumerate(provenance.images, 1):
         of_image = f" {number}" if len(provenance.images) > 1 else ""
-        masks = (provenance.mask_of(image.mask), provenance.mask_of(image.source_mask))
-        origins = (image, image.source, image.dark, *masks)
-        names = ("image", "source", "dark frame", "mask", "source mask")
-        for name, origin in zip(names, origins, strict=True):
+        files = {"image": image, "source": image.source, "dark frame": image.dark}
+        files["mask"] = provenance.mask_of(image.mask)
+        files["source mask"] = provenance.mask_of(image.source_mask)
+        for name, origin in files.items():
             if origin is not None and (origin.file or origin is not image):
                 checksum = f", sha256 {origin.sha256}" if origin.sha256 else ""
                 rows.append((name + of_image, f"{origin.file or 'an array'}{checksum}"))
         rows += [(f"prepared{of_image}", note) for note in image.notes]
-        if image.brightness is not None:
-            rows.append((f"brightness{of_image}", f"{image.brightness:g}"))
     recipe, table = provenance.recipe, provenance.fiducials
     if recipe.steps and not any(image.notes for image in provenance.images):  # of many shots
         rows.append(("steps", "; ".join(step.summary for step in recipe.steps)))
@@ -78,27 +76,17 @@ def provenance_rows(provenance: Provenance | None) -> Rows:
     return rows
 
 
-def fact_rows(
-    facts: Iterable[Fact], printed: Collection[str] = (), *, details: bool = False
-) -> Rows:
-    """Return facts as rows of a table, without the verdict and cautions that are printed."""
+def fact_rows(facts: Iterable[Fact], *, details: bool = False) -> Rows:
+    """Return facts as rows of a table, without the verdict."""
     return [
         (fact.title[:1].lower() + fact.title[1:], fact.text)
         for fact in facts
-        # A fit puts the name of the image first.
-        if fact.key != "verdict" and not fact.text.endswith(tuple(printed))
-        if details or not fact.is_detail
+        if fact.key != "verdict" and (details or not fact.is_detail)
     ]
 
 
-def result_rows(
-    result: Any,
-    printed: Collection[str] = (),
-    *,
-    names: Sequence[str] = (),
-    shot: Shot | None = None,
-) -> Rows:
-    """Return headline, facts and setup of a result, without the cautions that are printed.
+def result_rows(result: Any, *, names: Sequence[str] = (), shot: Shot | None = None) -> Rows:
+    """Return headline, facts and setup of a result.
 
     `names` are the images of a fit; `shot` has what the file of an image says about the setup.
     """
@@ -106,7 +94,7 @@ def result_rows(
     image = result.images[0] if hasattr(result, "images") else result.image
     return [
         headline_row(result.headline),
-        *fact_rows(facts, printed),
+        *fact_rows(facts),
         ("setup", setup_text(result.setup, shot, image.shape)),
     ]
 

@@ -22,7 +22,6 @@ from napari_shadowinv._system.machine import ENDING_SIGNALS, handling
 from napari_shadowinv.errors import InputError, InversionCancelled
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
     from rich.table import Table
     from rich.text import Text
 
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 
 EXIT_FAILED_SHOTS = 1
 EXIT_MISTAKE = 2
-EXIT_NO_FIGURE = 1
 EXIT_NOT_CONVERGED = 3
 
 # Control characters, marks of direction, lone surrogates, and ends of lines.
@@ -75,14 +73,14 @@ def say_on_stderr(text: str, style: str = "bold red") -> None:
 
 @contextmanager
 def work_callbacks(quiet: bool) -> Iterator[dict[str, Any]]:
-    """Provide the callbacks of long work as keywords: bars of its progress, and Ctrl-C."""
-    with nullcontext() if quiet else progress_bars() as show:
+    """Provide the callbacks of long work as keywords: a bar of its progress, and Ctrl-C."""
+    with nullcontext() if quiet else progress_bar() as show:
         yield {"on_progress": show, "should_stop": is_interrupted}
 
 
 @contextmanager
-def progress_bars() -> Iterator[OnProgress | None]:
-    """Show a bar for each stage, on a terminal only."""
+def progress_bar() -> Iterator[OnProgress | None]:
+    """Show a bar for the stage of the work, on a terminal only."""
     from rich import progress as bar
     from rich.console import Console
     from rich.table import Column
@@ -91,30 +89,27 @@ def progress_bars() -> Iterator[OnProgress | None]:
     if not console.is_terminal:
         yield None
         return
-    flexible = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # keeps each bar on one line
+    flexible = Column(ratio=1, no_wrap=True, overflow="ellipsis")  # keeps the bar on one line
     columns = (
         bar.TextColumn("{task.description:<10}", markup=False),
         bar.BarColumn(bar_width=30),
         bar.TimeElapsedColumn(),
+        bar.TimeRemainingColumn(),
         bar.TextColumn("{task.fields[message]}", style="dim", markup=False, table_column=flexible),
     )
     with bar.Progress(*columns, console=console, expand=True) as bars:
-        tasks: dict[str, TaskID] = {}
-
-        def finish_all() -> None:
-            for task in tasks.values():
-                bars.update(task, total=1, completed=1)
-                bars.stop_task(task)
+        task = bars.add_task("", total=None, message="")
 
         def show(progress: Progress) -> None:
-            if progress.stage not in tasks:
-                finish_all()
-                tasks[progress.stage] = bars.add_task(progress.stage, total=None, message="")
-            task, message = tasks[progress.stage], escape_invisible(progress.text)
-            bars.update(task, total=progress.total, completed=progress.step, message=message)
+            bars.update(
+                task,
+                description=progress.stage,
+                total=progress.total,
+                completed=progress.step,
+                message=escape_invisible(progress.text),
+            )
 
         yield show
-        finish_all()
 
 
 def notify_errors(command: Callable[P, None]) -> Callable[P, None]:

@@ -202,7 +202,6 @@ SCAN_SUFFIXES = _collect_suffixes(each for each in FORMATS if each.is_scan)
 IMAGE_WRITERS = {
     suffix: each.image_writer for each in FORMATS if each.image_writer for suffix in each.suffixes
 }
-NETCDF_SUFFIX = HDF5.suffixes[-1]
 FIGURE_SUFFIXES = (PNG.suffix, ".pdf", ".svg")
 
 # Their marks are those of TIFF.

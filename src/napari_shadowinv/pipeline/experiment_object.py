@@ -285,8 +285,8 @@ def object_of_result(result: Any) -> PlannedObject:
     if len(fields) > 1:
         names = " and ".join(field.name for field in fields)
         raise InputError(
-            f"the result has the fields {names}: an experiment is planned for one of them; give "
-            "its displacement as an array"
+            f"the result has the fields {names}: expected one; in Python, object_of_displacement "
+            "takes the displacement of one of them"
         )
     (field,) = fields
     displacement = getattr(field, "displacement", None)

@@ -81,11 +81,6 @@ class RunStatus:
         return self.ended / self.seconds if self.seconds > 0 else 0.0
 
     @property
-    def remaining(self) -> float | None:
-        """Seconds until the waiting shots have ended at the same rate; None if unknown."""
-        return self.waiting / self.rate if self.rate else None
-
-    @property
     def text(self) -> str:
         """The numbers of shots."""
         numbers = [
