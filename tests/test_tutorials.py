@@ -170,7 +170,7 @@ def test_the_table_of_sources_is_as_the_inversions_say():
     rows = re.findall(pattern, text_of("docs/tutorials/no-reference.md"), re.M)
     by_title = {f"estimate: {model.title}": model for model in ESTIMATES.values()}
     by_title["uniform"] = ESTIMATES["uniform"]
-    assert len(rows) == 5
+    assert len(rows) == 4
     for title, peak, error, residual in rows:
         beam = source if title.startswith("supplied") else by_title[title]().source(image, None)
         inversion = invert(image, source=beam)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,21 +35,28 @@ Exit codes: 0 written; 2 invalid input; 130 cancelled.
 """
 
 
+@dataclass(frozen=True)
+class ProductFlags:
+    """Flags of the products and of their bands."""
+
+    unit: Annotated[str | None, Option(help=HELP["unit"])] = None
+    deflector: Annotated[str | None, Option(help="Field of a fit: B, E, plasma or phase.")] = None
+    samples: Annotated[int, Option(help="Samples of the field for the bands.", metavar="N")] = 100
+    setup: _flags.SetupFile = None
+    shots: _flags.ChosenShots = None
+    times: Annotated[str | None, Option(help="Seconds between shots, or a list for each.")] = None
+
+
 @notify_errors
+@_flags.takes_flags
 def analyse(
     result: Annotated[Path, _flags.argument(help="Result, or store of shots.")],
+    flags: ProductFlags,
+    outputs: Outputs,
     product: Annotated[list[str] | None, _flags.argument(help=HELP["products"])] = None,
-    unit: Annotated[str | None, Option(help=HELP["unit"])] = None,
-    deflector: Annotated[str | None, Option(help="Field of a fit: B, E, plasma or phase.")] = None,
-    samples: Annotated[int, Option(help="Samples of the field for the bands.", metavar="N")] = 100,
-    setup: _flags.SetupFile = None,
-    shots: _flags.ChosenShots = None,
-    times: Annotated[str | None, Option(help="Seconds between shots, or a list for each.")] = None,
     csv: Annotated[Path | None, Option(help="Table of all numbers with their bands.")] = None,
     figure: Annotated[Path | None, Option(help=HELP["figure"])] = None,
     out: Annotated[Path | None, Option(help="Copy of the result with the products.")] = None,
-    overwrite: _flags.Overwrite = False,
-    quiet: _flags.Quiet = False,
 ) -> None:
     """Measure profiles, regions, fluxes, currents and maps of a result, with error bands.
 
@@ -63,10 +71,10 @@ def analyse(
     from napari_shadowinv.io.store_shots import open_shots
     from napari_shadowinv.physics.beam import numbers_in_unit
 
-    chosen, outputs = _products(product or []), Outputs(overwrite, quiet)
+    chosen = _products(product or [])
     outputs.check(
         [(csv, TABLE.suffixes), (figure, FIGURE_SUFFIXES), (out, RESULT.suffixes)],
-        [result, setup],
+        [result, flags.setup],
     )
     if is_stack(result):
         if out is not None:
@@ -74,38 +82,34 @@ def analyse(
                 f"received --out {out}, which copies one result with its products, but a store has "
                 "many results: use --csv"
             )
-        dataset = open_shots(result, shots)
-    elif shots is not None or times is not None:
+        dataset = open_shots(result, flags.shots)
+    elif flags.shots is not None or flags.times is not None:
         raise InputError(f"{result} is one result: --shots and --times belong to a store of shots")
     else:
         dataset = read_dataset(result)
-    with work_callbacks(quiet) as callbacks:
-        common: dict[str, Any] = {
-            "unit": unit,
-            "deflector": deflector,
-            "setup": read_setup(setup),
-            **callbacks,
-        }
+    with work_callbacks(outputs.quiet) as callbacks:
+        common = {"unit": flags.unit, "deflector": flags.deflector, **callbacks}
+        common["setup"] = read_setup(flags.setup)
         if "shot" in dataset.dims:
             seconds = None
-            if times is not None:
-                numbers = numbers_in_unit(times, "s", "--times")
+            if flags.times is not None:
+                numbers = numbers_in_unit(flags.times, "s", "--times")
                 indices = dataset["index"].values
-                seconds = shot_times(numbers, indices.tolist(), f"--times is {times!r}")
+                seconds = shot_times(numbers, indices.tolist(), f"--times is {flags.times!r}")
             results = analyse_shots(dataset, chosen, seconds, **common)
         else:
-            results = measure(dataset, chosen, samples=samples, **common)
+            results = measure(dataset, chosen, samples=flags.samples, **common)
     with ExitStack() as stack:  # both files, or none
         if csv is not None:
-            temporary = stack.enter_context(replacing(csv, overwrite))
+            temporary = stack.enter_context(replacing(csv, outputs.overwrite))
             temporary.write_text(products_table(results), encoding="utf-8")
         if out is not None:
-            write(out, add_products(dataset, results), overwrite=overwrite)
+            write(out, add_products(dataset, results), overwrite=outputs.overwrite)
     if figure is not None:
         from napari_shadowinv.plotting import products_figure
 
         outputs.write_figures({figure: lambda: products_figure(results)})
-    if not quiet:
+    if not outputs.quiet:
         for table in _tables(results):
             say(table)
     if outputs.files:

@@ -56,11 +56,6 @@ if TYPE_CHECKING:
 _MAX_LISTED = 10  # shots, or reasons, that a row lists
 
 
-def _rate_text(status: RunStatus) -> str:
-    rate = status.rate
-    return f"{rate:.1f} shots/s" if rate >= 1 else f"{60 * rate:.1f} shots/min"
-
-
 @dataclass
 class _Printer:
     """Printer of a run, by a bar or a line for each shot, with its latest status."""
@@ -157,7 +152,7 @@ def run_batch(
     store, status, text = StackStore(out), printer.status, "nothing to do"
     if status is not None and status.ended:
         shots_text = f"{status.ended} shot{'s' * (status.ended != 1)}"
-        text = f"{shots_text} in {status.seconds:.1f} s, {_rate_text(status)}"
+        text = f"{shots_text} in {status.seconds:.1f} s, {status.rate:.2g} shots/s"
     if not quiet:
         rows = [
             ("shots", _counts_text(store)),

@@ -36,14 +36,14 @@ Exit codes: 0 written; 2 invalid input, nothing written; 130 cancelled.
 
 
 @notify_errors
+@_flags.takes_flags
 def film(
     pack: Annotated[Path, _flags.argument(help=HELP["pack"])],
+    outputs: Outputs,
     layers: Annotated[Path | None, Option(help=HELP["layers"])] = None,
     corners: Annotated[Path | None, Option("--save-corners", help=HELP["corners"])] = None,
     out: Annotated[Path | None, Option(help=HELP["out"])] = None,
     figure: _flags.Figure = None,
-    overwrite: _flags.Overwrite = False,
-    quiet: _flags.Quiet = False,
 ) -> None:
     """Convert the scans of a film pack to doses and fluences, layer by layer.
 
@@ -56,7 +56,6 @@ def film(
     from napari_shadowinv.pipeline import read_pack, run_film, write_layers
     from napari_shadowinv.pipeline.film_files import LAYERS_TABLE
 
-    outputs = Outputs(overwrite, quiet)
     result, figure = result_and_figure(pack, out, figure)
     outputs.check_result(ResultKind.FILM_DOSES, result, figure)
     table = None if layers is None else layers / LAYERS_TABLE
@@ -64,11 +63,11 @@ def film(
     outputs.check([(corners, TABLE.suffixes), (replaced, TABLE.suffixes)], [])
     content = read_pack(pack)
     outputs.protect([pack, *content.files])
-    with work_callbacks(quiet) as callbacks:
+    with work_callbacks(outputs.quiet) as callbacks:
         doses = run_film(content, **callbacks)
     outputs.write_result(doses, [str(pack)], result, figure)
     if layers is not None:
-        files = write_layers(doses, layers, overwrite=overwrite)
+        files = write_layers(doses, layers, overwrite=outputs.overwrite)
         outputs.files.append(files[-1])
     if corners is not None:
         corners_by_film = {
@@ -76,9 +75,9 @@ def film(
             for number, places in enumerate(doses.corners, 1)
             if np.isfinite(places).all()
         }
-        with replacing(corners, overwrite) as temporary:
+        with replacing(corners, outputs.overwrite) as temporary:
             write_corners(temporary, corners_by_film)
-    if not quiet:
+    if not outputs.quiet:
         say(film_table(doses))
     outputs.show("Film pack", fact_rows(doses.facts))
 

@@ -36,6 +36,7 @@ Exit codes: 0 determined; 2 invalid input; 3 another verdict; 130 cancelled.
 def fit(
     images: Annotated[list[Path], _flags.argument(help="Images, or a table (.csv) of them.")],
     flags: _flags.FitFlags,
+    outputs: Outputs,
     settings: Annotated[
         list[str] | None,
         _flags.setting(FIT_SECTIONS, "fit.options.samples=0", FILE_KEYS[:1]),
@@ -43,8 +44,6 @@ def fit(
     save_recipe: _flags.SaveRecipe = None,
     out: Annotated[Path | None, Option(help="Result: .shadowinv, or .h5 for one field.")] = None,
     figure: _flags.Figure = None,
-    overwrite: _flags.Overwrite = False,
-    quiet: _flags.Quiet = False,
 ) -> None:
     """Fit the fields, and the beam, to one or several images of an object.
 
@@ -55,7 +54,7 @@ def fit(
     from napari_shadowinv.pipeline.shot_table import shot_rows
 
     rows = shot_rows(images, flags.setup, flags.energies, "--energies")
-    first, outputs = split_address(rows[0].file)[0], Outputs(overwrite, quiet)
+    first, _ = split_address(rows[0].file)
     target = Path(f"{first.stem}_fit{RESULT.suffix}") if out is None else out
     file, figure = result_and_figure(first, target, figure)
     inputs = [*images, flags.fiducials, flags.recipe]
@@ -69,12 +68,12 @@ def fit(
     check_setup(file, shots[0].setup, recipe.fit.fields if recipe.fit else None)
     outputs.warn_of_setups((shot.setup, getattr(shot.image, "shape", None)) for shot in shots)
     names = [str(row.file) for row in rows]
-    with work_callbacks(quiet) as callbacks:
+    with work_callbacks(outputs.quiet) as callbacks:
         result = run_fit(recipe, shots, **callbacks)
     outputs.write_result(result, names, file, figure)
     if save_recipe is not None:
         setups = {shot.setup for shot in shots}
-        (common,) = setups if len(setups) == 1 else (None,)
-        write_recipe(save_recipe, recipe.model_copy(update={"setup": common}), overwrite=overwrite)
+        common = recipe.model_copy(update={"setup": setups.pop() if len(setups) == 1 else None})
+        write_recipe(save_recipe, common, overwrite=outputs.overwrite)
     outputs.show("Fit", result_rows(result, names=names))
     outputs.exit_unless_sound(result, file)

@@ -36,8 +36,6 @@ SetupFile = Annotated[Path | None, Option(help="Geometry, for SI units: TOML or 
 Channel = Annotated[str | None, Option(help="red, green, blue, mean or an index.")]
 ChosenShots = Annotated[str | None, Option(help="Shots such as 3, 3:20, ::10 or 1,4,9.")]
 Figure = Annotated[Path | None, Option(help=".png, .pdf or .svg. Default: a PNG.")]
-Overwrite = Annotated[bool, Option("--overwrite", help="Replace existing files.")]
-Quiet = Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")]
 # Names of two words have a hyphen on the command line.
 Deflector = Annotated[
     str | None,
@@ -154,26 +152,25 @@ def instrument_keys(text: str | None) -> dict[str, tuple[str, Any]]:
 def takes_flags(command: Callable[..., None]) -> Callable[..., None]:
     """Let a command take the fields of a dataclass as flags, in place of the dataclass."""
     parameters = inspect.signature(command, eval_str=True).parameters.values()
-    groups: dict[str, Any] = {
+    kinds: dict[str, Any] = {
         each.name: each.annotation for each in parameters if is_dataclass(each.annotation)
     }
+    groups = {name: [f for f in fields(kind) if f.init] for name, kind in kinds.items()}
 
     @functools.wraps(command)
     def with_flags(**arguments: Any) -> None:
         for name, group in groups.items():
-            arguments[name] = group(**{f.name: arguments.pop(f.name) for f in fields(group)})
+            arguments[name] = kinds[name](**{f.name: arguments.pop(f.name) for f in group})
         command(**arguments)
 
     listed = []
-    for parameter in parameters:
-        if parameter.name in groups:
-            hints = get_type_hints(groups[parameter.name], include_extras=True)
-            listed += [
-                inspect.Parameter(f.name, _KEYWORD, default=f.default, annotation=hints[f.name])
-                for f in fields(groups[parameter.name])
-            ]
-        else:
-            listed.append(parameter.replace(kind=_KEYWORD))
+    for each in parameters:
+        hints = get_type_hints(kinds.get(each.name, object), include_extras=True)
+        listed += [
+            inspect.Parameter(f.name, _KEYWORD, default=f.default, annotation=hints[f.name])
+            for f in groups.get(each.name, ())
+        ] or [each.replace(kind=_KEYWORD)]
+    listed.sort(key=lambda each: each.name in ("overwrite", "quiet"))  # the last on a help page
     with_flags.__signature__ = inspect.Signature(listed)  # type: ignore[attr-defined]
     with_flags.__annotations__ = {}
     return with_flags

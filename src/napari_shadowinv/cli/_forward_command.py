@@ -30,16 +30,16 @@ Causes: magnetic-field, electric-field, plasma, refractive-index.
 
 
 @notify_errors
+@_flags.takes_flags
 def forward(
     object: Annotated[str, _flags.argument(help=HELP)],
+    outputs: Outputs,
     setup: _flags.SetupFile = None,
     deflector: _flags.Deflector = None,
     source: _flags.SourceFile = None,
     channel: _flags.Channel = None,
     settings: Annotated[list[str] | None, _flags.setting(SECTIONS, "trace.output=counts")] = None,
     out: Annotated[Path | None, Option(help="Image: .tif, .npy or .png.")] = None,
-    overwrite: _flags.Overwrite = False,
-    quiet: _flags.Quiet = False,
 ) -> None:
     """Predict the image of a result, a 3-D field or a phantom, for any setup.
 
@@ -48,7 +48,7 @@ def forward(
     from napari_shadowinv.io import read_shot, write
     from napari_shadowinv.pipeline.prediction import predict
 
-    outputs, file = Outputs(overwrite, quiet), file_of(object)
+    file = file_of(object)
     stem = object.partition(":")[0] if file is None else file.stem
     path = Path(f"{stem}_image{TIFF.suffix}") if out is None else out
     outputs.check([(path, tuple(IMAGE_WRITERS))], [file, source, setup])
@@ -69,7 +69,7 @@ def forward(
         raise InputError(
             "received --deflector, but only one setup: expected a different one with --setup"
         )
-    with work_callbacks(quiet) as callbacks:
+    with work_callbacks(outputs.quiet) as callbacks:
         prediction = predict(
             target,
             experiment,
@@ -80,7 +80,7 @@ def forward(
             **callbacks,
         )
     traced, image = prediction.traced, prediction.image
-    write(path, image, setup=prediction.setup, overwrite=overwrite)
+    write(path, image, setup=prediction.setup, overwrite=outputs.overwrite)
     rows: Rows = [("setup", setup_text(prediction.setup, shape=image.shape))]
     if traced is not None:
         rows += fact_rows(traced.facts)

@@ -10,9 +10,9 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from typer import Exit
+from typer import Exit, Option
 
 from napari_shadowinv._system.safety import resolved_path
 from napari_shadowinv.cli._summary import Rows, two_columns
@@ -41,11 +41,11 @@ Output = tuple[Path | None, tuple[str, ...]]
 
 @dataclass
 class Outputs:
-    """Files of a command."""
+    """Files of a command, with its flags about all that it writes and prints."""
 
-    overwrite: bool
-    quiet: bool
-    files: list[Path] = field(default_factory=list)  # to write
+    overwrite: Annotated[bool, Option("--overwrite", help="Replace existing files.")] = False
+    quiet: Annotated[bool, Option("--quiet", "-q", help="Print errors and warnings only.")] = False
+    files: list[Path] = field(default_factory=list, init=False)  # to write
 
     def check(self, outputs: Iterable[Output], inputs: Iterable[Path | None]) -> None:
         """Add files to be written; refuse, before any work, one that cannot be, or is read."""
@@ -132,21 +132,19 @@ class Outputs:
     def exit_unless_sound(self, result: Any, out: Path) -> None:
         """Exit with an error code if a result has a flaw."""
         doubts = {each.code: each.text for each in result.cautions}
-        if result.kind is ResultKind.INVERSION:
-            flaw = flaw_of(result.report.converged, None, doubts)
-        else:
-            flaw = flaw_of(True, getattr(result, "verdict", None), doubts)
+        is_inversion = result.kind is ResultKind.INVERSION
+        verdict = None if is_inversion else getattr(result, "verdict", None)
+        flaw = flaw_of(not is_inversion or result.report.converged, verdict, doubts)
+        if not flaw:
+            return
+        reason = doubts["samples"] if flaw == _BAD_SAMPLES else getattr(result, "explanation", "")
         if flaw == _NOT_CONVERGED:
-            report = result.report
             reason = (
-                f"its flux residual is {to_figures(report.residual)} (tolerance "
-                f"{to_figures(report.tolerance)}): do not trust the field"
+                f"its flux residual is {to_figures(result.report.residual)} (tolerance "
+                f"{to_figures(result.report.tolerance)}): do not trust the field"
             )
-        elif flaw:
-            reason = doubts["samples"] if flaw == _BAD_SAMPLES else result.explanation
-        if flaw:
-            say_on_stderr(f"{flaw.upper()}: {out} was written, but {reason}")
-            raise Exit(EXIT_NOT_CONVERGED)
+        say_on_stderr(f"{flaw.upper()}: {out} was written, but {reason}")
+        raise Exit(EXIT_NOT_CONVERGED)
 
 
 def flaw_of(converged: bool, verdict: str | None, codes: Collection[str]) -> str:

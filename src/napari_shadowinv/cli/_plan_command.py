@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,20 +39,27 @@ Exit codes: 0 determined; 2 invalid input; 3 not determined; 130 cancelled.
 """
 
 
+@dataclass(frozen=True)
+class PlanFlags:
+    """Flags of the experiment that an object is put into."""
+
+    setup: _flags.SetupFile = None
+    deflector: _flags.Deflector = None
+    energies: Annotated[str | None, Option(metavar="X,X,…", help=HELP["energies"])] = None
+    instrument: _flags.InstrumentNames = None
+    counts: Annotated[float | None, Option(help="Mean counts a pixel. Default: 1000.")] = None
+    size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None
+
+
 @notify_errors
+@_flags.takes_flags
 def plan(
     object: Annotated[str, _flags.argument(help=OBJECT)],
-    setup: _flags.SetupFile = None,
-    deflector: _flags.Deflector = None,
-    energies: Annotated[str | None, Option(metavar="X,X,…", help=HELP["energies"])] = None,
-    instrument: _flags.InstrumentNames = None,
-    counts: Annotated[float | None, Option(help="Mean counts a pixel. Default: 1000.")] = None,
-    size: Annotated[str | None, Option(metavar="HxW", help=HELP["size"])] = None,
+    flags: PlanFlags,
+    outputs: Outputs,
     settings: Annotated[list[str] | None, _flags.setting(SECTIONS, "plan.draws=5")] = None,
     out: Annotated[Path, Option(help="Table (.csv) of draws.")] = Path("plan.csv"),
     figure: _flags.Figure = None,
-    overwrite: _flags.Overwrite = False,
-    quiet: _flags.Quiet = False,
 ) -> None:
     """Simulate shots of an experiment, and report whether the field would be determined."""
     from napari_shadowinv.io.files import replacing
@@ -60,25 +68,25 @@ def plan(
     from napari_shadowinv.pipeline.experiment_object import setups_of_text, shape_of_text
     from napari_shadowinv.plotting import plan_figure
 
-    page, outputs = figure or figure_beside(out), Outputs(overwrite, quiet)
+    page = figure or figure_beside(out)
     outputs.check(
         [(out, TABLE.suffixes), (page, FIGURE_SUFFIXES)],
-        [setup, file_of(object)],
+        [flags.setup, file_of(object)],
     )
-    keys = _flags.instrument_keys(instrument) | {"plan.counts": ("--counts", counts)}
+    keys = _flags.instrument_keys(flags.instrument) | {"plan.counts": ("--counts", flags.counts)}
     stated = settings_of(settings or (), SECTIONS, keys)
-    setups = setups_of_text(read_setup(setup), energies or "", "--energies")
-    shape = None if size is None else shape_of_text(size, "--size")
-    target = object_of(object, deflector, stated, stated.change("view", GridView()))
+    setups = setups_of_text(read_setup(flags.setup), flags.energies or "", "--energies")
+    shape = None if flags.size is None else shape_of_text(flags.size, "--size")
+    target = object_of(object, flags.deflector, stated, stated.change("view", GridView()))
     choices: dict[str, Any] = {
         "shape": shape,
         "instrument": stated.change("instrument", Instrument()),
         "options": stated.change("plan", ExperimentOptions()),
     }
     outputs.warn_of_setups((each, shape) for each in setups or ())
-    with work_callbacks(quiet) as callbacks:
+    with work_callbacks(outputs.quiet) as callbacks:
         result = plan_experiment(target, setups, **choices, **callbacks)
-    with replacing(out, overwrite) as temporary:
+    with replacing(out, outputs.overwrite) as temporary:
         rows_of_draws = result.rows()
         write_cells(temporary, [*rows_of_draws[0]], rows_of_draws)
     outputs.write_figures({page: partial(plan_figure, result)})

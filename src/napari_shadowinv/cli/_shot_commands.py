@@ -56,6 +56,7 @@ Exit codes: 0 success; 2 invalid input; 3 written, but not converged; 130 cancel
 def invert(
     image: _flags.ImageFile,
     flags: _flags.InversionFlags,
+    outputs: Outputs,
     settings: Annotated[
         list[str] | None,
         _flags.setting(INVERSION_SECTIONS, "options.tolerance=1e-4", FILE_KEYS),
@@ -63,8 +64,6 @@ def invert(
     save_recipe: _flags.SaveRecipe = None,
     out: Annotated[Path | None, Option(help="Result: .shadowinv, .h5 or .csv.")] = None,
     figure: _flags.Figure = None,
-    overwrite: _flags.Overwrite = False,
-    quiet: _flags.Quiet = False,
 ) -> None:
     """Retrieve the deflection potential of one image.
 
@@ -73,7 +72,6 @@ def invert(
     from napari_shadowinv.io import read_shot
     from napari_shadowinv.pipeline import run, write_recipe
 
-    outputs = Outputs(overwrite, quiet)
     result, figure = result_and_figure(image, out, figure)
     inputs = [image, flags.recipe, flags.setup]
     outputs.check_result(ResultKind.INVERSION, result, figure, recipe=save_recipe, inputs=inputs)
@@ -85,26 +83,26 @@ def invert(
     recipe = recipe.model_copy(update={"setup": setup_for(flags.setup, shot, recipe)})
     check_setup(result, recipe.setup)
     outputs.warn_of_setups([(recipe.setup, shot.shape)])
-    with work_callbacks(quiet) as callbacks:
+    with work_callbacks(outputs.quiet) as callbacks:
         inversion = run(recipe, shot, **callbacks)
     outputs.write_result(inversion, [str(image)], result, figure)
     if save_recipe is not None:
-        write_recipe(save_recipe, recipe, overwrite=overwrite)
+        write_recipe(save_recipe, recipe, overwrite=outputs.overwrite)
     title = f"{shot.path}, {size_text(inversion.image.shape)}"
     outputs.show(title, result_rows(inversion, shot=shot))
     outputs.exit_unless_sound(inversion, result)
 
 
 @notify_errors
+@_flags.takes_flags
 def rerun(
     result: Annotated[Path, _flags.argument(help="A .shadowinv result of this program.")],
+    outputs: Outputs,
     image: Annotated[list[Path] | None, _flags.argument(help=HELP["image"])] = None,
     source: Annotated[Path | None, Option(help="The measured source, if it has moved.")] = None,
     out: Annotated[Path | None, Option(help=HELP["rerun_out"])] = None,
     figure: _flags.Figure = None,
     other_folders: Annotated[bool, Option("--other-folders", help=HELP["other_folders"])] = False,
-    overwrite: _flags.Overwrite = False,
-    quiet: _flags.Quiet = False,
 ) -> None:
     """Repeat a result from the recipe it contains, and report the changes.
 
@@ -112,7 +110,6 @@ def rerun(
     """
     from napari_shadowinv.pipeline.rerun import collect_rerun
 
-    outputs = Outputs(overwrite, quiet)
     target = out or Path(f"{result.stem}_again{RESULT.suffix}")
     again_out, figure = result_and_figure(result, target, figure)
     inputs = collect_rerun(result, image, source=source, other_folders=other_folders)
@@ -120,7 +117,7 @@ def rerun(
     outputs.warn_of_setups(
         (shot.setup, getattr(shot.image, "shape", None)) for shot in inputs.shots
     )
-    with work_callbacks(quiet) as callbacks:
+    with work_callbacks(outputs.quiet) as callbacks:
         again = inputs.run(**callbacks)
     names = [str(file) for file in inputs.files[: len(inputs.shots)]] or [str(result)]
     outputs.write_result(again.content, names, again_out, figure)
@@ -207,7 +204,8 @@ def demo(
         ),
     }
     result = write(out / f"{name}{RESULT.suffix}", inversion, overwrite=True)
-    outputs = Outputs(overwrite=True, quiet=False, files=[result, *figures])
+    outputs = Outputs(overwrite=True)
+    outputs.files += [result, *figures]
     outputs.write_figures(figures)
     rows = [("error", errors["Retrieved"]), ("error of Poisson", errors["Poisson"])]
     outputs.show("Demo", [*result_rows(inversion), *rows])

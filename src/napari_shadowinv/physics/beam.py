@@ -147,15 +147,10 @@ class BeamQuantity:
     long_name: str
     description: str
 
-    @property
-    def plural(self) -> str:
-        """Noun for several values, such as "energies"."""
-        return f"{self.noun[:-1]}ies" if self.noun.endswith("y") else f"{self.noun}s"
-
-    def text(self, *values: float, digits: int = 4) -> str:
-        """Return values with their unit, such as "14.7 MeV" or "532, 810 nm"."""
-        size, unit = length_unit(max(values)) if self.unit == "m" else (1.0, self.unit)
-        return f"{', '.join(f'{value / size:.{digits}g}' for value in values)} {unit}"
+    def text(self, value: float) -> str:
+        """Return a value with its unit, such as "14.7 MeV" or "532 nm"."""
+        size, unit = length_unit(value) if self.unit == "m" else (1.0, self.unit)
+        return f"{value / size:.4g} {unit}"
 
 
 def number_field(title: str, description: str, default: Any = ..., **limits: Any) -> Any:
