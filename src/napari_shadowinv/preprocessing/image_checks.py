@@ -156,11 +156,12 @@ class CheckedImage:
         is_noise = (noise > 0).all() and np.median(noise) > self.least_noise * levels.mean()
         if not (is_noise and np.ptp(levels) > 0):
             return 0.0
-        variances, weights = noise**2, 1 / (noise * uncertainty)
-        line, covariance = np.polyfit(levels, variances, 1, w=weights, cov="unscaled")
-        misfit = float((((variances - np.polyval(line, levels)) * weights) ** 2).mean())
-        freedom = (len(levels) - 2) / len(levels)
-        return float(line[0]) / math.sqrt(covariance[0, 0] * max(misfit / freedom, 1.0))
+        weights = 1 / (noise * uncertainty)
+        levels, variances = (v - np.average(v, weights=weights**2) for v in (levels, noise**2))
+        information = float(((levels * weights) ** 2).sum())
+        slope = float((levels * variances * weights**2).sum()) / information
+        misfit = float((((variances - slope * levels) * weights) ** 2).sum()) / (len(levels) - 2)
+        return slope * math.sqrt(information / max(misfit, 1.0))
 
     @cached_property
     def relative_differences(self) -> FloatArray:
