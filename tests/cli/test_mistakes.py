@@ -78,7 +78,6 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     "info shots --verify": "is not a stack of shots",
     "info none.shadowinv.zarr": "none.shadowinv.zarr does not exist",
     "export shots --format csv": "is not a stack of shots",
-    "export shots --format pradformat": "expected one of tiff, csv",
     "forward missing.tif": "missing.tif",
     "forward shot.npy": "expected the result",
     "forward ring.shadowinv --source small.npy": "(20, 20)",

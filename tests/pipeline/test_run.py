@@ -326,7 +326,7 @@ def test_cache_spares_work_without_changing_results(image: FloatArray) -> None:
         ),
         (Recipe(), {"mask": (3, 4)}, r"mask has shape \(3, 4\), image \(40, 52\)"),
         (Recipe(), {"source_mask": SHAPE}, "no source estimate to use it"),
-        (Recipe(source=IsotropicEstimate()), {}, "without a setup"),
+        (Recipe(source=IsotropicEstimate()), {}, "and no setup"),
         (Recipe(steps=(Crop(y=(38, 90)),)), {}, "contains 52 × 2 pixels"),
         (Recipe(steps=(Bin(factor=30),)), {}, "cannot bin 40×52 pixels by 30"),
     ],

@@ -14,12 +14,14 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import h5py
 import imageio.v3 as iio
 import numpy as np
 import pytest
 import tifffile
 
 from helpers.command_line import done, interrupted, refused, shadowinv
+from helpers.results import provenance_in
 from napari_shadowinv import read, synthetic_image
 from napari_shadowinv.cli._batch import _Printer
 from napari_shadowinv.cli._terminal import progress_bar
@@ -27,6 +29,7 @@ from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.facts import Level, Verdict
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import store_writing
+from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.plotting import stack_frames, write_film
 from napari_shadowinv.provenance import Provenance
@@ -131,6 +134,7 @@ def test_mistakes_of_an_export_write_nothing(store):
     for text in ("6", "a", "1:2:3:4", ""):
         refused(*tiffs, text, names="expected numbers from 0 to 5")
     refused(*tiffs, "1", "--out", "tiffs", names="exists")
+    refused("export", store, "--format", "pradformat", names="needs a setup of kind 'proton'")
 
 
 def test_shots_are_exported_as_tiff(store):
@@ -139,6 +143,21 @@ def test_shots_are_exported_as_tiff(store):
     assert len(list(Path("tiffs").iterdir())) == 3 * 3
     plane = tifffile.imread("tiffs/0005_shot_5_displacement_x.tif")
     np.testing.assert_array_equal(plane, read(store).displacement.sel(component="x")[5])
+
+
+def test_shots_are_exported_as_pradformat_for_particle_beams(night, folder):
+    Path("setup.toml").write_text(PROTON)
+    batch("--setup", "setup.toml")
+    store = read("n.shadowinv.zarr")
+    done("export", "n.shadowinv.zarr", "--format", "pradformat", "--shots", "4")
+    (path,) = Path("n").iterdir()
+    with h5py.File(path) as file:
+        assert file.attrs["radiograph_filename"] == "shot_4.npy"
+    provenance = provenance_in(path)
+    assert provenance.image.file == "shot_4.npy"
+    assert provenance.image.sha256 == sha256("shots/shot_4.npy")
+    assert provenance.recipe == provenance_in(store).recipe
+    np.testing.assert_allclose(read(path).displacement, store.displacement[4], atol=1e-6)
 
 
 def test_progress_of_a_batch_fits_80_columns(folder, monkeypatch):

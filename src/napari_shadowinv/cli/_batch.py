@@ -94,9 +94,6 @@ class _Printer:
         cautions = list(map(Caution.from_json, report["warnings"]))
         texts = [report["headline"], f"{status.outcome.seconds:.2f} s"]
         texts += [f"{status.waiting} waiting"] if status.waiting else []
-        # A verdict that is no success implies its warnings.
-        if level.is_success and cautions:
-            texts.append(f"{len(cautions)} warning{'s' if len(cautions) > 1 else ''}")
         if not self.quiet:
             say("  ".join([status.name, *texts]), "" if level.is_success else "yellow")
         for warning in cautions:

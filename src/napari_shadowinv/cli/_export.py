@@ -12,15 +12,17 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import check_output, replacing, write
 from napari_shadowinv.io.files import make_folder
-from napari_shadowinv.io.formats import TIFF
+from napari_shadowinv.io.formats import PRADFORMAT, TIFF
+from napari_shadowinv.io.pradformat import check_pradformat_setup
 from napari_shadowinv.io.store import STATUS_NAMES, StackStore
 from napari_shadowinv.io.store_shots import check_images, open_shots, parse_shots
+from napari_shadowinv.pipeline.rerun import provenance_of
 
 if TYPE_CHECKING:
     import xarray
 
 _FORMULA_SIGNS = ("=", "+", "-", "@")
-FORMATS = ("tiff", "csv")
+FORMATS = ("tiff", "pradformat", "csv")
 
 
 def export_shots(
@@ -32,19 +34,28 @@ def export_shots(
     if form == "csv":
         return [_write_table(store, out, shots, overwrite)]
     dataset = open_shots(store, shots)
-    check_images(dataset, variables)
+    if form == "tiff":
+        check_images(dataset, variables)
+    contents: dict[Path, tuple[Any, Any]] = {}  # of the files, with their setups
+    for position in range(dataset.sizes["shot"]):
+        shot = dataset.isel(shot=position)
+        setup, stem = setup_from_dataset(shot), out / _stem(shot)
+        if form == "tiff":
+            for name, plane in _planes(shot, variables):
+                contents[Path(f"{stem}_{name}{TIFF.suffix}")] = plane.astype(float), setup
+            continue
+        check_pradformat_setup(setup)
+        provenance = provenance_of(shot)  # a shot may have its own
+        attributes = {} if provenance is None else {"provenance": provenance.to_json()}
+        contents[Path(f"{stem}{PRADFORMAT.suffix}")] = shot.assign_attrs(attributes), setup
     make_folder(out)
-    chosen = [dataset.isel(shot=position) for position in range(dataset.sizes["shot"])]
-    planes = {
-        out / f"{_stem(shot)}_{name}{TIFF.suffix}": (plane, setup_from_dataset(shot))
-        for shot in chosen
-        for name, plane in _planes(shot, variables)
-    }
-    for path in planes:
+    for path in contents:
         check_output(path, overwrite)
-    for path, (plane, setup) in planes.items():
-        write(path, plane.compute().values.astype(float), setup=setup, overwrite=overwrite)
-    return [*planes]
+    for path, (content, setup) in contents.items():
+        computed = content.compute()
+        plain = computed.values if form == "tiff" else computed
+        write(path, plain, setup=setup, overwrite=overwrite)
+    return [*contents]
 
 
 def _stem(shot: xarray.Dataset) -> str:

@@ -24,7 +24,7 @@ from napari_shadowinv.pipeline.run_options import RunOptions, WatchOptions
 
 # Help of options, where it is longer than a line.
 HELP = {
-    "format": "tiff (float32, one file per shot and component) or csv (one row per shot).",
+    "format": "tiff (float32, one file per shot and component), pradformat, csv (a row per shot).",
     "shots": "A quoted glob, a folder, files, a file of frames, an array of frames in HDF5, or a "
     "table (.csv) with a row per shot.",
     "workers": "Shots at once. Default: one per core.",
@@ -117,7 +117,7 @@ def watch(
 @_flags.takes_flags
 def export(
     store: _flags.StoreFolder,
-    form: Annotated[str, Option("--format", metavar="tiff|csv", help=HELP["format"])],
+    form: Annotated[str, Option("--format", metavar="tiff|pradformat|csv", help=HELP["format"])],
     outputs: Outputs,
     shots: _flags.ChosenShots = None,
     variables: Annotated[str, Option(help=HELP["variables"])] = "potential",

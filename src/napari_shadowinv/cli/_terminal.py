@@ -101,13 +101,9 @@ def progress_bar() -> Iterator[OnProgress | None]:
         task = bars.add_task("", total=None, message="")
 
         def show(progress: Progress) -> None:
-            bars.update(
-                task,
-                description=progress.stage,
-                total=progress.total,
-                completed=progress.step,
-                message=escape_invisible(progress.text),
-            )
+            shares: Any = {"total": progress.total, "completed": progress.step}
+            message = escape_invisible(progress.text)
+            bars.update(task, description=progress.stage, message=message, **shares)
 
         yield show
 
