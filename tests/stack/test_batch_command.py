@@ -27,12 +27,10 @@ from napari_shadowinv.cli._batch import _Printer
 from napari_shadowinv.cli._terminal import progress_bar
 from napari_shadowinv.errors import FileFormatError
 from napari_shadowinv.facts import Level, Verdict
-from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io import store_writing
 from napari_shadowinv.io.files import sha256
 from napari_shadowinv.io.store import DONE, PENDING, StackStore
 from napari_shadowinv.plotting import stack_frames, write_film
-from napari_shadowinv.provenance import Provenance
 from napari_shadowinv.stack import RunStatus
 
 OPTICAL = """
