@@ -1,7 +1,7 @@
 """Work on layers in a thread.
 
-- the pattern of all jobs: `Job`, `Finished`, `ImageJob`
-- an inversion: `InversionJob`; its estimated source: `SourceJob`
+- something to compute, and the layers that come of it: `Job`, `Finished`; on an image: `ImageJob`
+- an inversion: `InversionJob`; its estimated source: `source_job`
 - a fit: `FitJob`; the fit that refines an inversion: `refinement`
 """
 
@@ -20,9 +20,6 @@ from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.inversion import Inversion
-from napari_shadowinv.options import (
-    FitChoices,
-)
 from napari_shadowinv.pipeline.fit_run import refinement_choices, run_fit, run_refinement
 from napari_shadowinv.pipeline.inversion_run import Cache, run
 from napari_shadowinv.preprocessing import Estimate, Recipe, estimate_source
@@ -46,20 +43,26 @@ class Finished:
 
 
 class Job:
-    """Something to compute in a thread, and the layers that come of it.
+    """Something to compute in a thread, and a description of the layers that come of it.
 
-    Cancelled work that does not stop is left alone after `patience` (s).
+    The result of the next job on the same `subject`, an image layer or a name, takes the place of
+    this one's. Cancelled work that does not stop is left alone after `patience` (s).
     """
 
     patience: ClassVar[float] = 0.5
     show: Callable[[Any], Any] | None = None  # what its work returned, unless its window does
 
+    def __init__(
+        self, compute: Callable[..., Any], describe: Callable[[Any], LayerData], subject: Any = None
+    ) -> None:
+        self._compute, self._describe, self.subject = compute, describe, subject
+
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Any:
-        raise NotImplementedError
+        return self._compute(on_progress=on_progress, should_stop=should_stop)
 
     def layers(self, content: Any) -> LayerData:
         """Describe the layers of the result, the lowest first."""
-        raise NotImplementedError
+        return self._describe(content)
 
     def work(self, on_progress: OnProgress, should_stop: ShouldStop) -> Finished:
         """Compute the result and describe its layers, both in the thread."""
@@ -120,49 +123,43 @@ class InversionJob(ImageJob):
         return layer_data
 
 
-@dataclass(eq=False)
-class SourceJob(Job):
-    estimate: Estimate
-    shot: Shot  # its image may be lazy
-    image: Any
-    made_from: dict[str, str]
+def source_job(estimate: Estimate, shot: Shot, image: Any, made_from: dict[str, str]) -> Job:
+    """Return the job that estimates the source of a shot, whose image may be lazy."""
 
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> FloatArray:
-        report = Reporter(on_progress, should_stop)
-        report("source", 0, None, self.estimate.title)
-        shot = shot_in_memory(self.shot, "the image")
-        source = estimate_source(self.estimate, shot, should_stop)
-        report("source", 1, 1)
-        return source
+    def compute(on_progress: OnProgress, should_stop: ShouldStop) -> FloatArray:
+        Reporter(on_progress, should_stop)("source", 0, None, estimate.title)
+        return estimate_source(estimate, shot_in_memory(shot, "the image"), should_stop)
 
-    def layers(self, content: FloatArray) -> LayerData:
-        layer: Any = self.image
-        return [
-            shot_layer(
-                content,
-                f"{layer.name} source: {self.estimate.title}",
-                about.setup_of(layer),
-                tuple(layer.contrast_limits),
-                about.SOURCE,
-                frame=about.frame_of(layer),
-                unit="",
-                setup_origin=about.setup_origin_of(layer),
-                made_from=self.made_from,
-                source_mask=self.shot.source_mask,
-            )
-        ]
+    def describe(content: FloatArray) -> LayerData:
+        layer = shot_layer(
+            content,
+            f"{image.name} source: {estimate.title}",
+            about.setup_of(image),
+            tuple(image.contrast_limits),
+            about.SOURCE,
+            frame=frame_of(image),
+            unit="",
+            setup_origin=about.setup_origin_of(image),
+            made_from=made_from,
+            source_mask=shot.source_mask,
+        )
+        return [layer]
+
+    return Job(compute, describe)
 
 
 @dataclass(eq=False, kw_only=True)
 class FitJob(ImageJob):
     """A fit to several images; images and sources may be lazy.
 
-    The recipe holds the choices of the fit and the setup of the first image.
+    The recipe holds the choices of the fit and the setup of the first image. A `start` is the
+    inversion that the fit refines.
     """
 
     task: ClassVar[str] = "fit"
 
     shots: tuple[Shot, ...]  # with the names of their images
+    start: Inversion | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -172,44 +169,24 @@ class FitJob(ImageJob):
     def image_name(self) -> str:
         return self.names[0]
 
-    @property
-    def choices(self) -> FitChoices:
-        assert self.recipe.fit is not None
-        return self.recipe.fit
-
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
-        return self.compute(on_progress, should_stop)
-
-    def layers(self, content: Fit) -> LayerData:
-        return fit_layers(Result(content, self.origins), self.frame, self.name)
-
-    def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
-        """Load the images, apply the recipe's steps, and fit."""
+        """Load the images, apply the recipe's steps, and fit; or refine the inversion."""
+        callbacks: Any = {"on_progress": on_progress, "should_stop": should_stop}
+        if self.start is not None:
+            assert self.recipe.fit is not None
+            return run_refinement(self.start, self.start.setup, self.recipe.fit, **callbacks)
         names = [f"'{name}'" for name in self.names]
         shots = [
             replace(shot_in_memory(shot, name, f"the source of {name}"), name=name)
             for shot, name in zip(self.shots, names, strict=True)
         ]
-        return run_fit(self.recipe, shots, on_progress=on_progress, should_stop=should_stop)
+        return run_fit(self.recipe, shots, **callbacks)
+
+    def layers(self, content: Fit) -> LayerData:
+        return fit_layers(Result(content, self.origins), self.frame, self.name)
 
 
-@dataclass(eq=False, kw_only=True)
-class Refinement(FitJob):
-    """A fit to the image of an inversion, starting from the inversion."""
-
-    inversion: Inversion
-
-    def compute(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
-        return run_refinement(
-            self.inversion,
-            self.inversion.setup,
-            self.choices,
-            on_progress=on_progress,
-            should_stop=should_stop,
-        )
-
-
-def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
+def refinement(layer: Any, image: Any, name: str, psf: float) -> FitJob:
     """Return the job that fits an inversion's image with its source, mask and setup.
 
     `layer` belongs to the inversion, `image` is the layer of its shot, or `layer` again.
@@ -223,14 +200,14 @@ def refinement(layer: Any, image: Any, name: str, psf: float) -> Refinement:
         )
     inversion = result.content
     start = f"the inversion of '{name}'"
-    return Refinement(
+    return FitJob(
         recipe=Recipe(fit=refinement_choices(inversion, inversion.setup, psf)),
         shots=(Shot(inversion.image, name=name),),
         name=f"{name} refined",
         frame=frame_of(layer),
         origins={"Start": start, "Point spread": f"σ {psf:g} px" if psf else "none"},
         image=image,
-        inversion=inversion,
+        start=inversion,
     )
 
 

@@ -1,16 +1,14 @@
 """The window that simulates an object before its shot: `Simulate`.
 
-- the object: a phantom, or the field of a layer
-- its image: `ForwardJob`; a plan of shots of it: `PlanJob`
+The object is a phantom, or the field of a layer.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 from qtpy.QtWidgets import QWidget
 
 from napari_shadowinv._napari import form as forms
@@ -21,11 +19,9 @@ from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.widgets import _panels as panels
-from napari_shadowinv._napari.widgets._files import IMAGE_FORMATS, Savable, save_as
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of
-from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors, push_button
-from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
+from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
@@ -61,68 +57,10 @@ def is_field(layer: Any) -> bool:
     return about.role_of(layer) in _FIELDS and about.displacement_of(layer) is not None
 
 
-@dataclass(frozen=True, eq=False)
-class ForwardJob(Job):
-    """A prediction of the image of an object."""
-
-    object: SimulatedObject
-    shape: tuple[int, int] = _SHAPE  # of the image of a phantom
-    setup: Setup | None = None
-    deflector: str | None = None
-    source: ArrayLike | None = None  # None for a uniform beam
-    name: str = ""  # of the image
-    frame: about.Frame = about.Frame()  # noqa: RUF009
-    unit: str = ""  # of the source
-    setup_origin: str = ""
-    subject: Any = None  # the layer of the field, or the name of an object
-
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Prediction:
-        Reporter(on_progress, should_stop)("field", 0, None)
-        return predict(
-            self.object,
-            self.setup,
-            self.shape,
-            source=None if self.source is None else plane_of(self.source, "the source"),
-            deflector=self.deflector,
-            on_progress=on_progress,
-            should_stop=should_stop,
-        )
-
-    def layers(self, content: Prediction) -> LayerData:
-        origin = f"{about.CAME_WITH} the forward model, {self.setup_origin}"
-        layer = shot_layer(
-            content.image,
-            self.name,
-            self.setup,
-            intensity_limits(content.image),
-            frame=self.frame,
-            unit=self.unit,
-            source=content.source,  # for an inversion of the image
-            setup_origin=origin if self.setup_origin else None,
-        )
-        return [layer]
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class PlanJob(Job):
-    """A plan of an experiment."""
-
-    object: SimulatedObject
-    setups: tuple[Setup, ...]
-    shape: tuple[int, int] | None
-    instrument: Instrument
-    options: ExperimentOptions
-
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> ExperimentPlan:
-        choices = {"shape": self.shape, "instrument": self.instrument, "options": self.options}
-        keywords: Any = {**choices, "on_progress": on_progress, "should_stop": should_stop}
-        return plan_experiment(self.object, self.setups or None, **keywords)
-
-    def layers(self, plan: ExperimentPlan) -> LayerData:
-        """Describe the image of the first draw."""
-        setup = plan.setups[0] if plan.setups else None
-        image, name = plan.images[0], f"{self.object.title}, planned"
-        return [shot_layer(image, name, setup, intensity_limits(image), unit="counts")]
+def _planned_image(plan: ExperimentPlan, name: str) -> LayerData:
+    """Describe the image of the first draw."""
+    setup, image = plan.setups[0] if plan.setups else None, plan.images[0]
+    return [shot_layer(image, name, setup, intensity_limits(image), unit="counts")]
 
 
 class Simulate(panels.ToolPanel):
@@ -131,16 +69,13 @@ class Simulate(panels.ToolPanel):
     def __init__(self, napari_viewer: Any) -> None:
         tip = "Trace the beam through the object, or invert shots with random imperfections."
         super().__init__(napari_viewer, Run("Run", tip))
-        self._predicted: Any = None  # layers of the last image; plans have others
         self._build_object()
         self._build_task()
         self.warning = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.verdict, self.report = panels.VerdictLine(), panels.ReportView()
         self.plot = Plot(_PLOT_HEIGHT_PX, fixed=True)
-        tip = "Save the predicted image with its pixel size (.tif, .npy or .png)."
-        self.save_result = push_button("Save result…", tip, self._save_image)
         self.add(self.object, self._size_row, self.setup, self.task, self.keep_earlier)
-        self.add(self.panel, self.warning, self.verdict, self.save_result, self.plot, self.report)
+        self.add(self.panel, self.warning, self.verdict, self.plot, self.report)
         self._connect()
         self.setup.choose_kind("proton")
         self._ready = True
@@ -165,17 +100,8 @@ class Simulate(panels.ToolPanel):
     def _build_task(self) -> None:
         tip = "Image layer of the undisturbed beam."
         self.source = LayerPicker(self.viewer, tip, "uniform", about.may_be_source)
-        self.deflector = forms.combo_box(
-            "Field that deflects the beam. Used only to predict the object's image in another "
-            "experiment, when the setup differs from the result's setup.",
-            [
-                ("default for the beam", None),
-                *((name, name) for name in deflector_titles().values()),
-            ],
-        )
-        self._deflector_row = forms.labelled("Deflected by", self.deflector.native)
         image, plan = QWidget(), QWidget()
-        column(image, forms.labelled("Source", self.source), self._deflector_row)
+        column(image, forms.labelled("Source", self.source))
         self.energies = forms.text_line(
             "14.7, 30",
             "Energies of several images of a shot in MeV (of light: wavelengths in m), separated "
@@ -216,22 +142,21 @@ class Simulate(panels.ToolPanel):
         self.object.set_kind(_LAYER)
         self.field.layer = layer
 
-    def request(self) -> ForwardJob | PlanJob:
+    def request(self) -> Job:
         setup = self.setup.setup()
         target = self._object()
         size = self.side.text().strip()
         shape = shape_of_text(size, "'Size (px)'") if size else None
         if self.task.kind == _IMAGE:
             return self._image_job(target, setup, shape or _SHAPE)
-        instrument = validate(Instrument, self.instrument.state(), "instrument")
-        options: Any = self.options.model()
-        return PlanJob(
-            object=target,
-            setups=tuple(setups_of_text(setup, self.energies.text(), "'Energies'") or ()),
-            shape=shape,
-            instrument=instrument,
-            options=options,
-        )
+        choices: Any = {
+            "setups": setups_of_text(setup, self.energies.text(), "'Energies'"),
+            "shape": shape,
+            "instrument": validate(Instrument, self.instrument.state(), "instrument"),
+            "options": self.options.model(),
+        }
+        describe = partial(_planned_image, name=f"{target.title}, planned")
+        return Job(partial(plan_experiment, target, **choices), describe, _PLAN)
 
     def _object(self) -> SimulatedObject:
         """Return the phantom or the layer's field, or raise an `InputError`."""
@@ -255,7 +180,7 @@ class Simulate(panels.ToolPanel):
 
     def _image_job(
         self, target: SimulatedObject, setup: Setup | None, shape: tuple[int, int]
-    ) -> ForwardJob:
+    ) -> Job:
         beam: Any = self.source.layer
         source = None if beam is None else image_of(beam)
         layer: Any = None
@@ -267,26 +192,23 @@ class Simulate(panels.ToolPanel):
             shape = source.shape
         # In another experiment the object may have other pixels.
         is_moved = layer is None or getattr(target, "setup", None) not in (None, setup)
-        return ForwardJob(
-            target,
-            shape=shape,
-            setup=setup,
-            deflector=self.deflector.value,
-            source=source,
-            name=f"{target.title} image",
-            frame=about.frame_for(shape, setup) if is_moved else about.frame_of(layer),
-            unit=about.unit_of(beam or {}),
-            setup_origin=self.setup.origin,
-            subject=target.title if layer is None else layer,
-        )
+        origin = f"{about.CAME_WITH} the forward model, {self.setup.origin}"
+        facts: dict[str, Any] = {
+            "frame": about.frame_for(shape, setup) if is_moved else about.frame_of(layer),
+            "unit": about.unit_of(beam or {}),
+            "setup_origin": origin if self.setup.origin else None,
+        }
 
-    @notify_errors
-    def _save_image(self) -> None:
-        if self._predicted is None or not self._predicted.layers:
-            raise InputError("there is no predicted image yet: press Run first")
-        (layer,) = self._predicted.layers
-        setup = about.setup_of(layer)
-        save_as(self, Savable(layer.name, layer.data, IMAGE_FORMATS, setup), self.panel.say)
+        def compute(**callbacks: Any) -> Prediction:
+            light = None if source is None else plane_of(source, "the source")
+            return predict(target, setup, shape, source=light, **callbacks)
+
+        def describe(content: Prediction) -> LayerData:
+            image, name = content.image, f"{target.title} image"
+            more = facts | {"source": content.source}  # for an inversion of the image
+            return [shot_layer(image, name, setup, intensity_limits(image), **more)]
+
+        return Job(compute, describe, target.title if layer is None else layer)
 
     def forget(self) -> None:
         self.warning.setVisible(False)
@@ -294,13 +216,11 @@ class Simulate(panels.ToolPanel):
         self.report.empty()
         self.plot.setVisible(False)
 
-    def show_result(self, finished: Finished, job: ForwardJob | PlanJob) -> None:
+    def show_result(self, finished: Finished, job: Job) -> None:
         content = finished.content
-        subject = job.subject if isinstance(job, ForwardJob) else _PLAN
-        self.results = self._last.layers_for_next(subject)
+        self.results = self._last.layers_for_next(job.subject)
         self.results.show(finished.layer_data)
-        if isinstance(job, ForwardJob):
-            self._predicted = self.results
+        if isinstance(content, Prediction):
             self.viewer.reset_view()
             self.warning.show_text(content.warning)
             return
@@ -329,8 +249,6 @@ class Simulate(panels.ToolPanel):
         if not self.panel.running:
             self.panel.say("")  # an error of other choices
         kind, is_plan = self.object.kind, self.task.kind == _PLAN
-        self.save_result.setVisible(not is_plan)
         self._size_row.setVisible(is_plan or kind != _LAYER)
-        self._deflector_row.setVisible(kind == _LAYER)
         has_size = is_plan and kind not in PHANTOMS
         self.side.setPlaceholderText("that of the field" if has_size else _SIZE)

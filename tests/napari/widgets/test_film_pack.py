@@ -1,7 +1,5 @@
 """The widget that converts scans of a film pack to fluences, mostly without a window."""
 
-import time
-
 import numpy as np
 import pytest
 
@@ -9,11 +7,9 @@ from helpers.layers import layer_of
 from napari_shadowinv import read, write
 from napari_shadowinv._napari.layer_metadata import role_of, setup_of, usable_of
 from napari_shadowinv._napari.layers import BY_HAND
-from napari_shadowinv._napari.widgets import film_pack
 from napari_shadowinv._napari.widgets.film_pack import FilmPack, corner_layers, dragged_corners
 from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
-from napari_shadowinv.errors import InversionCancelled
 from napari_shadowinv.film import read_corners
 from napari_shadowinv.film_doses import FilmDoses
 
@@ -30,17 +26,6 @@ def evaluated(viewer, tool, pack_doses, tmp_path):
     viewer.open(write(tmp_path / "trio.shadowinv", pack_doses), plugin="napari-shadowinv")
     assert tool.file.state() == {}
     return tool
-
-
-def scratch_of(tool):
-    return list(tool._scratch.rglob("*"))
-
-
-def mean_fluences(doses, rows=np.s_[:], columns=np.s_[:]):
-    """The mean of each film's usable pixels."""
-    films = doses.fluence[:, rows, columns].astype(float)
-    used = np.where(doses.usable[:, rows, columns], films, np.nan)
-    return np.nanmean(used, axis=(1, 2))
 
 
 def test_corners_are_shown_dragged_and_used(viewer, evaluated, pack_doses, run, wait):
@@ -126,26 +111,7 @@ def test_painted_pixels_are_not_used(viewer, evaluated, pack_doses, run, tmp_pat
     assert tool._selected()[1].usable[spot].all()
 
 
-def test_cancelling_removes_what_was_written_for_the_run(
-    viewer, evaluated, cancelled, monkeypatch, wait
-):
-    written = []
-
-    def work(pack, *, on_progress, should_stop):
-        written.extend(path.name for path in scratch_of(evaluated) if path.is_file())
-        while not should_stop():
-            time.sleep(0.01)
-        raise InversionCancelled
-
-    monkeypatch.setattr(film_pack, "run_film", work)
-    layer_of(viewer, "unusable").data[0, 30:40, 30:40] = BY_HAND
-    cancelled(evaluated, lambda: bool(written))
-    assert written == ["mask_01.tif"]
-    wait(lambda: not scratch_of(evaluated))
-
-
 def test_films_become_images_that_can_be_fitted(viewer, opened, evaluated, pack_doses, rest):
-    assert evaluated.request().pack == pack_doses.pack
     evaluated.to_fit.click()
     rest(evaluated)
     images = [layer for layer in viewer.layers if role_of(layer) == "shot"]

@@ -38,11 +38,9 @@ from napari_shadowinv.io.formats import (
     PNG,
     PRADFORMAT,
     RESULT,
-    TIFF,
     Format,
     formats_for,
 )
-from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.pipeline import read_recipe, write_recipe
 from napari_shadowinv.pipeline.files import command_of, recipe_entries
 from napari_shadowinv.pipeline.inversion_run import picture_mask, plane_of
@@ -209,11 +207,7 @@ def _read_mask(file: Path | None, shape: tuple[int, ...] | None) -> BoolArray | 
 _TITLES = {
     RESULT: "Complete result",
     PRADFORMAT: "Potential and deflection, pradformat",
-    TIFF: "Image, float32 TIFF",
-    NPY: "Image, NumPy array",
-    PNG: "Image, 16-bit PNG",
 }
-IMAGE_FORMATS = (TIFF, NPY, PNG)
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,7 +217,6 @@ class Savable:
     name: str
     content: Any
     formats: tuple[Format, ...]
-    setup: Setup | None = None  # of an image
 
 
 def shown_result(viewer: Any, preferred: Iterable[Any] = ()) -> Any:
@@ -262,7 +255,7 @@ def save_as(parent: Any, content: Savable, say: Callable[[str], Any]) -> None:
     path = ask_file(parent, "Save result", _file_name(content.name), filters)
     if path is None:
         return
-    write(path, content.content, setup=content.setup, overwrite=True)
+    write(path, content.content, overwrite=True)
     suffix = path.suffix.lower()
     title = next(_TITLES[form] for form in content.formats if suffix in form.suffixes)
     text = f"Saved {title[:1].lower()}{title[1:]} in {path.absolute()}"

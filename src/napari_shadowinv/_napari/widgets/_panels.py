@@ -21,7 +21,7 @@ from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.jobs import Finished, FitJob, ImageJob, Job, Refinement
+from napari_shadowinv._napari.jobs import Finished, FitJob, ImageJob, Job
 from napari_shadowinv._napari.layer_metadata import Result, kind_of, main_layers, result_of
 from napari_shadowinv._napari.layers import FullLayerData, LayerData, add_layers
 from napari_shadowinv._napari.result_files import missing_layers
@@ -273,7 +273,8 @@ class ResultView(QtWidgets.QWidget):
     ) -> None:
         """Show the verdict and report of a job's result; notify if it is doubtful."""
         headline = self._show(result, facts)
-        self._recipe = None if isinstance(job, Refinement) else job.recipe
+        is_refinement = isinstance(job, FitJob) and job.start is not None
+        self._recipe = None if is_refinement else job.recipe
         if not headline.level.is_success:
             show_caution(str(headline))
         self._tool.reveal(self.verdict)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +36,6 @@ from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes, painted_on
 from napari_shadowinv._napari.widgets._panels import ResultLayers
-from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
@@ -189,44 +187,30 @@ def painted_by_hand(labels: AnyArray, doses: FilmDoses) -> BoolArray:
 
 
 @dataclass(frozen=True, eq=False)
-class PackJob(Job):
-    """Arguments of `run_film`; corrections are written to a folder, which a failed run removes."""
+class _Corrections:
+    """What the user has corrected in the result of a pack."""
 
-    pack: Pack  # before any correction
-    path: str  # of the pack file
-    name: str
-    folder: Path  # to create
     corners: Mapping[str, FloatArray] | None = None  # of all films by number
     by_hand: BoolArray | None = None  # painted pixels, which are not used, (n, H, W)
     # Pixel side of the upright films in pixels of each film's scan, (n,); needed with corners.
     scales: FloatArray | None = None
     plane: int = 0  # the film in view
 
-    def run(
-        self, on_progress: OnProgress, should_stop: ShouldStop
-    ) -> tuple[FilmDoses, BoolArray | None]:
-        """Return the doses of the corrected pack, and the painted pixels on its grid."""
-        try:
-            pack, by_hand = corrected_pack(
-                self.pack, self.folder, self.corners, self.by_hand, self.scales
-            )
-            return run_film(pack, on_progress=on_progress, should_stop=should_stop), by_hand
-        except BaseException:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            raise
 
-    def layers(self, content: tuple[FilmDoses, BoolArray | None]) -> LayerData:
+def _pack_job(pack: Pack, path: str, name: str, folder: Path, made: _Corrections) -> Job:
+    """Return the job that evaluates a corrected pack; corrections are written to a folder."""
+
+    def compute(**callbacks: Any) -> tuple[FilmDoses, BoolArray | None]:
+        corrected, by_hand = corrected_pack(pack, folder, made.corners, made.by_hand, made.scales)
+        return run_film(corrected, **callbacks), by_hand
+
+    def describe(content: tuple[FilmDoses, BoolArray | None]) -> LayerData:
         doses, by_hand = content
-        return pack_layers(
-            about.Result(doses),
-            about.frame_for(doses.dose.shape, doses.setup, pixel_size=doses.pixel_size),
-            self.name,
-            by_hand=by_hand,
-            plane=self.plane,
-            path=self.path,
-            pack=self.pack,
-            corners=self.corners,
-        )
+        frame = about.frame_for(doses.dose.shape, doses.setup, pixel_size=doses.pixel_size)
+        facts: Any = {"path": path, "pack": pack, "corners": made.corners, "plane": made.plane}
+        return pack_layers(about.Result(doses), frame, name, by_hand=by_hand, **facts)
+
+    return Job(compute, describe, path or name)
 
 
 class FilmPack(panels.ToolPanel):
@@ -301,7 +285,7 @@ class FilmPack(panels.ToolPanel):
         column.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.add(self.file, self.keep_earlier, self.panel, self.actions)
 
-    def request(self) -> PackJob:
+    def request(self) -> Job:
         """Return the pack of the file, or else of the result, with its corners and painted pixels.
 
         Another file than the result's has none of them.
@@ -309,7 +293,7 @@ class FilmPack(panels.ToolPanel):
         stated = self.file.state().get("file", "").strip()
         file = str(Path(stated).expanduser().absolute()) if stated else ""
         layer = self.packs.layer
-        corrections: tuple[Any, ...] = ()
+        corrections = _Corrections()
         metadata = {} if layer is None else about.metadata_of(layer)
         if layer is None or file not in ("", metadata.get("path")):
             if not file:
@@ -322,22 +306,21 @@ class FilmPack(panels.ToolPanel):
             if len(pack.layers) == len(doses.usable):
                 corrections = self._corrections(layer, doses)
         folder = Path(mkdtemp(dir=self._scratch))
-        return PackJob(pack, file or metadata.get("path", ""), name, folder, *corrections)
+        return _pack_job(pack, file or metadata.get("path", ""), name, folder, corrections)
 
-    def _corrections(self, layer: Any, doses: FilmDoses) -> tuple[Any, ...]:
-        """Return the last arguments of a job: corners, painted pixels, and the film in view."""
+    def _corrections(self, layer: Any, doses: FilmDoses) -> _Corrections:
         labels = self._partner(layer, UNUSABLE)
         by_hand = None if labels is None else painted_by_hand(labels.data, doses)
         corners = dragged_corners(self.viewer, doses) or about.metadata_of(layer).get("corners")
-        return corners, by_hand, doses.scales, plane_in_view(self.viewer, layer)
+        return _Corrections(corners, by_hand, doses.scales, plane_in_view(self.viewer, layer))
 
     def forget(self) -> None:
         self.panel.say("")
 
-    def show_result(self, finished: Finished, job: PackJob) -> None:
+    def show_result(self, finished: Finished, job: Job) -> None:
         for layer in corner_layers(self.viewer):
             self.viewer.layers.remove(layer)
-        self.results = self._last.layers_for_next(job.path or job.name)
+        self.results = self._last.layers_for_next(job.subject)
         self.results.complete.connect(self._follow_result)
         self.results.show(finished.layer_data, fit=not self.viewer.layers)
 

@@ -263,8 +263,8 @@ class Invert(ImagePanel):
         if hidden is not None:
             made_from["source_mask"] = self.source_masks.summary(layer)
         shot = Shot(image, source_mask=hidden)
-        job = jobs.SourceJob(estimate, shot, layer, made_from)
-        self.start(job, partial(self._show_estimate, job=job))
+        job = jobs.source_job(estimate, shot, layer, made_from)
+        self.start(job, partial(self._show_estimate, image=layer))
 
     def _on_progress(self, progress: Progress) -> None:
         job = self.panel.tag
@@ -309,12 +309,12 @@ class Invert(ImagePanel):
         layer_data = main_layers(finished.layer_data, also=self.results.layer_keys)
         self.results.show(layer_data, fit=moved)
 
-    def _show_refinement(self, finished: jobs.Finished, job: jobs.Refinement) -> None:
+    def _show_refinement(self, finished: jobs.Finished, job: jobs.FitJob) -> None:
         self.previewed.hide()
         self.results = self._refined = self.view.show_fit(job, finished)
 
-    def _show_estimate(self, finished: jobs.Finished, job: jobs.SourceJob) -> None:
-        self._last.layers_for_next((job.image, about.SOURCE)).show(finished.layer_data)
+    def _show_estimate(self, finished: jobs.Finished, image: Any) -> None:
+        self._last.layers_for_next((image, about.SOURCE)).show(finished.layer_data)
 
     def on_change(self) -> None:
         """Update the preview, the estimated cost, and what is said of the result."""
