@@ -185,9 +185,6 @@ def first_windows() -> None:
     profile = open_widget(viewer, "Analyse")
     profile._draw()
     profile.lines.layer.add([[99.5, 5.0], [99.5, 194.0]], shape_type="line")
-    for layer in profile.checked():
-        profile.check(layer, False)
-    profile.check(viewer.layers["✓ |∫B×dz| (mT·m) – toroid"])
     photograph(viewer, "tutorial-first-profile.png")
 
 

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from napari_shadowinv.analysis.paths import (
-    Profile,
     interpolate,
     measure_peak,
     sample_path,
     sample_strip,
-    table_text,
 )
 
 
@@ -25,19 +23,6 @@ def test_a_plane_is_sampled_exactly_at_its_place_in_the_world() -> None:
     np.testing.assert_allclose(values[inside], expected[inside], atol=1e-12)
     assert distance[-1] == pytest.approx(50)
     assert np.isnan(interpolate(plane, np.array([[-1.0, 0.0]]), lambda at: at)).all()
-
-
-def test_a_table_names_each_unit_once_and_what_is_averaged() -> None:
-    profiles = [
-        Profile("a potential (nm)", "nm", np.array([1.0, 2.0]), "mean over 5 px"),
-        Profile("re-projection", "flux/px²", np.array([np.nan, 4.0])),
-    ]
-    text = table_text(np.array([0.0, 1.5]), "µm", profiles)
-    assert text.splitlines() == [
-        'distance (µm),"a potential (nm), mean over 5 px",re-projection (flux/px²)',
-        "0,1,nan",
-        "1.5,2,4",
-    ]
 
 
 @pytest.mark.parametrize("degrees", [0.0, 33.0, 90.0, 200.0])

@@ -6,7 +6,7 @@
 - values at points: `interpolate`, `interpolate_cubic`; means across a strip: `mean_inside`
 - where values fall below a level: `first_below`
 - the peak of a profile, its width and area: `measure_peak`, `PeakMeasures`
-- profiles as comma-separated text: `Profile`, `table_text`
+- the values along a line: `Profile`; rows as comma-separated text: `csv_text`
 
 Points are (y, x) in any unit; `interpolate` maps them to pixels.
 """
@@ -16,7 +16,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,7 +33,6 @@ class Profile:
     name: str
     unit: str
     values: FloatArray  # (n,); NaN where the line is outside the image
-    averaging: str = ""  # across the line, in words; empty for values on the line
 
 
 def sample_path(vertices: ArrayLike, step: float = 1.0) -> tuple[FloatArray, FloatArray]:
@@ -155,21 +154,6 @@ def csv_text(rows: Iterable[Iterable[str]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
-
-
-def table_text(distance: FloatArray, unit: str, profiles: Sequence[Profile]) -> str:
-    """Return profiles as comma-separated columns, with units in the first row."""
-    heading = [f"distance ({unit})", *map(_heading, profiles)]
-    numbers = zip(distance, *(profile.values for profile in profiles), strict=True)
-    return csv_text([heading, *([f"{value:.9g}" for value in row] for row in numbers)])
-
-
-def _heading(profile: Profile) -> str:
-    """Return the heading of a column: name, unit unless in the name, and averaging."""
-    name = profile.name
-    if profile.unit and f"({profile.unit})" not in name:
-        name = f"{name} ({profile.unit})"
-    return f"{name}, {profile.averaging}" if profile.averaging else name
 
 
 def path_directions(vertices: ArrayLike, distance: FloatArray) -> FloatArray:

@@ -48,7 +48,7 @@ def test_analyse_opens_once_for_the_selected_image_or_result(
     choose("plot_along_line")
     analyse = docked(window, Analyse)
     assert analyse.tabs.currentIndex() == 0
-    assert analyse.checked() == [image]
+    assert analyse.layers == [image]
     assert analyse.lines.layer.name == "profile – shot"
     assert analyse.lines.layer.mode == "add_line"
     wait(analyse.isVisible)

@@ -200,10 +200,8 @@ def test_first_shadowgram_is_clicked_to_its_end(
     ends[:, 0] = middle[0]
     lines = profile.lines.layer
     lines.add_lines(np.array([lines.world_to_data(end) for end in ends]))
-    for row in range(profile.layers.count()):
-        on = profile.layers.item(row).text() == field.name
-        state = Qt.CheckState.Checked if on else Qt.CheckState.Unchecked
-        profile.layers.item(row).setCheckState(state)
+    for layer in profile.layers:
+        layer.visible = layer is field
     wait(lambda: [one.name for one in profile.profiles] == [field.name])
     flanks = np.array_split(profile.profiles[0].values, 2)
     for flank in flanks:

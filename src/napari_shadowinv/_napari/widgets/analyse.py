@@ -1,20 +1,19 @@
 """The widget that measures layers along a line, and products of a result: `Analyse`.
 
-- the form of the products, with their job: `ProductForm`, `ProductJob`
+- the form of the products: `ProductForm`
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
+from magicgui.widgets import SpinBox
 from napari.utils.notifications import show_info
-from pydantic import Field, create_model
+from pydantic import create_model
 from qtpy import QtWidgets
-from qtpy.QtCore import QSignalBlocker, Qt
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
@@ -24,7 +23,6 @@ from napari_shadowinv._napari.layer_metadata import (
     mapped,
     matrix_between,
     pixel_mapper,
-    role_of,
     unit_of,
 )
 from napari_shadowinv._napari.layers import LayerData, add_layers
@@ -32,7 +30,6 @@ from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._layers import LayerPicker, new_shapes, shown_plane
 from napari_shadowinv._napari.widgets._panels import ReportView, ToolPanel
-from napari_shadowinv._system.progress import OnProgress, ShouldStop
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis import (
@@ -50,23 +47,18 @@ from napari_shadowinv.analysis.paths import (
     measure_peak,
     sample_path,
     sample_strip,
-    table_text,
 )
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.io.formats import FIGURE_SUFFIXES
 from napari_shadowinv.physics.arrays import PLANE
-from napari_shadowinv.physics.beam import number_in_unit
 from napari_shadowinv.physics.units import prefix_for
-from napari_shadowinv.plotting import draw_curves, products_figure, save_figure
+from napari_shadowinv.plotting import draw_curves
 
 _REDRAW_MS = 40  # while the line moves
-_MAX_NAME_LENGTH = 34
-_MAX_WIDTH = 1e6
-_LIST_HEIGHT_PX = 110
+_MAX_WIDTH_PX = 10_000
 
 
 def draw_profiles(
-    columns: Sequence[Any], distance: FloatArray, unit: str, profiles: Sequence[Profile]
+    columns: Sequence[Any], distance: FloatArray, label: str, profiles: Sequence[Profile]
 ) -> None:
     """Draw profiles in panels for their units, with a common distance axis."""
     units = list(dict.fromkeys(profile.unit for profile in profiles))
@@ -74,16 +66,13 @@ def draw_profiles(
         axes.set_ylabel(of_unit or "value")
         for number, profile in enumerate(profiles):
             if profile.unit == of_unit:
-                colour, name = qt.COLOURS[number % len(qt.COLOURS)], profile.name
-                if len(name) > _MAX_NAME_LENGTH:
-                    name = f"{name[: _MAX_NAME_LENGTH - 1]}…"
-                axes.plot(distance, profile.values, color=colour, label=name)
-    averaging = f", {profiles[0].averaging}" if profiles and profiles[0].averaging else ""
-    columns[-1].set_xlabel(f"distance ({unit}){averaging}")
+                colour = qt.COLOURS[number % len(qt.COLOURS)]
+                axes.plot(distance, profile.values, color=colour, label=profile.name)
+    columns[-1].set_xlabel(label)
 
 
 class Analyse(qt.Docked):
-    """Plot the checked layers along a line in their units, and measure products of a result."""
+    """Plot the visible images along a line in their units, and measure products of a result."""
 
     spare_width = 50
 
@@ -96,27 +85,22 @@ class Analyse(qt.Docked):
         kinds = ("shapes",)
         self.lines = LayerPicker(self.viewer, tip, "none yet", kinds=kinds, label="Line")
         self.lines.add_button("✎", "Draw a new line.", self._draw)
-        self._listed: list[Any] = []
-        self.layers = QtWidgets.QListWidget(maximumHeight=_LIST_HEIGHT_PX)
-        self.layers.setSelectionMode(QtWidgets.QListWidget.SelectionMode.NoSelection)
-        self.width_edit = forms.text_line(
-            "0: line only",
-            "Width of the strip, perpendicular to the line, over which values are averaged: in "
-            "px, or with a unit such as 20 um.",
-        )
+        tip = "Width in px of the strip, perpendicular to the line, over which values are averaged."
+        self.width_px = SpinBox(max=_MAX_WIDTH_PX, tooltip=f"<qt>{tip}</qt>")
+        forms.steady(self.width_px.native)
         self.plot = qt.Plot(height=220)
         self.measures = forms.WrappingLabel()
         self.measures.setToolTip(
             "<qt>Peak: value of largest magnitude. Width: full width at half of the peak, relative "
             "to zero. Area: integral along the line.</qt>"
         )
-        self.hint = forms.WrappingLabel("Press ✎ and draw a line on the image.")
+        self.hint = forms.WrappingLabel(
+            "Press ✎ and draw a line on the image: the images that are visible are plotted."
+        )
         self.problem = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
-        self.export = qt.push_button("Export CSV…", "Save the profile as a table.", self._export)
-        width = forms.labelled("Width", self.width_edit)
-        title = QtWidgets.QLabel("Layers to plot")
-        controls = (self.lines, title, self.layers, width)
-        results = (self.hint, self.plot, self.measures, self.export, self.problem)
+        width = forms.labelled("Width (px)", self.width_px.native)
+        controls = (self.lines, width, self.hint)
+        results = (self.plot, self.measures, self.problem)
         page, self.products = QtWidgets.QWidget(), ProductForm(self.viewer)
         self.products.setMinimumWidth(0)  # that of the window counts
         self.tabs = QtWidgets.QTabWidget()
@@ -126,37 +110,36 @@ class Analyse(qt.Docked):
         qt.column(page, *controls, *results, margin=6).setStretchFactor(self.plot, 1)
         self.plot.setVisible(True)  # it keeps its place
         self._connect()
-        self._fill()
+        self._schedule_plot()
 
     def _connect(self) -> None:
         self._timer = qt.timer(self, _REDRAW_MS, self.update_plot, once=True)
-        qt.while_alive(self, self.viewer.layers, ("inserted", "removed", "reordered"), self._fill)
-        qt.while_alive(self, self.viewer.dims, "current_step", self._schedule_plot)
-        qt.layers_while_alive(self, self.viewer.layers, "set_data", self._on_layer)
-        self.lines.picked.connect(self._schedule_plot)
-        for signal in (self.layers.itemChanged, self.width_edit.textChanged):
-            signal.connect(lambda _: self._schedule_plot())
+        layers, dims, plot = self.viewer.layers, self.viewer.dims, self._schedule_plot
+        qt.while_alive(self, layers, ("inserted", "removed", "reordered"), plot)
+        qt.while_alive(self, dims, "current_step", plot)
+        qt.layers_while_alive(self, layers, ("set_data", "visible", "name"), plot)
+        self.lines.picked.connect(plot)
+        self.width_px.changed.connect(plot)
 
-    def checked(self) -> list[Any]:
-        checked = Qt.CheckState.Checked
-        items = (self.layers.item(row) for row in range(self.layers.count()))
-        pairs = zip(self._listed, items, strict=True)
-        return [layer for layer, item in pairs if item.checkState() == checked]
+    @property
+    def layers(self) -> list[Any]:
+        """The visible grey images, the topmost first."""
+        return [layer for layer in self._images if layer.visible]
 
-    def check(self, layer: Any, on: bool = True) -> None:
-        for row, listed in enumerate(self._listed):
-            if listed is layer:
-                self.layers.item(row).setCheckState(_state_of(on))
+    @property
+    def _images(self) -> list[Any]:
+        images = [layer for layer in reversed(self.viewer.layers) if kind_of(layer) == "image"]
+        return [layer for layer in images if not layer.rgb and layer.ndim >= 2]
 
     @qt.notify_errors
     def plot_layer(self, layer: Any) -> None:
-        """Plot only one layer; without a line yet, begin to draw it."""
-        if not any(layer is listed for listed in self._listed):
+        """Show only one of the images; without a line yet, begin to draw it."""
+        images = self._images
+        if layer not in images:
             raise InputError("no image is selected: select a grey image in the layer list")
         self.tabs.setCurrentIndex(0)
-        for checked in self.checked():
-            self.check(checked, on=checked is layer)
-        self.check(layer)
+        for image in images:
+            image.visible = image is layer
         if self.lines.layer is None:
             self._draw()
 
@@ -167,7 +150,7 @@ class Analyse(qt.Docked):
         self.products.choose(layer)
 
     def update_plot(self) -> None:
-        shapes, layers = self.lines.layer, self.checked()
+        shapes, layers = self.lines.layer, self.layers
         line = None
         if shapes is not None:
             line = selected_shape(shapes, lambda kind: kind in OPEN_SHAPES)
@@ -182,7 +165,9 @@ class Analyse(qt.Docked):
         self.hint.setVisible(not self.profiles and not problem)
         if self.profiles or self.plot.figure is not None:
             panels = len({profile.unit for profile in self.profiles}) or 1
-            curves = self._distance, self._unit, self.profiles
+            width = self.width_px.value
+            averaging = f", mean over {width} px" if width else ""
+            curves = self._distance, f"distance ({self._unit}){averaging}", self.profiles
             self.plot.show_drawing(lambda axes: draw_profiles(axes, *curves), panels)
         self._show_measures()
 
@@ -191,15 +176,13 @@ class Analyse(qt.Docked):
         step = min(float(np.min(np.abs(layer.scale[-2:]))) for layer in layers)
         _, self._distance = sample_path(vertices, step)
         self._unit = f"{layers[0].units[-1]:~P}"
-        width, averaging = strip_width(self.width_edit.text(), step, self._unit)
-        points = sample_strip(vertices, self._distance, width, step)
+        points = sample_strip(vertices, self._distance, self.width_px.value * step, step)
         position = self.viewer.dims.point
         self.profiles = [
             Profile(
                 layer.name,
                 unit_of(layer),
                 interpolate(shown_plane(layer, position), points, pixel_mapper(layer, shapes)),
-                averaging,
             )
             for layer in layers
         ]
@@ -217,65 +200,19 @@ class Analyse(qt.Docked):
         """Show a problem until the next profile."""
         self.problem.show_text(text)
 
-    def table(self) -> str:
-        """Return the profiles as comma-separated values, or raise an `InputError`."""
-        if not self.profiles:
-            raise InputError("there is no profile to export: draw a line and check a layer first")
-        return table_text(self._distance, self._unit, self.profiles)
-
     def _schedule_plot(self, _: Any = None) -> None:
         if not self._timer.isActive():
             self._timer.start()
 
-    def _on_layer(self, event: Any) -> None:
-        if any(event.source is layer for layer in (self.lines.layer, *self.checked())):
-            self._schedule_plot()
-
-    def _fill(self, _: Any = None) -> None:
-        """List all grey images; new visible ones are checked."""
-        earlier, checked = self._listed, self.checked()
-        images = [layer for layer in reversed(self.viewer.layers) if kind_of(layer) == "image"]
-        self._listed = [layer for layer in images if not layer.rgb and layer.ndim >= 2]
-        with QSignalBlocker(self.layers):
-            self.layers.clear()
-            for layer in self._listed:
-                is_new = not any(layer is old for old in earlier)
-                on = any(layer is old for old in checked) or (
-                    is_new and layer.visible and (role_of(layer) is not None or not earlier)
-                )
-                item = QtWidgets.QListWidgetItem(layer.name, self.layers)
-                item.setToolTip(layer.name)
-                item.setCheckState(_state_of(on))
-        self._schedule_plot()
-
     @qt.notify_errors
     def _draw(self) -> None:
-        layers = self.viewer.layers
-        images = self.checked() or [layer for layer in layers if kind_of(layer) == "image"]
+        images = self.layers or self._images
         if not images:
             raise InputError(
                 "there is no image to draw a line on: open one (File → Open) or use a sample "
                 "(File → Open Sample)"
             )
-        self.lines.layer = new_shapes(self.viewer, images[-1], "profile", "add_line")
-
-    @qt.notify_errors
-    def _export(self) -> None:
-        export_csv(self, "profile", self.table())
-
-
-def _state_of(on: bool) -> Qt.CheckState:
-    return Qt.CheckState.Checked if on else Qt.CheckState.Unchecked
-
-
-def strip_width(text: str, pixel: float, unit: str) -> tuple[float, str]:
-    """Return a strip's width, of px or a length, in the world's unit, and the mean in words."""
-    for in_unit, factor in (("px", pixel), (unit, 1.0)):
-        with suppress(ValueError):
-            width = number_in_unit(text or "0", in_unit)
-            if 0 <= width < _MAX_WIDTH:
-                return factor * width, f"mean over {width:g} {in_unit}" if width else ""
-    raise InputError(f"Width is '{text}', expected a number in px, or with a unit, such as 20 um")
+        self.lines.layer = new_shapes(self.viewer, images[0], "profile", "add_line")
 
 
 _ELLIPSE_CORNERS = 90
@@ -288,43 +225,11 @@ OPEN_SHAPES = ("line", "path")
 _PANEL_HEIGHT_PX = 210
 
 
-@dataclass(frozen=True, eq=False)
-class ProductJob(Job):
-    """The measurement of a product of a result."""
-
-    origin: about.Result[Any]
-    layer: Any  # of the result
-    product: Product
-    unit: str | None
-    samples: int
-
-    def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> list[ProductResult]:
-        common: Any = {"unit": self.unit, "on_progress": on_progress, "should_stop": should_stop}
-        return analyse(self.origin.content, self.product, samples=self.samples, **common)
-
-    def layers(self, content: list[ProductResult]) -> LayerData:
-        """Describe the maps, on top of the result."""
-        return [
-            map_layer(measured, name, self.layer)
-            for measured in content
-            for name, variable in measured.variables.items()
-            if variable.dims == PLANE
-        ]
-
-
 def draw_groups(columns: Sequence[Any], result: ProductResult) -> None:
     """Draw the curves of a product, in a panel for each unit, but the image's intensity."""
     for axes, names in zip(columns, result.curve_groups, strict=True):
         draw_curves(axes, result, names, qt.COLOURS)
         axes.label_outer()
-
-
-class _Bands(CheckedModel):
-    """How the bands of a single result are found."""
-
-    samples: int = Field(
-        default=100, ge=20, le=2000, description="Number of samples of the field for the bands."
-    )
 
 
 class ProductForm(ToolPanel):
@@ -344,22 +249,17 @@ class ProductForm(ToolPanel):
         self.shapes = LayerPicker(viewer, tip, "none yet", kinds=("shapes",), label="Shape")
         self.shapes.add_button("✎", "Draw a new shape for the product.", self._draw)
         self.unit = forms.combo_box("Unit of the field, which chooses the field, too.")
-        self.bands = forms.ModelForm(_Bands)
         self.plot, self.report = qt.Plot(_PANEL_HEIGHT_PX, fixed=True), ReportView()
         self.export = qt.push_button("Export CSV…", "Save the numbers and curves.", self._export)
-        self.picture = qt.push_button(
-            "Save figure…", "Save a figure of the curves and maps.", self._save_figure
-        )
         self.add(
             self.result,
             self.product,
             self.shapes,
             forms.labelled("Unit", self.unit.native),
-            self.bands,
             self.panel,
             self.plot,
             self.report,
-            qt.side_by_side((self.export, 1), (self.picture, 1)),
+            self.export,
         )
         self.result.picked.connect(self._on_result)
         for picker in (self.product, self.more_products):
@@ -384,7 +284,7 @@ class ProductForm(ToolPanel):
         symbols = [s for s, unit in FIELD_UNITS.items() if unit.field in fields | {"displacement"}]
         self.unit.choices = (_BY_SETUP, *symbols)
 
-    def request(self) -> ProductJob:
+    def request(self) -> Job:
         """Return what is to be measured, or raise an `InputError`."""
         layer = self.result.layer
         if layer is None:
@@ -398,9 +298,9 @@ class ProductForm(ToolPanel):
             values |= self._outline(layer)
         symbol = self.unit.value
         product, unit = product_from_dict(values), None if symbol == _BY_SETUP else symbol
-        origin: Any = about.result_of(layer)
-        bands: Any = self.bands.model()
-        return ProductJob(origin, layer, product, unit, bands.samples)
+        result: Any = about.result_of(layer)
+        measure: Any = partial(analyse, result.content, product, unit=unit)
+        return Job(measure, partial(map_layers, layer=layer))
 
     def _outline(self, layer: Any) -> dict[str, Any]:
         """Return the fields of a product that the selected shape stands for, in px."""
@@ -444,10 +344,9 @@ class ProductForm(ToolPanel):
         self.measured = []
         for widget in (self.report, self.plot):
             widget.setVisible(False)
-        for button in (self.export, self.picture):
-            button.setEnabled(False)
+        self.export.setEnabled(False)
 
-    def show_result(self, finished: Finished, job: ProductJob) -> None:
+    def show_result(self, finished: Finished, job: Job) -> None:
         self.measured = finished.content
         measured = self.measured[-1]
         rows = [(fact.title, fact.text) for fact in measured.facts]
@@ -457,8 +356,7 @@ class ProductForm(ToolPanel):
         if panels:
             self.plot.setFixedHeight(_PANEL_HEIGHT_PX * panels)
             self.plot.show_drawing(lambda axes: draw_groups(axes, measured), panels)
-        for button in (self.export, self.picture):
-            button.setEnabled(True)
+        self.export.setEnabled(True)
         add_layers(self.viewer, finished.layer_data)
 
     @qt.notify_errors
@@ -471,14 +369,9 @@ class ProductForm(ToolPanel):
 
     @qt.notify_errors
     def _export(self) -> None:
-        export_csv(self, "products", products_table(self.measured))
-
-    @qt.notify_errors
-    def _save_figure(self) -> None:
-        formats = ";;".join(qt.filter_of(end[1:].upper(), [end]) for end in FIGURE_SUFFIXES)
-        if path := qt.ask_file(self, "Save figure", "products", formats):
-            figure = products_figure(self.measured)
-            show_info(f"Wrote {save_figure(path, figure, overwrite=True)}")
+        if path := qt.ask_file(self, "Export CSV", "products", qt.TABLES):
+            qt.write_text(path, products_table(self.measured))
+            show_info(f"Wrote {path}")
 
 
 def _is_drawn(kind: type[Product]) -> bool:
@@ -503,13 +396,6 @@ def _forms_of(products: Mapping[str, type[Product]]) -> forms.Kinds:
 
 def _has_fields(layer: Any) -> bool:
     return about.result_of(layer) is not None
-
-
-def export_csv(parent: QtWidgets.QWidget, stem: str, text: str) -> None:
-    """Ask for a file, offering a name, and write a table."""
-    if path := qt.ask_file(parent, "Export CSV", stem, qt.TABLES):
-        qt.write_text(path, text)
-        show_info(f"Wrote {path}")
 
 
 def selected_shape(shapes: Any, suits: Callable[[str], bool]) -> int | None:
@@ -539,12 +425,18 @@ def shape_fields(shape_type: str, corners: FloatArray) -> dict[str, Any]:
 _MAP = about.Kind("product", "", "{title} ({unit})", colormap="signed", visible=True)
 
 
-def map_layer(measured: ProductResult, name: str, layer: Any) -> Any:
-    """Describe the layer of a map, on top of a layer of its result."""
-    values = measured[name].value
-    largest = float(np.nanpercentile(np.abs(values), 99.8)) or 1.0
-    factor, prefix = prefix_for(largest)
-    unit = f"{prefix}{measured.variables[name].unit}"
-    look = {"contrast_limits": (-factor * largest, factor * largest)}
-    words, name = {"title": measured.title, "unit": unit}, name_of_result(layer)
-    return _MAP.layer(factor * values, name, about.frame_of(layer), None, look, words=words)
+def map_layers(results: Sequence[ProductResult], layer: Any) -> LayerData:
+    """Describe the maps among products, on top of a layer of their result."""
+    maps = []
+    for measured in results:
+        for name, variable in measured.variables.items():
+            if variable.dims != PLANE:
+                continue
+            values = measured[name].value
+            largest = float(np.nanpercentile(np.abs(values), 99.8)) or 1.0
+            factor, prefix = prefix_for(largest)
+            words = {"title": measured.title, "unit": f"{prefix}{variable.unit}"}
+            look = {"contrast_limits": (-factor * largest, factor * largest)}
+            frame, shot = about.frame_of(layer), name_of_result(layer)
+            maps.append(_MAP.layer(factor * values, shot, frame, None, look, words=words))
+    return maps
