@@ -17,6 +17,7 @@ from napari_shadowinv._napari.widgets.fit_images import FitImages
 from napari_shadowinv._napari.widgets.invert import Invert
 
 FLAT = np.ones((20, 20))
+EXAMPLE = ProtonSetup.example()
 
 
 def of_a_shot(tool, viewer):
@@ -71,7 +72,7 @@ def of_a_fit(tool, viewer):
     for name in ("one", "two"):
         viewer.add_image(rng.normal(1, 0.01, shape), name=name)
     yield "here is no setup"
-    tool.setup.show_setup(ProtonSetup.example().model_dump())
+    tool.setup.show_setup(EXAMPLE.model_dump())
     for row, words in ((1, "1 image is checked"), (0, "No images are checked")):
         check(row, Qt.CheckState.Unchecked)
         yield words
@@ -84,7 +85,7 @@ def of_a_fit(tool, viewer):
         tool.images.item(1, 1).setText(text)
         yield words
     tool.images.item(1, 1).setText("6")
-    viewer.add_image(np.ones((16, 20)), name="crop", metadata=metadata_for("shot", ""))
+    viewer.add_image(np.ones((16, 20)), name="crop", metadata=metadata_for("shot", "", EXAMPLE))
     check(2)
     yield "'crop' has shape (16, 20), 'one' (32, 40)"
     check(2, Qt.CheckState.Unchecked)
@@ -132,7 +133,7 @@ def of_a_product(tool, viewer, solved):
             getattr(tool.shapes.layer, adds)(np.array(corners))
 
     yield "There is no result to measure"
-    add_to_viewer(viewer, solved, ProtonSetup.example())
+    add_to_viewer(viewer, solved, EXAMPLE)
     tool.product.set_kind("flux")
     yield "There is no shape for the flux across a line"
     choose("current", "add_lines", [[3.0, 3.0], [9.0, 9.0]])

@@ -1,14 +1,13 @@
 """The widget that fits fields to several images of one object: `FitImages`.
 
-- its images, each with a check box and its numbers: `ImageTable`
+- its images, each with a check box and its energy: `ImageTable`
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from qtpy.QtCore import QSignalBlocker, Qt, Signal
@@ -16,7 +15,6 @@ from qtpy.QtWidgets import QHeaderView, QSizePolicy, QTableWidget, QTableWidgetI
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
-from napari_shadowinv._napari.form import PROBLEM_COLOUR
 from napari_shadowinv._napari.jobs import Finished, FitJob, name_of_result
 from napari_shadowinv._napari.layer_metadata import kind_of
 from napari_shadowinv._napari.run import Run
@@ -29,25 +27,14 @@ from napari_shadowinv._system.validation import labels_of, validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.fitting import Fit
 from napari_shadowinv.options import FitChoices, FitOptions
-from napari_shadowinv.physics.beam import number_in_unit, text_in_unit
+from napari_shadowinv.physics.beam import BeamQuantity, number_in_unit, text_in_unit
 from napari_shadowinv.physics.setup import SETUPS, Setup
 from napari_shadowinv.pipeline.costs import fit_cost
-from napari_shadowinv.pipeline.shot_table import ShotRow
 from napari_shadowinv.preprocessing import FIT_STEPS, Recipe
 from napari_shadowinv.shot import Shot
 
 # Choices of a fit that other controls of the window make.
-_ELSEWHERE = {"fields", "beam", "psf", "source_size", "resolution", "options"}
-
-
-def _cautions_of(images: Sequence[Any]) -> dict[str, str]:
-    """Return the warnings of the images' readers as a row of the report."""
-    texts = [
-        f"'{image.name}': {caution.text}"
-        for image in images
-        for caution in layers.cautions_of(image)
-    ]
-    return {"Warning": "; ".join(texts)} if texts else {}
+_ELSEWHERE = {"fields", "beam", "source_size", "resolution", "options"}
 
 
 def _has_recorded_beam(image: Any | None) -> bool:
@@ -109,7 +96,6 @@ class FitImages(inputs.ImagePanel):
         self.images.changed.connect(self._show_beams)
         self.source.changed.connect(self.images.fill)
         self.setup.changed.connect(self._on_setup)
-        self.choices.changed.connect(self._show_beams)
         for part in self.parts():
             part.changed.connect(lambda *_: self.compare())
             part.changed.connect(lambda *_: self._show_cost())
@@ -133,20 +119,9 @@ class FitImages(inputs.ImagePanel):
     def _instrument(self) -> Any:
         return self.instrument.model()  # each shot says whether its beam was measured
 
-    def recipe_to_save(self) -> Recipe:
-        recipe = self.recipe()
-        assert recipe.fit is not None
-        choices = recipe.fit.model_copy(update={"psf": self.common_psf()})
-        return recipe.model_copy(update={"fit": choices})
-
     def chosen_image(self) -> Any | None:
         """Return the layer of the reference, to which masks and source of a recipe belong."""
         return self.images.reference
-
-    def common_psf(self) -> float | None:
-        """Return the common point spread of all images; None if they differ."""
-        widths = {self.images.values(image)["psf"] for image in self.images.used}
-        return widths.pop() if len(widths) == 1 else None
 
     def request(self) -> FitJob:
         images = self._images()
@@ -161,25 +136,21 @@ class FitImages(inputs.ImagePanel):
         shots = self._shots(images, recipe.setup)
         steps = "; ".join(step.summary for step in recipe.steps)
         described = self.describe(first, recipe, (*images, self.masks.layer), steps=steps)
-        described["origins"] |= _cautions_of(images)
         name = f"{name_of_result(first).removesuffix(' fit')} fit"
         return FitJob(shots=shots, name=name, frame=result_frame(first, recipe), **described)
 
     def _shots(self, images: Sequence[Any], setup: Setup) -> tuple[Shot, ...]:
         """Return the images, lazy if their layers are, with all their settings."""
-        rows = [self.images.values(image) for image in images]
-        # One that is 1 for all need not be said.
-        is_known = self._is_brightness_known and any(row["brightness"] != 1 for row in rows)
+        is_measured = self.source.layer is None or not about.is_estimate(self.source.layer)
         return tuple(
             replace(
                 self.shot_of(image),
                 name=image.name,
                 setup=self._setup_of(image, setup),
-                brightness=row["brightness"] if is_known else None,
-                psf=row["psf"],
-                measured=self.source.layer is None or not about.is_estimate(self.source.layer),
+                measured=is_measured,
+                cautions=layers.cautions_of(image),
             )
-            for image, row in zip(images, rows, strict=True)
+            for image in images
         )
 
     def show_result(self, finished: Finished, job: FitJob) -> None:
@@ -205,39 +176,27 @@ class FitImages(inputs.ImagePanel):
                 "two or more of one object: open them, split a stack (right click on the layer → "
                 "Split Stack), or use 'Refine' in Invert for one image"
             )
-        shape = tuple(images[0].data.shape)
-        for image in images[1:]:
-            if tuple(image.data.shape) != shape:
-                raise InputError(
-                    f"'{image.name}' has shape {tuple(image.data.shape)}, '{images[0].name}' "
-                    f"{shape}: all images must have the same shape; crop or uncheck the image that "
-                    "differs"
-                )
         return images
 
     def _setup_of(self, image: Any, setup: Setup) -> Setup:
         """Return the setup of an image, its own or the reference's, with the beam of its row."""
-        beam, base = self.images.beam, self._base_setup(image, setup)
+        if image is self.images.reference:
+            return setup
+        own, beam = about.setup_of(image), self.images.beam
+        base = own if own is not None and own.kind == setup.kind else setup
         values = {**base.model_dump(), beam.name: self.images.beam_value(image)}
         model_class = SETUPS[setup.kind]
-        names = labels_of(model_class) | {beam.name: f"'{beam.title}'"}
+        names = labels_of(model_class) | {beam.name: f"'{beam.noun.capitalize()}'"}
         return validate(model_class, values, f"the setup of '{image.name}'", names)
-
-    def _base_setup(self, image: Any, setup: Setup) -> Setup:
-        own = about.setup_of(image)
-        is_of_kind = own is not None and own.kind == setup.kind
-        return own if own and is_of_kind and image is not self.images.reference else setup
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
-        # Another widget may have changed the setup of the reference.
-        setup = self._setup_of_reference()
-        if self._ready and setup not in (None, self.setup.complete_setup()):
-            self.setup.suggest(setup, about.setup_origin_of(self.images.reference))
-
-    def _setup_of_reference(self) -> Any:
+        # Another widget may have changed setups; now the rows have the heights of napari's style.
+        self.images.fill()
         image = self.images.reference
-        return None if image is None else about.setup_of(image)
+        setup = None if image is None else about.setup_of(image)
+        if self._ready and setup is not None and setup != self.setup.complete_setup():
+            self.setup.suggest(setup, about.setup_origin_of(image))
 
     def _on_reference(self) -> None:
         """Show the setup of a new reference; without a setup it gets the last one."""
@@ -247,15 +206,10 @@ class FitImages(inputs.ImagePanel):
         self.setup.follow(image)
         if image is not None:
             self.masks.follow(image)
-            own = self._setup_of_reference()
-            if (base := own or old_setup) is not None:
-                values, beam = base.model_dump(), beam_column(base.kind).name
-                entry = entries_of(image).get(beam)
-                if isinstance(entry, float) and own is None:
-                    values[beam] = entry
-                setup = self.setup.complete_setup()
-                if setup is None or values != setup.model_dump():
-                    self.setup.show_setup(values)
+            if about.setup_of(image) is None and old_setup is not None:
+                beam = old_setup.beam_quantity().name
+                typed = entries_of(image).get(beam)
+                self.setup.show_setup(old_setup.model_dump() | ({beam: typed} if typed else {}))
         self.view.empty()
         self._on_setup()
         # A complete setup is folded to show the controls below.
@@ -273,81 +227,25 @@ class FitImages(inputs.ImagePanel):
         self._show_beams()
 
     def _show_beams(self) -> None:
-        form = self.setup.form
-        beam = None if form is None else form.state().get(self.images.beam.name)
-        self.images.show_beams(self.setup.kind, beam, self._is_brightness_known)
-
-    @property
-    def _is_brightness_known(self) -> bool:
-        return self.choices.state().get("brightness") != "free"
+        kind, form = self.setup.kind, self.setup.form
+        value = None if form is None else form.state().get(beam_of(kind).name)
+        self.images.show_beams(kind, value)
 
 
-_PREFIXED_UNIT = "m"  # cells show it, with the prefix of each number
 _METADATA_KEY = "fit"  # a row's entries in its layer's metadata
-_MAX_ROWS = 8  # more of them scroll
-_BEAM, _BRIGHTNESS = 1, 2  # columns
+_MAX_HEIGHT_PX = 270  # higher ones scroll
+_BEAM_WIDTH_PX = 110
 _READABLE = Qt.ItemFlag.ItemIsEnabled
 _EDITABLE = _READABLE | Qt.ItemFlag.ItemIsEditable
 
 
-@dataclass(frozen=True)
-class Column:
-    """A column of numbers in a unit."""
-
-    name: str
-    title: str
-    unit: str
-    tip: str
-    width_px: int = 90
-    default: float | None = None
-
-    @property
-    def heading(self) -> str:
-        unit = "" if self.unit == _PREFIXED_UNIT else self.unit
-        return f"{self.title} ({unit})" if unit else self.title
-
-    def read(self, text: str) -> Any:
-        """Return a number, None for nothing, or text that is no number."""
-        with suppress(ValueError):  # the text stays for correction
-            return number_in_unit(text, self.unit) if text else None
-        return text
-
-    def show(self, value: Any) -> str:
-        """Return the text of a value, rounded."""
-        if value is None or isinstance(value, str):
-            return value or ""
-        return text_in_unit(value, "m") if self.unit == _PREFIXED_UNIT else f"{value:.6g}"
-
-    def problem(self, value: Any) -> str:
-        """Return what is wrong with a value, in a sentence; empty for a number."""
-        try:
-            if isinstance(value, str):
-                number_in_unit(value, self.unit)
-        except ValueError as error:
-            return f"received {value!r}, {error}"
-        return ""
-
-
-def _column(name: str, title: str, unit: str, width_px: int, default: float) -> Column:
-    """Return the column of a field of a row of shots."""
-    return Column(name, title, unit, str(ShotRow.model_fields[name].description), width_px, default)
-
-
-_OTHER_COLUMNS = (
-    _column("brightness", "Brightness", "", 76, 1.0),
-    _column("psf", "PSF σ", "px", 72, 0.0),
-)
-
-
-def beam_column(kind: str) -> Column:
-    """Return the column for a kind of setup, by default for the first."""
-    quantity = SETUPS.get(kind, next(iter(SETUPS.values()))).beam_quantity()
-    title = quantity.noun.capitalize()
-    return Column(quantity.name, title, quantity.unit, quantity.description)
+def beam_of(kind: str) -> BeamQuantity:
+    """Return the quantity that differs between images, by default for the first kind of setup."""
+    return SETUPS.get(kind, next(iter(SETUPS.values()))).beam_quantity()
 
 
 def entries_of(layer: Any) -> dict[str, Any]:
-    """Return the user's entries for an image, which its layer keeps."""
+    """Return what the user has typed or checked for an image, which its layer keeps."""
     return dict(about.metadata_of(layer).get(_METADATA_KEY, {}))
 
 
@@ -358,30 +256,34 @@ def store_entries(layer: Any, **values: Any) -> None:
 
 
 class ImageTable(QTableWidget):
-    """The 2-D images of a viewer; the first in use is the reference."""
+    """The 2-D images of a viewer with their energies; the first in use is the reference.
+
+    A cell keeps the text that the user has typed; others show the value of the image's setup.
+    """
 
     changed = Signal()  # an entry or the selection
     reference_changed = Signal()
 
     def __init__(self, viewer: Any, suits: Callable[[Any], bool]) -> None:
-        super().__init__(0, 2 + len(_OTHER_COLUMNS))
+        super().__init__(0, 2)
         self._viewer, self._suits = viewer, suits
         # The first image in use, whose pixels and units the fields have.
         self.reference: Any = None
         self.images: list[Any] = []
+        self.beam = beam_of("")
         self.verticalHeader().setVisible(False)
         self.setSelectionMode(QTableWidget.SelectionMode.NoSelection)
+        self.setSizeAdjustPolicy(QTableWidget.SizeAdjustPolicy.AdjustToContents)
         # Or else a high window would spread all controls of its column.
-        self.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        self.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Fixed)
+        self.setMaximumHeight(_MAX_HEIGHT_PX)
         self.setTextElideMode(Qt.TextElideMode.ElideMiddle)
         self.setWordWrap(False)  # it would cut off the end of a name, which tells images apart
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         header = self.horizontalHeader()
         header.setSectionResizeMode(QHeaderView.ResizeMode.Fixed)
         header.setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        self._set_beam(beam_column(""))
-        for number, spec in enumerate(self._columns, 1):
-            header.resizeSection(number, spec.width_px)
+        header.resizeSection(1, _BEAM_WIDTH_PX)
         self.itemChanged.connect(self._on_edit)
         qt.while_alive(self, viewer.layers, ("inserted", "removed", "reordered"), self.fill)
         qt.layers_while_alive(self, viewer.layers, "name", self.fill)
@@ -393,6 +295,7 @@ class ImageTable(QTableWidget):
         return [image for row, image in enumerate(self.images) if self._is_checked(row)]
 
     def fill(self, _: Any = None) -> None:
+        """List the images; the window then shows their energies by `show_beams`."""
         self.images = [layer for layer in self._viewer.layers if self._is_image(layer)]
         shapes = Counter(image.data.shape for image in self.images)
         common_shape = max(shapes, key=lambda shape: shapes[shape], default=None)
@@ -401,99 +304,58 @@ class ImageTable(QTableWidget):
             for row, image in enumerate(self.images):
                 use = entries_of(image).get("use", image.data.shape == common_shape)
                 name = QTableWidgetItem(image.name)
-                name.setFlags(Qt.ItemFlag.ItemIsEnabled | Qt.ItemFlag.ItemIsUserCheckable)
+                name.setFlags(_READABLE | Qt.ItemFlag.ItemIsUserCheckable)
                 name.setToolTip(f"<qt>{image.name}: {_setup_summary(image)}.</qt>")
                 name.setCheckState(Qt.CheckState.Checked if use else Qt.CheckState.Unchecked)
                 self.setItem(row, 0, name)
-                for number in range(1, self.columnCount()):
-                    self.setItem(row, number, QTableWidgetItem())
-        self._fit_height()
+                self.setItem(row, 1, QTableWidgetItem())
         self._on_use()
 
-    def showEvent(self, event: Any) -> None:
-        super().showEvent(event)
-        # The rows have the heights of napari's style only now, and another widget may have changed
-        # a layer's setup.
-        self.fill()
-
-    def show_beams(self, kind: str, value: Any, is_brightness_known: bool) -> None:
+    def show_beams(self, kind: str, value: Any) -> None:
         """Fill the cells; `value` is the reference's energy or wavelength in the shown setup."""
-        self._set_beam(beam_column(kind))
-        for row, image in enumerate(self.images):
-            beam = value if image is self.reference else self._beam_of(image)
-            values = {**entries_of(image), self.beam.name: beam}
-            for number, spec in enumerate(self._columns, 1):
-                self._write(row, number, values.get(spec.name, spec.default))
-            with QSignalBlocker(self):
-                # Energy or wavelength of the reference are those of the setup.
-                is_reference = image is self.reference
-                self.item(row, _BEAM).setFlags(_READABLE if is_reference else _EDITABLE)
-                brightness = self.item(row, _BRIGHTNESS)
-                brightness.setFlags(_EDITABLE if is_brightness_known else Qt.ItemFlag.NoItemFlags)
-                if not is_brightness_known:
-                    brightness.setText("free")
-
-    def values(self, image: Any) -> dict[str, Any]:
-        """Return the numbers of an image by column, or raise an `InputError`."""
-        values = {}
-        for number, spec in enumerate(self._columns, 1):
-            cell = self.item(self.images.index(image), number)
-            value = cell.data(Qt.ItemDataRole.UserRole)
-            if problem := spec.problem(value):
-                raise InputError(f"{spec.title} of '{image.name}': {problem}")
-            values[spec.name] = spec.default if value is None else float(value)
-        return values
+        beam = self.beam = beam_of(kind)
+        title = beam.noun.capitalize()
+        has_prefix = beam.unit == "m"  # of each number
+        self.setHorizontalHeaderLabels(["Image", title if has_prefix else f"{title} ({beam.unit})"])
+        with QSignalBlocker(self):
+            for row, image in enumerate(self.images):
+                is_reference = image is self.reference  # its energy is that of the setup
+                shown, cell = value if is_reference else self._stated(image), self.item(row, 1)
+                if isinstance(shown, float | int):
+                    shown = text_in_unit(shown, "m") if has_prefix else f"{shown:.6g}"
+                cell.setText(shown or "")
+                cell.setFlags(_READABLE if is_reference else _EDITABLE)
+                cell.setToolTip(f"<qt>{beam.description}</qt>")
 
     def beam_value(self, image: Any) -> float:
         """Return energy or wavelength of an image, or raise an `InputError`."""
-        value = self.values(image)[self.beam.name]
+        value, noun = self._stated(image), self.beam.noun
         if value is None:
             raise InputError(
-                f"'{image.name}' has no {self.beam.title.lower()}: enter it in the table, or "
-                "uncheck the image"
+                f"'{image.name}' has no {noun}: enter it in the table, or uncheck the image"
             )
-        return float(value)
+        try:
+            return number_in_unit(value, self.beam.unit) if isinstance(value, str) else value
+        except ValueError as error:
+            text = f"{noun} of '{image.name}': received {value!r}, {error}"
+            raise InputError(text) from error
 
-    @property
-    def _columns(self) -> tuple[Column, ...]:
-        return self.beam, *_OTHER_COLUMNS
-
-    def _set_beam(self, column: Column) -> None:
-        self.beam = column
-        self.setHorizontalHeaderLabels(["Image", *(spec.heading for spec in self._columns)])
+    def _stated(self, image: Any) -> Any:
+        """Return what was typed, or else the value of the layer's setup, or None."""
+        own = getattr(about.setup_of(image), self.beam.name, None)
+        return entries_of(image).get(self.beam.name) or own
 
     def _is_checked(self, row: int) -> bool:
         return bool(self.item(row, 0).checkState() == Qt.CheckState.Checked)
 
-    def _beam_of(self, image: Any) -> Any:
-        """Return the user's entry, or else the value in the layer's setup."""
-        entry = entries_of(image).get(self.beam.name)
-        if entry is not None:
-            return entry
-        return getattr(about.setup_of(image), self.beam.name, None)
-
-    def _write(self, row: int, number: int, value: Any) -> None:
-        """Show a number or a text, which the user has to correct if it is no number."""
-        item, spec = self.item(row, number), self._columns[number - 1]
-        problem = spec.problem(value)
-        with QSignalBlocker(self):
-            # The shown text is rounded.
-            item.setData(Qt.ItemDataRole.UserRole, value)
-            item.setText(spec.show(value))
-            item.setData(Qt.ItemDataRole.ForegroundRole, PROBLEM_COLOUR if problem else None)
-            item.setToolTip(f"<qt>{problem or spec.tip}</qt>")
-
     def _on_edit(self, item: Any) -> None:
-        row, image = item.row(), self.images[item.row()]
+        image = self.images[item.row()]
         if item.column() == 0:
-            store_entries(image, use=self._is_checked(row))
+            store_entries(image, use=self._is_checked(item.row()))
             self._on_use()
-            return
-        spec = self._columns[item.column() - 1]
-        value = spec.read(item.text().strip())
-        self._write(row, item.column(), value)
-        store_entries(image, **{spec.name: value})
-        self.changed.emit()
+        else:
+            store_entries(image, **{self.beam.name: item.text().strip()})
+            self.changed.emit()
 
     def _on_use(self) -> None:
         old_reference, self.reference = self.reference, next(iter(self.used), None)
@@ -504,12 +366,6 @@ class ImageTable(QTableWidget):
     def _is_image(self, layer: Any) -> bool:
         is_grey = kind_of(layer) == "image" and not getattr(layer, "rgb", False)
         return is_grey and layer.ndim == 2 and self._suits(layer)
-
-    def _fit_height(self) -> None:
-        rows = sum(self.rowHeight(row) for row in range(min(self.rowCount(), _MAX_ROWS)))
-        header = self.horizontalHeader()
-        header.setFixedHeight(header.sizeHint().height())
-        self.setFixedHeight(header.height() + rows + 2 * self.frameWidth())
 
 
 def _setup_summary(image: Any) -> str:
