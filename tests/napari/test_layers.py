@@ -236,13 +236,11 @@ def test_doubtful_result_has_the_doubt_in_its_names(solved):
         assert f"{mark} |d| (px)" in names
 
 
-def test_errors_of_an_inversion_have_its_significance(viewer, solved):
+def test_errors_of_an_inversion_have_a_layer(viewer, solved):
     std = np.full_like(solved.displacement, 0.05)
     certain = replace(solved, errors=replace(solved.errors, per_pixel=std, causes=("noise",)))
-    layers = by_role(add_to_viewer(viewer, certain, all_layers=True))
-    expected = np.hypot(*solved.displacement) / 0.05
-    np.testing.assert_allclose(layers["significance"].data, expected)
-    assert "significance" not in by_role(add_to_viewer(viewer, certain))
+    layers = by_role(add_to_viewer(viewer, certain))
+    np.testing.assert_allclose(layers["uncertainty"].data, 0.05 * np.sqrt(2))
 
 
 def opened(viewer, path):
@@ -263,7 +261,6 @@ def test_a_file_of_the_command_shows_all_of_a_fit(viewer, two_fields, tmp_path, 
     layers = opened(viewer, write(tmp_path / "pack.shadowinv", two_fields))
     layers = more(viewer, layers)
     in_each = ["potential", "field y", "field x", "direction", "field", "uncertainty", "arrows"]
-    in_each += ["significance"]
     of_fields = [f"{role}{part}" for role in in_each for part in ("", " E")]
     of_images = ["reprojection", "residual"]
     assert set(layers) == {*of_fields, *of_images, "image 1", "image 2"}

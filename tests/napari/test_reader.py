@@ -13,7 +13,7 @@ from scipy.io import savemat
 
 from helpers.layers import by_role
 from napari_shadowinv import FileFormatError, ProtonSetup, write
-from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, role_of, setup_of
+from napari_shadowinv._napari.layer_metadata import metadata_of, result_of, setup_of, unit_of
 from napari_shadowinv._napari.layers import add_layers, sample_arrows
 from napari_shadowinv._napari.reader import get_reader, read_paths
 from napari_shadowinv._napari.result_files import follow_arrows, missing_layers
@@ -146,7 +146,16 @@ def test_a_stray_file_is_dark_and_gives_a_warning(run):
         assert data[shot].compute().all()
 
 
-def test_a_field_of_another_program_is_shown(viewer, solved, proton_setup, tmp_path):
+def test_a_result_opens_whole_and_one_of_another_program_with_its_field(
+    viewer, solved, proton_setup, tmp_path
+):
+    write(tmp_path / "shot9.shadowinv", solved, setup=proton_setup)
+    layers = viewer.open(tmp_path / "shot9.shadowinv", plugin=None)
+    assert all(layer.name.endswith(" – shot9") for layer in layers)
+    assert setup_of(layers[0]) == proton_setup
+    assert result_of(layers[0]).content.options == solved.options
+    missing = add_layers(viewer, missing_layers(viewer, layers[0]))
+    np.testing.assert_array_equal(by_role(missing)["reprojection"].data, solved.reprojection)
     dataset = dataset_from_field(solved.displacement, solved.potential, proton_setup)
     write(tmp_path / "field.shadowinv", dataset)
     layers = by_role(viewer.open(tmp_path / "field.shadowinv", plugin=PLUGIN))
@@ -156,77 +165,46 @@ def test_a_field_of_another_program_is_shown(viewer, solved, proton_setup, tmp_p
     np.testing.assert_allclose(layers["field"].scale, 1.5)
 
 
-def test_a_result_of_the_command_line_opens_whole(viewer, solved, proton_setup, tmp_path):
-    write(tmp_path / "shot9.shadowinv", solved, setup=proton_setup)
-    layers = viewer.open(tmp_path / "shot9.shadowinv", plugin=None)
-    assert all(layer.name.endswith(" – shot9") for layer in layers)
-    assert setup_of(layers[0]) == proton_setup
-    result = result_of(layers[0])
-    assert result is not None
-    assert result.content.options == solved.options
-    missing = add_layers(viewer, missing_layers(viewer, layers[0]))
-    np.testing.assert_array_equal(by_role(missing)["reprojection"].data, solved.reprojection)
+def test_a_bad_file_is_one_notification_in_a_window(viewer, tmp_path, in_loop, messages):
+    for name, content, words in (
+        ("cut.shadowinv", b"\x89HDF\r\n\x1a\n" + b"\0" * 40, "damaged, incomplete"),
+        ("words.txt", b"# x\n1 2\n3 four\n", "words.txt"),
+    ):
+        messages.clear()
+        (tmp_path / name).write_bytes(content)
+        assert in_loop(lambda: viewer.open(tmp_path / name, plugin=None)) == []  # noqa: B023
+        (text,) = messages
+        assert words in text
+        assert "\n" not in text
 
 
-BAD = {
-    "cut.shadowinv": (b"\x89HDF\r\n\x1a\n" + b"\0" * 40, "damaged, incomplete"),
-    "words.txt": (b"# x\n1 2\n3 four\n", "words.txt"),
-}
-
-
-@pytest.mark.parametrize("name", BAD)
-def test_bad_files_are_one_notification_in_a_window(viewer, tmp_path, name, in_loop, messages):
-    content, words = BAD[name]
-    (tmp_path / name).write_bytes(content)
-    assert in_loop(lambda: viewer.open(tmp_path / name, plugin=None)) == []
-    (text,) = messages
-    assert words in text
-    assert "Traceback" not in text
-    assert "\n" not in text
-
-
-def grid(folder, inversion):
-    with h5py.File(folder / "grid.h5", "w") as file:
+def test_what_cannot_be_read_is_one_sentence(tmp_path, run, store, inversion):
+    with h5py.File(tmp_path / "grid.h5", "w") as file:
         file["Bx"] = file["By"] = np.ones((3, 4, 5))
-
-
-def no_shot(folder, inversion):
-    (folder / "night").mkdir()
-    (folder / "night" / "a.tif").write_bytes(b"nonsense")
-
-
-def damaged(folder, inversion):
-    with h5py.File(write(folder / "shot.shadowinv", inversion), "r+") as file:
+    (tmp_path / "night").mkdir()
+    (tmp_path / "night" / "a.tif").write_bytes(b"nonsense")
+    with h5py.File(write(tmp_path / "shot.shadowinv", inversion), "r+") as file:
         file.attrs["report"] = '{"converged": '
-
-
-@pytest.mark.parametrize(
-    ("make", "name", "words"),
-    [
-        (grid, "grid.h5", "trace particles through them with shadowinv forwa"),
-        (no_shot, "night", "none of 1 files can be read as a shot: .*a.tif"),
-        (damaged, "shot.shadowinv", r"shot\.shadowinv: the result is damaged"),
-    ],
-)
-def test_what_cannot_be_read_is_one_sentence(make, name, words, tmp_path, inversion):
-    make(tmp_path, inversion)
-    with pytest.raises(FileFormatError, match=words) as error:
-        read_paths(str(tmp_path / name))
-    assert "\n" not in str(error.value)
-
-
-def test_what_is_lost_or_a_pipe_is_refused_by_its_reader(run, tmp_path):
-    read = get_reader(str(run))
-    for file in run.iterdir():
+    for file in run.iterdir():  # after the question for a reader
         file.unlink()
-    with pytest.raises(FileFormatError, match="contains no image: expected a folder"):
-        read(str(run))
-    for name in ("shot.h5", "shot.tif", "shot.shadowinv"):  # a pipe would block
+    shutil.rmtree(store / "displacement")
+    (store / "zarr.json").unlink()
+    for name in ("pipe.h5", "pipe.tif", "pipe.shadowinv"):  # a pipe would block
         os.mkfifo(tmp_path / name)
-        reader = get_reader(str(tmp_path / name))
-        if reader is not None:
-            with pytest.raises(FileFormatError, match="is a pipe"):
-                reader(str(tmp_path / name))
+    for name, words in (
+        ("grid.h5", "trace particles through them with shadowinv forwa"),
+        ("night", "none of 1 files can be read as a shot: .*a.tif"),
+        ("shot.shadowinv", r"shot\.shadowinv: the result is damaged"),
+        (run.name, "contains no image: expected a folder"),
+        (store.name, r"could not be read|not a store"),
+        ("gone.shadowinv.zarr", "does not exist"),
+        ("pipe.h5", "is a pipe"),
+        ("pipe.tif", "is a pipe"),
+        ("pipe.shadowinv", "is a pipe"),
+    ):
+        with pytest.raises(FileFormatError, match=words) as error:
+            read_paths(str(tmp_path / name))
+        assert "\n" not in str(error.value)
 
 
 @pytest.fixture
@@ -241,7 +219,7 @@ def store(solved, proton_setup, tmp_path):
         half[name] = 0.5 * result[name]
         empty[name] = np.nan * result[name]
     run = xr.concat(
-        [part.drop_dims("site") for part in (empty, result, half)], "shot", data_vars="all"
+        [part.drop_dims("site") for part in (empty, half, result)], "shot", data_vars="all"
     )
     run.attrs = result.attrs
     path = tmp_path / "night.shadowinv.zarr"
@@ -266,38 +244,19 @@ def test_a_store_opens_as_lazy_layers(viewer, store, solved, proton_setup):
         assert layer.name.endswith(" – night")
         assert setup_of(layer) == proton_setup
     field = proton_setup.path_integrated_b(solved.displacement)
-    np.testing.assert_allclose(layers["field"].data[1].compute(), 1e3 * np.hypot(*field))
-    np.testing.assert_allclose(layers["field"].data[2].compute(), 500 * np.hypot(*field))
-    np.testing.assert_allclose(layers["field y"].data[1].compute(), 1e3 * field[0])
-    np.testing.assert_allclose(layers["field x"].data[1].compute(), 1e3 * field[1])
-    assert layers["field"].contrast_limits[1] == pytest.approx(1e3 * np.hypot(*field).max())
+    np.testing.assert_allclose(layers["field"].data[1].compute(), 500 * np.hypot(*field))
+    np.testing.assert_allclose(layers["field"].data[2].compute(), 1e3 * np.hypot(*field))
+    np.testing.assert_allclose(layers["field y"].data[2].compute(), 1e3 * field[0])
+    np.testing.assert_allclose(layers["field x"].data[2].compute(), 1e3 * field[1])
+    metres = {"m": 1.0, "mm": 1e3, "µm": 1e6, "nm": 1e9}[unit_of(layers["potential"])]
+    potential = metres * proton_setup.potential(solved.potential)
+    np.testing.assert_allclose(layers["potential"].data[2].compute(), potential)
     assert [name for name, layer in layers.items() if layer.visible] == ["field"]
-
-
-def test_the_contrast_of_a_store_suits_its_strongest_shot(store, solved):
-    import xarray as xr
-
-    with xr.open_zarr(store, consolidated=False) as run:
-        reversed_run = run.isel(shot=[2, 0, 1]).load()
-    later = store.with_name("reversed.shadowinv.zarr")
-    for variable in reversed_run.variables.values():
-        variable.encoding.clear()
-    reversed_run.chunk({"shot": 1}).to_zarr(later, consolidated=False)
-    keywords = keywords_of(later)
-    setup = setup_of(keywords["field"])
-    assert isinstance(setup, ProtonSetup)
-    strongest = np.hypot(*setup.path_integrated_b(solved.displacement)).max()
-    # The unit is that of the first finished shot, whose field is half as strong.
-    assert keywords["field"]["contrast_limits"] == pytest.approx((0, 1e6 * strongest))
-    low, high = keywords["residual"]["contrast_limits"]
-    residual = 100 * np.abs(solved.residual) / solved.image[solved.mask].mean()
+    # The contrast suits the strongest shot, and in the residual most pixels.
+    assert layers["field"].contrast_limits[1] == pytest.approx(1e3 * np.hypot(*field).max())
+    low, high = layers["residual"].contrast_limits
     assert low == -high
-    assert np.median(residual) < high < residual.max()
-
-
-def keywords_of(path):
-    """Keywords of the layers of a store by their roles."""
-    return {role_of(keywords): keywords for _, keywords, _ in read_paths(str(path))}
+    assert np.median(np.abs(solved.residual)) < high < np.abs(solved.residual).max()
 
 
 def rays(solved, factor=1.0):
@@ -307,10 +266,10 @@ def rays(solved, factor=1.0):
 
 def test_arrows_follow_the_shot_in_view(viewer, store, solved):
     arrows = by_role(viewer.open(store, plugin=PLUGIN))["arrows"]
-    assert (arrows.data[:, 0, 0] == 1).all()  # the first that is done
+    assert (arrows.data[:, 0, 0] == 2).all()  # the strongest
     follow_arrows(viewer)
     length = arrows.length
-    for shot, expected in ((2, rays(solved, 0.5)), (1, rays(solved))):
+    for shot, expected in ((1, rays(solved, 0.5)), (2, rays(solved))):
         viewer.dims.set_point(0, shot)
         np.testing.assert_allclose(arrows.data[:, 0, 0], shot)
         np.testing.assert_allclose(arrows.data[:, 1, 0], 0)
@@ -325,30 +284,21 @@ def test_arrows_follow_the_shot_in_view(viewer, store, solved):
 
     # Nothing is read for arrows that nobody sees.
     arrows.visible = False
-    viewer.dims.set_point(0, 1)
+    viewer.dims.set_point(0, 2)
     assert len(arrows.data) == 0
     arrows.visible = True
     np.testing.assert_allclose(arrows.data[:, :, 1:], rays(solved))
     viewer.layers.remove(arrows)
-    viewer.dims.set_point(0, 2)
-    assert (arrows.data[:, 0, 0] == 1).all()
+    viewer.dims.set_point(0, 1)
+    assert (arrows.data[:, 0, 0] == 2).all()
 
 
 def test_arrows_of_a_store_follow_in_a_window(make_napari_viewer, store, solved, qtbot):
     window = make_napari_viewer()
     layers = by_role(window.open(store, plugin=PLUGIN))
     qtbot.waitUntil(lambda: window.layers.selection.active is layers["field"])
-    window.dims.set_point(0, 2)
+    window.dims.set_point(0, 1)
     np.testing.assert_allclose(layers["arrows"].data[:, :, 1:], rays(solved, 0.5))
-
-
-def test_a_damaged_store_is_one_sentence(store):
-    shutil.rmtree(store / "displacement")
-    (store / "zarr.json").unlink()
-    with pytest.raises(FileFormatError, match=r"could not be read|not a store"):
-        read_paths(str(store))
-    with pytest.raises(FileFormatError, match="does not exist"):
-        read_paths(str(store.with_name("gone.shadowinv.zarr")))
 
 
 def test_a_scan_of_film_is_told_and_so_is_its_result(viewer, tmp_path):

@@ -191,7 +191,6 @@ KINDS = (
         main=True,
         shown_of="shot",
     ),
-    Kind("significance", "significance", "|d|/σ", "1", "significance", shown_of="shot"),
     Kind("caustic", "caustic", "caustics", type="labels", main=True),
     Kind("arrows", "displacement", "displacement arrows", "px", type="vectors", visible=True),
     Kind("sites", "sites", "sites{share}", colormap="field", type="points", shown_of="shot"),

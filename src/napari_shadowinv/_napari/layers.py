@@ -18,12 +18,12 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, role_of
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
+from napari_shadowinv._system.arrays import PLANE, VECTOR
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.inversion.variables import VARIABLES
-from napari_shadowinv.io.store import of_each_setup
+from napari_shadowinv.io.store import field_in_si
 from napari_shadowinv.physics.setup import deflector_titles
-from napari_shadowinv.physics.significance import significance
 from napari_shadowinv.physics.units import (
     ShownField,
     intensity_limits,
@@ -44,17 +44,10 @@ FullLayerData = tuple[Any, dict[str, Any], str]
 LayerData = list[FullLayerData]
 Limits = tuple[float, float]
 
-_CAUSTIC_COLOUR = "#5dff5d"
 _ARROW_COLOUR = "#00c8ff"
 
-_FIELD_VARIABLES = ("displacement", "potential")
-_MASKED_VARIABLES = (
-    *_FIELD_VARIABLES,
-    "reprojection",
-    "residual",
-    "displacement_uncertainty",
-    "significance",
-)
+_FIELD_VARIABLES = ("displacement", "potential", "displacement_uncertainty")
+_MASKED_VARIABLES = (*_FIELD_VARIABLES, "reprojection", "residual")
 _MAX_ARROWS_PER_SIDE = 20
 _MIN_ARROW_LENGTH = 0.05  # relative to the longest
 _MAX_SHOWN_SITES = 200_000
@@ -62,7 +55,6 @@ _LIMITS_PERCENTILE = 99.7
 _LIMITS_SAMPLE_SIZE = 100_000  # pixels
 _KINDS = {kind.role: kind for kind in about.KINDS if kind.shown_of != "stack"}
 _MAX_BEAM_DIFFERENCE = 1e-6  # relative to the mean
-_MIN_SIGNIFICANCE_LIMIT = 4.0  # σ, so that a map of noise looks like noise
 
 
 def inversion_layers(
@@ -157,23 +149,10 @@ def present(viewer: Any, layers: Sequence[Any]) -> None:
 
 def field_layers(result: Result[RetrievedField], frame: Frame, name: str = "") -> LayerData:
     """Describe the layers of a field without images."""
-    content, dataset = result.content, result.content.dataset
-    field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]].assign(
-        significance_variables(content.displacement, content.displacement_std)
-    )
-    return dataset_layers(View(field, content.setup), frame, name, {"result": result, "name": name})
-
-
-def significance_variables(
-    displacement: FloatArray, std: FloatArray | None
-) -> dict[str, tuple[tuple[str, ...], AnyArray]]:
-    """Return σ and the map |d|/σ as variables; none without errors."""
-    if std is None:
-        return {}
-    return {
-        "displacement_uncertainty": (("component", "y", "x"), std),
-        "significance": (("y", "x"), significance(displacement, std)),
-    }
+    dataset = result.content.dataset
+    field = dataset[[variable for variable in _FIELD_VARIABLES if variable in dataset]]
+    facts = {"result": result, "name": name}
+    return dataset_layers(View(field, result.content.setup), frame, name, facts)
 
 
 def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> LayerData:
@@ -181,10 +160,10 @@ def result_layers(result: Result[Inversion], frame: Frame, name: str = "") -> La
     import xarray as xr
 
     content = result.content
-    std = per_pixel_of(content.errors)
-    dataset = xr.Dataset(
-        {name: (dims, content.variable(name)) for name, (dims, _, _) in VARIABLES.items()}
-    ).assign(significance_variables(content.displacement, std))
+    variables = {name: (dims, content.variable(name)) for name, (dims, *_) in VARIABLES.items()}
+    if (std := per_pixel_of(content.errors)) is not None:
+        variables["displacement_uncertainty"] = VECTOR, std
+    dataset = xr.Dataset(variables)
     facts = {"result": result, "name": name, "level": content.headline.level}
     layer_data = dataset_layers(View(dataset, content.setup), frame, name, facts)
     for _, keywords, _ in layer_data:
@@ -216,12 +195,13 @@ def _fitted_fields(fit: Fit, frame: Frame, name: str, facts: dict[str, Any]) -> 
     layers: LayerData = []
     for m, field in reversed(list(enumerate(fit.fields))):
         variables: dict[str, Any] = {
-            "displacement": (("component", "y", "x"), field.displacement),
-            "potential": (("y", "x"), field.potential),
+            "displacement": (VECTOR, field.displacement),
+            "potential": (PLANE, field.potential),
         }
         if fit.mask.shape[1:] == field.potential.shape:
-            variables["mask"] = ("y", "x"), fit.mask.any(axis=0)
-        variables |= significance_variables(field.displacement, per_pixel_of(field.errors))
+            variables["mask"] = PLANE, fit.mask.any(axis=0)
+        if (std := per_pixel_of(field.errors)) is not None:
+            variables["displacement_uncertainty"] = VECTOR, std
         more = facts | {"displacement": field.displacement} | ({"part": field.name} if m else {})
         title = name if len(fit.fields) == 1 else f"{name} {field.name}"
         view = View(xr.Dataset(variables), fit.setup, deflector=deflector_titles()[field.name])
@@ -303,7 +283,7 @@ def pack_layers(
             data: AnyArray = np.where(doses.usable, 0, EXCLUDED).astype(np.uint8)
             if by_hand is not None:
                 data[by_hand] = BY_HAND
-            look: dict[str, Any] = {"colormap": label_colours("#5dff5d", "#00c8ff"), "opacity": 0.5}
+            look: dict[str, Any] = {"opacity": 0.5}
         else:
             data = getattr(doses, kind.variable)
             limits = list(map(film_limits, data, doses.usable))
@@ -371,25 +351,21 @@ class View:
     @cached_property
     def vectors(self) -> Any:
         """Components (y, x) of the field, in its unit."""
-        if self.shot is None:
-            return self.field.vectors
-        # All fields are linear in the displacement.
-        matrix = np.eye(2) if self.setup is None else _field_per_pixel(self.setup)
-        first = np.tensordot(matrix, self.plane("displacement"), axes=1)
-        matrix = matrix * _ratio(self.field.vectors, first)
-        stack = self.dataset["displacement"].transpose("component", "shot", "y", "x").data
-        ratio = self.relative_to_shot(lambda setup: float(np.linalg.norm(_field_per_pixel(setup))))
-        return [
-            sum((ratio * factor) * stack[k] for k, factor in enumerate(row) if factor)
-            for row in matrix
-        ]
+        name = "" if self.setup is None else self.setup.main_field.name
+        vectors = self.like(self.field.vectors, "displacement", name)
+        return vectors[..., 0, :, :], vectors[..., 1, :, :]
 
-    def relative_to_shot(self, measure: Callable[[Setup], Any]) -> Any:
-        """Return a quantity of each shot's setup relative to `shot`; 1 for a common setup."""
-        quantities = of_each_setup(self.dataset, measure)
-        if quantities is None or self.setup is None:
-            return 1.0
-        return (quantities / measure(self.setup))[:, np.newaxis, np.newaxis]
+    def like(self, shown: FloatArray, variable: str, name: str) -> Any:
+        """Return a variable as it is `shown` of the shot; of a stack for all shots, lazily.
+
+        `name` is that of the field in SI units, by the setup of each shot.
+        """
+        if self.shot is None:
+            return shown
+        values = self.dataset[variable].data
+        if self.setup is not None:
+            values = field_in_si(self.dataset, variable, name, self.setup)
+        return values * _ratio(shown, np.asarray(values[self.shot]))
 
     @cached_property
     def intensity_limits(self) -> Limits:
@@ -398,11 +374,6 @@ class View:
             if self.along_shots(name):
                 return intensity_limits(self.plane(name))
         return 0.0, 1.0
-
-
-def _field_per_pixel(setup: Setup) -> FloatArray:
-    """Return a setup's main field (y, x) for displacements by 1 px along y and along x."""
-    return setup.field_in_si(setup.main_field.name, np.eye(2))
 
 
 Content = tuple[Any, dict[str, str], dict[str, Any]]  # data, words of the title, keywords
@@ -420,20 +391,11 @@ def _image(view: View, kind: Kind) -> Content:
         data = strength_per_pixel * np.hypot(*view.plane(kind.variable))
         words = {"unit": view.field.unit, "symbol": view.field.symbol}
         limits = 0.0, float(np.nanpercentile(data, _LIMITS_PERCENTILE))
-    elif kind.role == "significance":
-        finite = data[np.isfinite(data)]
-        highest = np.percentile(finite, _LIMITS_PERCENTILE) if finite.size else 0.0
-        limits = 0.0, max(_MIN_SIGNIFICANCE_LIMIT, float(highest))
     elif kind.variable == "displacement":
         data, limits, words = _field(view, kind.role)
     elif kind.role == "potential":
-        plane = view.plane("potential")
-        values, unit = shown_potential(plane, view.setup)
-        if view.shot is None:
-            data = values
-        else:
-            ratio = view.relative_to_shot(lambda setup: float(setup.potential(np.ones(1))[0]))
-            data = data * (ratio * _ratio(values, plane))
+        values, unit = shown_potential(view.plane("potential"), view.setup)
+        data = view.like(values, "potential", "potential_si")
         limits, words = (float(np.nanmin(values)), float(np.nanmax(values))), {"unit": unit}
     elif kind.role == "residual":
         if kind.unit == "%":
@@ -468,24 +430,12 @@ def _field(view: View, role: str) -> tuple[Any, Limits, dict[str, str]]:
         data = field.magnitude if view.shot is None else np.hypot(*view.vectors)
         return data, (0.0, peak), {"unit": field.unit, "symbol": field.symbol}
     axis = "yx".index(role[-1])
-    # In another shot of a stack the field may lie along the other axis.
-    limit = peak if view.shot is not None else float(np.nanmax(np.abs(field.vectors)))
     words = {"unit": field.unit, "symbol": field.components[axis]}
-    return view.vectors[axis], (-limit, limit), words
+    return view.vectors[axis], (-peak, peak), words
 
 
 def _labels(view: View, kind: Kind) -> Content:
-    look = {"colormap": label_colours(_CAUSTIC_COLOUR), "opacity": 0.5}
-    return view.dataset["caustic"].data.astype(np.uint8), {}, look
-
-
-def label_colours(*colours: str) -> Any:
-    """Return the colour map of labels from 1 on; 0 is transparent."""
-    from napari.utils.colormaps import CyclicLabelColormap
-    from napari.utils.colormaps.standardize_color import transform_color
-
-    # For a dictionary of colours, napari would compile code for two seconds.
-    return CyclicLabelColormap(transform_color(["transparent", *colours]))
+    return view.dataset["caustic"].data.astype(np.uint8), {}, {"opacity": 0.5}
 
 
 def _arrows(view: View, kind: Kind) -> Content:
@@ -563,16 +513,6 @@ def symmetric_limits(residual: AnyArray) -> Limits:
     step = max(1, int(np.sqrt(residual.size / _LIMITS_SAMPLE_SIZE)))
     limit = float(np.nanpercentile(np.abs(residual[::step, ::step]), _LIMITS_PERCENTILE))
     return _nonempty((-limit, limit))
-
-
-def widen_limits(limits: Limits, plane: AnyArray) -> Limits:
-    """Extend limits to the values of a plane; limits around zero stay symmetric."""
-    finite = plane[np.isfinite(plane)]
-    if not finite.size:
-        return limits
-    symmetric = limits[0] == -limits[1]
-    low, high = symmetric_limits(plane) if symmetric else (float(finite.min()), float(finite.max()))
-    return min(limits[0], low), max(limits[1], high)
 
 
 def _nonempty(limits: Limits) -> Limits:

@@ -21,7 +21,6 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "signed": "RdBu_r",
         "potential": "viridis",
         "uncertainty": "magma",
-        "significance": "cividis",
     },
     "widgets": {"threads": 0, "last_setup": False},
 }

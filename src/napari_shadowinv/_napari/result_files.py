@@ -38,7 +38,6 @@ from napari_shadowinv._napari.layers import (
     pack_layers,
     result_layers,
     sample_arrows,
-    widen_limits,
 )
 from napari_shadowinv._napari.viewer_sync import connect, connect_layers, without_proxy
 from napari_shadowinv._system.safety import as_file_errors
@@ -175,35 +174,22 @@ def _quote_names(layers: Sequence[FullLayerData]) -> str:
     return ", ".join(names[:_MAX_NAMES]) + more
 
 
-_CONTRAST_SHOTS = 16
+_COMPARED_SHOTS = 16
 
 
 @as_file_errors
 def store_layers(path: Path, name: str = "") -> LayerData:
     """Describe the layers of a ``.shadowinv.zarr`` folder, with the arrows of one shot.
 
-    Units are those of the first finished shot, and the contrast suits up to 16 finished shots.
+    Units and contrast suit the strongest of up to 16 finished shots.
     """
     dataset = _open(path)
     name = name or path.name.removesuffix(".zarr").removesuffix(RESULT.suffix)
-    reference = _first_done(dataset, path)
+    reference = _strongest_shot(dataset, path)
     setup = setup_from_dataset(dataset.isel(shot=reference))
     frame = frame_for(dataset["displacement"].shape, setup)
     facts = {"store": str(path), "name": name, "shots": _shot_names(dataset)}
-    layers = dataset_layers(View(dataset, setup, reference), frame, name, facts)
-    _widen_contrast(layers, _finished_shots(dataset))
-    return layers
-
-
-def _widen_contrast(layers: Sequence[FullLayerData], finished: Sequence[int]) -> None:
-    """Extend the limits of the images shown by default to some of the finished shots."""
-    places = np.linspace(0, len(finished) - 1, min(len(finished), _CONTRAST_SHOTS))
-    images = [(data, words) for data, words, kind in main_layers(layers) if kind == "image"]
-    for shot in np.take(finished, np.rint(places).astype(int)).tolist():
-        with suppress(FileFormatError, OSError):  # the shot is damaged
-            for data, words in images:
-                plane = np.asarray(data[shot])
-                words["contrast_limits"] = widen_limits(words["contrast_limits"], plane)
+    return dataset_layers(View(dataset, setup, reference), frame, name, facts)
 
 
 @as_file_errors
@@ -248,18 +234,21 @@ def shot_rows(path: Path, index: int) -> list[tuple[str, str]]:
     return [("Shot", f"{index} ({_shot_names(dataset)[index]})"), *rows]
 
 
-def _first_done(dataset: xarray.Dataset, path: Path) -> int:
-    for shot in _finished_shots(dataset):
-        with suppress(FileFormatError):  # the shot is damaged
-            if np.isfinite(dataset["displacement"][shot].values).all():
-                return int(shot)
-    raise FileFormatError(f"{path} contains no finished shot yet: wait for the first one")
-
-
-def _finished_shots(dataset: xarray.Dataset) -> Sequence[int]:
+def _strongest_shot(dataset: xarray.Dataset, path: Path) -> int:
+    """Return the shot with the largest displacement among some of the finished ones."""
+    finished = np.arange(dataset.sizes["shot"])
     if "status" in dataset and "shot" in dataset["status"].dims:
-        return np.flatnonzero(dataset["status"].values == DONE).tolist()
-    return range(dataset.sizes["shot"])
+        finished = np.flatnonzero(dataset["status"].values == DONE)
+    places = np.linspace(0, len(finished) - 1, min(len(finished), _COMPARED_SHOTS))
+    peaks: dict[int, float] = {}
+    for shot in finished[np.rint(places).astype(int)].tolist():
+        with suppress(FileFormatError, OSError):  # the shot is damaged
+            peak = float(np.abs(dataset["displacement"][shot].values).max())
+            if np.isfinite(peak):
+                peaks[shot] = peak
+    if not peaks:
+        raise FileFormatError(f"{path} contains no finished shot yet: wait for the first one")
+    return max(peaks, key=lambda shot: peaks[shot])
 
 
 def _shot_names(dataset: xarray.Dataset) -> list[str]:
@@ -276,20 +265,19 @@ _shown_arrows: weakref.WeakKeyDictionary[Any, Any] = weakref.WeakKeyDictionary()
 
 def follow_arrows(viewer: Any) -> None:
     """Show the arrows of the shot in view, now and from now on; they cannot be lazy."""
-    show_arrows(viewer)
+
+    def follow(_: Any = None) -> None:
+        for layer in viewer.layers:
+            # Nothing is read for arrows that nobody sees.
+            if about.role_of(layer) == "arrows" and "store" in metadata_of(layer) and layer.visible:
+                _read_arrows(layer, viewer.dims.point)
+
+    follow()
     layers = without_proxy(viewer.layers)
     if layers not in _followed:
         _followed.add(layers)
-        connect(viewer.dims, "current_step", lambda _: show_arrows(viewer))
-        connect_layers(viewer.layers, "visible", lambda _: show_arrows(viewer))
-
-
-def show_arrows(viewer: Any) -> None:
-    """Read the arrows of the shot in view where they are seen."""
-    for layer in viewer.layers:
-        is_of_store = about.role_of(layer) == "arrows" and "store" in metadata_of(layer)
-        if is_of_store and layer.visible:
-            _read_arrows(layer, viewer.dims.point)
+        connect(viewer.dims, "current_step", follow)
+        connect_layers(viewer.layers, "visible", follow)
 
 
 def _read_arrows(layer: Any, point: Any) -> None:
