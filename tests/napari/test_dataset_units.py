@@ -42,15 +42,6 @@ def test_field_in_metres_lies_over_a_layer_of_its_pixels(origin, inversion, tmp_
     np.testing.assert_allclose(1e6 * field.extent.world, image.extent.world, rtol=1e-9)
 
 
-@reads_coordinates
-def test_field_without_a_setup_is_in_pixels_of_napari(inversion):
-    viewer = ViewerModel()
-    image = viewer.add_image(inversion.image)
-    field = viewer.add_image(inversion.to_dataset()["potential"])
-    assert field.units == image.units
-    np.testing.assert_array_equal(field.scale, image.scale)
-
-
 def test_units_of_a_result_are_parsed_by_pint_as_meant(inversion):
     dataset = inversion.in_units(SETUP).to_dataset()
     units = {name: registry.Unit(dataset[name].attrs["units"]) for name in dataset.variables}

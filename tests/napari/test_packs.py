@@ -67,13 +67,6 @@ def test_the_film_in_view_is_named_and_has_its_own_contrast(viewer, file, pack_d
     assert not text.visible
 
 
-def test_warnings_are_told_when_a_pack_is_opened(viewer, pack_doses, tmp_path, messages):
-    dark = '[{"code": "film-range", "text": "film 2 is too dark"}]'
-    warned = pack_doses.to_dataset().assign_attrs(cautions=dark)
-    opened(viewer, write(tmp_path / "dark.shadowinv", warned))
-    assert messages == ["dark.shadowinv: film 2 is too dark"]
-
-
 def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_doses):
     lost = deepcopy(pack_doses)
     lost.usable[1] = False

@@ -6,7 +6,6 @@ from napari.layers import Image, Labels, Shapes
 
 from napari_shadowinv._napari.layer_metadata import (
     labels_on,
-    matrix_between,
     pixel_mapper,
     source_on,
 )
@@ -120,7 +119,7 @@ def test_a_source_is_moved_by_whole_pixels_only():
     reference = Image(beam, scale=(2, 2), name="ref")
     np.testing.assert_array_equal(source_on(reference, beam, image), beam[3:23, 4:34])
     for translate, words in (
-        ((1, 0), r"50 × 40 px \(scale 2\), the image 'shot' 30 × 20 px"),  # half a pixel
+        ((1, 0), r"50 × 40 px \(pixels of 2 × 2 px\), the image 'shot' 30 × 20 px"),  # half a pixel
         ((8, 0), "only a part"),
     ):
         reference.translate = translate
@@ -152,10 +151,3 @@ def test_a_cut_source_is_no_longer_its_file(tmp_path):
     assert source_of_shot(beam, beam.data, image).path is None
     image.translate, image.data = (0, 0), np.ones((40, 50))
     assert source_of_shot(beam, beam.data, image).path == tmp_path / "ref.tif"
-
-
-def test_matrices_there_and_back_are_inverse():
-    image = Image(np.ones((20, 30)), scale=(2, 3), rotate=20.0, units="um")
-    turned = Image(np.ones((20, 30)), shear=[0.2], translate=(4, 5), units="mm")
-    there, back = matrix_between(image, turned), matrix_between(turned, image)
-    np.testing.assert_allclose(there @ back, np.eye(3), atol=1e-9)

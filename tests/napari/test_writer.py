@@ -84,18 +84,12 @@ def test_layers_of_two_results_or_of_none_are_refused(viewer, solved, make_inver
         viewer.layers.save(str(tmp_path / "a.shadowinv"), plugin=PLUGIN)
 
     viewer.add_image(np.zeros((4, 4)), name="holiday", contrast_limits=(0, 1))
-    with pytest.raises(FileFormatError, match=r"no layer belongs to a result .'holiday'."):
+    with pytest.raises(FileFormatError, match="no layer belongs to a result"):
         save()
     add_to_viewer(viewer, solved, name="one")
     add_to_viewer(viewer, make_inversion((24, 32)), name="two")
-    with pytest.raises(FileFormatError, match=r"belong to several results .*select layers of one"):
+    with pytest.raises(FileFormatError, match="several results: select layers of one"):
         save()
-
-
-def test_napari_still_writes_its_own_csv(viewer, tmp_path):
-    viewer.add_points(np.zeros((3, 2)))
-    viewer.layers.save(str(tmp_path / "points.csv"))
-    assert "axis-0" in (tmp_path / "points.csv").read_text()
 
 
 def test_an_ending_is_added_but_never_onto_an_existing_file(viewer, solved, tmp_path):

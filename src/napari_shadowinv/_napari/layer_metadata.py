@@ -78,32 +78,20 @@ def _upright(scale: Sequence[float], translate: Sequence[float]) -> FloatArray:
 
 
 def frame_for(
-    shape: Sequence[int],
-    setup: Setup | None,
-    *,
-    scale: Sequence[float] | None = None,
-    translate: Sequence[float] | None = None,
-    units: Sequence[str] | None = None,
-    pixel_size: float | None = None,
+    shape: Sequence[int], setup: Setup | None, *, pixel_size: float | None = None
 ) -> Frame:
     """Choose a frame in the preferred unit of length, or in pixels.
 
-    The automatic unit is µm, or mm above 1 cm. `pixel_size` (m) is used without a setup; the other
-    arguments take precedence.
+    The automatic unit is µm, or mm above 1 cm. `pixel_size` (m) is used without a setup.
     """
-    frame = Frame()
     side = pixel_size if setup is None else setup.object_pixel_size
-    if side is not None:
-        unit = preference("units", "length").replace("µ", "u")
-        if unit == AUTOMATIC:
-            unit = "mm" if max(shape[-2:]) * side * 1e6 > _MAX_LENGTH_UM else "um"
-        pixel = side * _UNITS_PER_M[unit]
-        frame = Frame(scale=(pixel, pixel), units=(unit, unit))
-    overrides = {"scale": scale, "translate": translate, "units": units}
-    changes: dict[str, Any] = {
-        name: tuple(value)[-2:] for name, value in overrides.items() if value is not None
-    }
-    return replace(frame, **changes)
+    if side is None:
+        return Frame()
+    unit = preference("units", "length").replace("µ", "u")
+    if unit == AUTOMATIC:
+        unit = "mm" if max(shape[-2:]) * side * 1e6 > _MAX_LENGTH_UM else "um"
+    pixel = side * _UNITS_PER_M[unit]
+    return Frame(scale=(pixel, pixel), units=(unit, unit))
 
 
 def frame_of(layer: Any) -> Frame:
@@ -438,11 +426,9 @@ def _sizes(role: str, layer: Any, image: Any) -> str:
 
 def _size(layer: Any) -> str:
     (height, width), frame = _shape(layer), frame_of(layer)
-    dy, dx = (f"{abs(side):.4g}" for side in frame.scale)
-    pixel = dx if dx == dy else f"{dx} × {dy}"
-    is_in_pixels = frame.units == Frame().units
-    place = f"scale {pixel}" if is_in_pixels else f"pixels of {pixel} {layer.units[-1]:~P}"
-    return f"{width} × {height} px" + ("" if frame == Frame() else f" ({place})")
+    dy, dx = frame.scale
+    place = f" (pixels of {dx:.4g} × {dy:.4g} {layer.units[-1]:~P})"
+    return f"{width} × {height} px{'' if frame == Frame() else place}"
 
 
 def _shape(layer: Any) -> tuple[int, int]:

@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -67,8 +67,10 @@ def inversion_layers(
 ) -> LayerData:
     """Describe the layers of a result, with the keywords of `add_to_viewer`."""
     inversion = inversion if setup is None else inversion.in_units(setup)
-    frame = frame_for(inversion.potential.shape, inversion.setup, **placement)
-    return result_layers(Result(inversion, dict(origins or {})), frame, name)
+    frame = frame_for(inversion.potential.shape, inversion.setup)
+    place = {key: tuple(value) for key, value in placement.items() if value is not None}
+    result = Result(inversion, dict(origins or {}))
+    return result_layers(result, replace(frame, **place), name)
 
 
 def add_to_viewer(

@@ -63,7 +63,6 @@ if TYPE_CHECKING:
     from napari_shadowinv.results import AnyResult
 
 _STATE = "napari"  # attribute with a result's name, its place, and its origins in words
-_MAX_NAMES = 3  # in a message
 
 
 def layers_of_result(result: Result[AnyResult], frame: Frame, name: str = "") -> LayerData:
@@ -154,24 +153,17 @@ def _common_result(layers: Sequence[FullLayerData]) -> xarray.Dataset:
     shown = [(about.result_of(layer[1]), layer) for layer in layers]
     of_results = [(result, layer) for result, layer in shown if result is not None]
     if len({id(result) for result, _ in of_results}) > 1:
-        names = _quote_names([layer for _, layer in of_results])
         raise InputError(
-            f"the layers belong to several results ({names}): select layers of one result and save "
-            "the selected layers"
+            "the layers belong to several results: select layers of one result and save the "
+            "selected layers"
         )
     if not of_results:
         raise InputError(
-            f"no layer belongs to a result ({_quote_names(layers)}): expected at least one layer "
-            "of an inversion; save other layers as images"
+            "no layer belongs to a result: expected at least one layer of an inversion; save other "
+            "layers as images"
         )
     result, layer = of_results[0]
     return dataset_to_save(result, Layer.create(*layer))
-
-
-def _quote_names(layers: Sequence[FullLayerData]) -> str:
-    names = [f"'{keywords.get('name', '?')}'" for _, keywords, _ in layers]
-    more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-    return ", ".join(names[:_MAX_NAMES]) + more
 
 
 _COMPARED_SHOTS = 16

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any
@@ -39,7 +38,6 @@ from napari_shadowinv._napari.widgets._panels import ResultLayers
 from napari_shadowinv._system.validation import CheckedModel
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
-from napari_shadowinv.film import Pack
 from napari_shadowinv.film.scans import checked_corners
 from napari_shadowinv.film_doses import FilmDoses, Spectrum
 from napari_shadowinv.io import write
@@ -186,33 +184,6 @@ def painted_by_hand(labels: AnyArray, doses: FilmDoses) -> BoolArray:
     return np.asarray((labels == BY_HAND) | (doses.usable & (labels > 0)))
 
 
-@dataclass(frozen=True, eq=False)
-class _Corrections:
-    """What the user has corrected in the result of a pack."""
-
-    corners: Mapping[str, FloatArray] | None = None  # of all films by number
-    by_hand: BoolArray | None = None  # painted pixels, which are not used, (n, H, W)
-    # Pixel side of the upright films in pixels of each film's scan, (n,); needed with corners.
-    scales: FloatArray | None = None
-    plane: int = 0  # the film in view
-
-
-def _pack_job(pack: Pack, path: str, name: str, folder: Path, made: _Corrections) -> Job:
-    """Return the job that evaluates a corrected pack; corrections are written to a folder."""
-
-    def compute(**callbacks: Any) -> tuple[FilmDoses, BoolArray | None]:
-        corrected, by_hand = corrected_pack(pack, folder, made.corners, made.by_hand, made.scales)
-        return run_film(corrected, **callbacks), by_hand
-
-    def describe(content: tuple[FilmDoses, BoolArray | None]) -> LayerData:
-        doses, by_hand = content
-        frame = about.frame_for(doses.dose.shape, doses.setup, pixel_size=doses.pixel_size)
-        facts: Any = {"path": path, "pack": pack, "corners": made.corners, "plane": made.plane}
-        return pack_layers(about.Result(doses), frame, name, by_hand=by_hand, **facts)
-
-    return Job(compute, describe, path or name)
-
-
 class FilmPack(panels.ToolPanel):
     """Choose a pack file, then press Run; correct corners and masks, and press it again."""
 
@@ -293,7 +264,8 @@ class FilmPack(panels.ToolPanel):
         stated = self.file.state().get("file", "").strip()
         file = str(Path(stated).expanduser().absolute()) if stated else ""
         layer = self.packs.layer
-        corrections = _Corrections()
+        corrections: tuple[Any, ...] = (None, None, None)
+        plane = 0  # the film in view
         metadata = {} if layer is None else about.metadata_of(layer)
         if layer is None or file not in ("", metadata.get("path")):
             if not file:
@@ -305,14 +277,30 @@ class FilmPack(panels.ToolPanel):
             pack = read_pack(Path(file)) if file else metadata.get("pack") or doses.pack
             if len(pack.layers) == len(doses.usable):
                 corrections = self._corrections(layer, doses)
+                plane = plane_in_view(self.viewer, layer)
         folder = Path(mkdtemp(dir=self._scratch))
-        return _pack_job(pack, file or metadata.get("path", ""), name, folder, corrections)
+        path_of_pack = file or metadata.get("path", "")
+        facts: Any = {"path": path_of_pack, "pack": pack, "corners": corrections[0]}
 
-    def _corrections(self, layer: Any, doses: FilmDoses) -> _Corrections:
+        def compute(**callbacks: Any) -> tuple[FilmDoses, BoolArray | None]:
+            corrected, painted = corrected_pack(pack, folder, *corrections)
+            return run_film(corrected, **callbacks), painted
+
+        def describe(content: tuple[FilmDoses, BoolArray | None]) -> LayerData:
+            doses, painted = content
+            frame = about.frame_for(doses.dose.shape, doses.setup, pixel_size=doses.pixel_size)
+            return pack_layers(
+                about.Result(doses), frame, name, by_hand=painted, plane=plane, **facts
+            )
+
+        return Job(compute, describe, path_of_pack or name)
+
+    def _corrections(self, layer: Any, doses: FilmDoses) -> tuple[Any, ...]:
+        """Return the corners of all films by number, painted pixels, and the films' scales."""
         labels = self._partner(layer, UNUSABLE)
         by_hand = None if labels is None else painted_by_hand(labels.data, doses)
         corners = dragged_corners(self.viewer, doses) or about.metadata_of(layer).get("corners")
-        return _Corrections(corners, by_hand, doses.scales, plane_in_view(self.viewer, layer))
+        return corners, by_hand, doses.scales
 
     def forget(self) -> None:
         self.panel.say("")
