@@ -15,26 +15,23 @@ from napari_shadowinv._napari.viewer_sync import (
 )
 from napari_shadowinv._system.safety import as_file_errors
 from napari_shadowinv.errors import FileFormatError
-from napari_shadowinv.io.files import join_address, split_address
+from napari_shadowinv.io.files import join_address
 from napari_shadowinv.io.formats import HDF5, IMAGE_SUFFIXES, RESULT, STORE, format_of
-from napari_shadowinv.io.frames import images_in, is_pattern, left_out_of, matching_files
+from napari_shadowinv.io.frames import images_in, left_out_of
 
 _MAX_IMAGES = 8  # of one file that are opened as layers
 
 
 def get_reader(path: str | Sequence[str]) -> Callable[[str | Sequence[str]], list[Any]] | None:
-    """Return the reader of a file, folder, pattern with ``*`` or list of files, or None."""
+    """Return the reader of a file, folder or list of files, or None."""
     if not isinstance(path, str):
         return read_paths if path and all(_is_image_name(Path(item)) for item in path) else None
-    file, _ = split_address(path)
-    if file.name.endswith((STORE.suffix, *RESULT.suffixes)):
-        return read_paths
-    if is_pattern(file):
-        return read_paths if any(map(_is_image_name, matching_files(file))) else None
-    return read_paths if _can_read(file) else None
+    return read_paths if _can_read(Path(path)) else None
 
 
 def _can_read(path: Path) -> bool:
+    if path.name.endswith((STORE.suffix, *RESULT.suffixes)):
+        return True
     if path.is_dir():
         return bool(images_in(path))
     # Other programs use the endings of HDF5, too.
@@ -59,44 +56,41 @@ def read_paths(path: str | Sequence[str]) -> list[Any]:
 
     if not isinstance(path, str):
         return stack_layers([Path(item) for item in path])
-    file, variable = split_address(path)
+    file = Path(path)
     if file.name.endswith(STORE.suffix):
         from napari_shadowinv._napari.result_files import store_layers
 
         layers = main_layers(store_layers(file))
         _show_in_window(layers)
         return layers
-    if variable is None and is_pattern(file):
-        return stack_layers(matching_files(file))
-    if variable is None and file.is_dir():
+    if file.is_dir():
         images = images_in(file)
         if not images:  # they may be gone since napari asked for a reader
             raise FileFormatError(f"{file} contains no image: expected a folder of radiographs")
         if others := left_out_of(file):
-            show_caution(f"{file.name}: left out: {others}; open them as a pattern or a list")
+            show_caution(f"{file.name}: left out: {others}; open them as a list")
         return stack_layers(images, file.name)
-    return _read_file(file, variable)
+    return _read_file(file)
 
 
 @as_file_errors
-def _read_file(file: Path, variable: str | None) -> list[Any]:
+def _read_file(file: Path) -> list[Any]:
     from napari_shadowinv.io.field_grids import is_field_grid
 
-    if variable is None and not is_field_grid(file):
-        names = format_of(file).image_names(file)
-        if len(names) > _MAX_IMAGES:
-            address = str(join_address(file, names[_MAX_IMAGES]))
-            show_caution(
-                f"{file.name}: {_MAX_IMAGES} of {len(names)} images are open: open another in "
-                f"napari's console, viewer.add_image(napari_shadowinv.read({address!r}).image)"
-            )
-        if len(names) > 1:
-            arrays = [(join_address(file, name), name) for name in names[:_MAX_IMAGES]]
-            return [layer for address, name in arrays for layer in _read_content(address, name)]
-    return _read_content(join_address(file, variable), (variable or "").strip("/"))
+    names = () if is_field_grid(file) else format_of(file).image_names(file)
+    if len(names) < 2:
+        return _read_content(file)
+    if len(names) > _MAX_IMAGES:
+        address = str(join_address(file, names[_MAX_IMAGES]))
+        show_caution(
+            f"{file.name}: {_MAX_IMAGES} of {len(names)} images are open: open another in napari's "
+            f"console, viewer.add_image(napari_shadowinv.read({address!r}).image)"
+        )
+    first = names[:_MAX_IMAGES]
+    return [layer for name in first for layer in _read_content(join_address(file, name), name)]
 
 
-def _read_content(path: Path, array: str) -> list[Any]:
+def _read_content(path: Path, array: str = "") -> list[Any]:
     from napari_shadowinv._napari.result_files import layers_of_dataset
     from napari_shadowinv._napari.shots import frame_layers, layers_of_shot
     from napari_shadowinv.io import read
@@ -109,7 +103,7 @@ def _read_content(path: Path, array: str) -> list[Any]:
             show_caution(f"{path.name}: {caution.text}")
         return layers_of_shot(content, array)
     if content.attrs.get("format") == FRAMES_FORMAT:
-        return frame_layers(content, array or split_address(path)[0].stem)
+        return frame_layers(content, array or path.stem)
     layers = layers_of_dataset(content, path.stem)
     _show_in_window(layers)
     result = result_of(layers[0][1])
