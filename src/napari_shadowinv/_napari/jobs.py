@@ -165,10 +165,6 @@ class FitJob(ImageJob):
     def names(self) -> tuple[str, ...]:
         return tuple(str(shot.name) for shot in self.shots)
 
-    @property
-    def image_name(self) -> str:
-        return self.names[0]
-
     def run(self, on_progress: OnProgress, should_stop: ShouldStop) -> Fit:
         """Load the images, apply the recipe's steps, and fit; or refine the inversion."""
         callbacks: Any = {"on_progress": on_progress, "should_stop": should_stop}

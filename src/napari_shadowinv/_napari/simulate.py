@@ -14,13 +14,12 @@ from qtpy.QtWidgets import QWidget
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, Job, name_of_result
-from napari_shadowinv._napari.layer_metadata import source_on
 from napari_shadowinv._napari.layers import LayerData
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
-from napari_shadowinv._napari.widgets._layers import LayerPicker, image_of
+from napari_shadowinv._napari.widgets._layers import LayerPicker
 from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
@@ -37,7 +36,6 @@ from napari_shadowinv.pipeline.experiment_object import (
 )
 from napari_shadowinv.pipeline.experiment_options import ExperimentOptions
 from napari_shadowinv.pipeline.experiment_result import ExperimentPlan
-from napari_shadowinv.pipeline.inversion_run import plane_of
 from napari_shadowinv.pipeline.prediction import Prediction, predict
 from napari_shadowinv.plotting import draw_errors
 
@@ -98,16 +96,13 @@ class Simulate(panels.ToolPanel):
         self.setup = SetupPicker("simulate")
 
     def _build_task(self) -> None:
-        tip = "Image layer of the undisturbed beam."
-        self.source = LayerPicker(self.viewer, tip, "uniform", about.may_be_source)
-        image, plan = QWidget(), QWidget()
-        column(image, forms.labelled("Source", self.source))
         self.energies = forms.text_line(
             "14.7, 30",
             "Energies of several images of a shot in MeV (of light: wavelengths in m), separated "
             "by commas. Empty: one image with the setup's.",
         )
         self.instrument, self.options = InstrumentForm(), forms.ModelForm(ExperimentOptions)
+        plan = QWidget()
         column(
             plan,
             forms.labelled("Energies", self.energies),
@@ -116,7 +111,7 @@ class Simulate(panels.ToolPanel):
         )
         self.task = forms.ModelPicker(
             "Simulate",
-            {_IMAGE: ("the image", image), _PLAN: ("shots, to plan an experiment", plan)},
+            {_IMAGE: ("the image", None), _PLAN: ("shots, to plan an experiment", plan)},
             "The image that the object casts, or shots with random imperfections, whose fields are "
             "compared with the object.",
         )
@@ -181,33 +176,25 @@ class Simulate(panels.ToolPanel):
     def _image_job(
         self, target: SimulatedObject, setup: Setup | None, shape: tuple[int, int]
     ) -> Job:
-        beam: Any = self.source.layer
-        source = None if beam is None else image_of(beam)
         layer: Any = None
         if isinstance(target, PlannedObject):
             layer, setup = self.field.layer, setup or target.setup
             shape = layer.data.shape[-2:]
-            source = None if source is None else source_on(beam, source, layer)
-        elif source is not None:
-            shape = source.shape
         # In another experiment the object may have other pixels.
         is_moved = layer is None or getattr(target, "setup", None) not in (None, setup)
         origin = f"{about.CAME_WITH} the forward model, {self.setup.origin}"
-        facts: dict[str, Any] = {
+        facts: Any = {
             "frame": about.frame_for(shape, setup) if is_moved else about.frame_of(layer),
-            "unit": about.unit_of(beam or {}),
+            "unit": "",
             "setup_origin": origin if self.setup.origin else None,
         }
-
-        def compute(**callbacks: Any) -> Prediction:
-            light = None if source is None else plane_of(source, "the source")
-            return predict(target, setup, shape, source=light, **callbacks)
 
         def describe(content: Prediction) -> LayerData:
             image, name = content.image, f"{target.title} image"
             more = facts | {"source": content.source}  # for an inversion of the image
             return [shot_layer(image, name, setup, intensity_limits(image), **more)]
 
+        compute = partial(predict, target, setup, shape)
         return Job(compute, describe, target.title if layer is None else layer)
 
     def forget(self) -> None:

@@ -17,7 +17,6 @@ from napari_shadowinv._napari.jobs import Finished
 from napari_shadowinv._napari.layer_metadata import (
     Result,
     metadata_for,
-    result_of,
     setup_of,
     store_setup,
 )
@@ -271,47 +270,20 @@ def assert_same(one, other):
     np.testing.assert_array_equal(one.reprojection, other.reprojection)
 
 
-def save(viewer, content, path):
-    layers = [
-        layer for layer in viewer.layers if getattr(result_of(layer), "content", None) is content
-    ]
-    viewer.layers.selection = set(layers)
-    viewer.layers.save(str(path), selected=True, plugin="napari-shadowinv")
-
-
-@pytest.fixture
-def files(tmp_path, monkeypatch):
-    """Both images and their beam as files, in the current folder."""
+def test_window_and_command_make_the_same_fit_and_make_it_again(
+    viewer, opened, run, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     beam = 300 * (1 + np.arange(SHAPE[1]) * np.ones(SHAPE) / 500)
-    paths = [tmp_path / name for name in ("fast.txt", "slow.txt", "beam.txt")]
-    planes = [predict_image(TRUTH, SETUPS[0], setup, source=beam) for setup in SETUPS]
     noise = np.random.default_rng(4).normal(0, 3, (2, *SHAPE))
-    for path, plane in zip(paths, [*np.add(planes, noise), beam], strict=True):
-        np.savetxt(path, plane)
-    return paths
-
-
-@pytest.fixture
-def of_files(viewer, opened):
-    """Open files, and the tool with both images at their energies."""
-
-    def make(*paths):
-        for path in paths:
-            viewer.open(str(path), plugin="napari-shadowinv")
-        tool = opened(FitImages)
-        tool.options.restore(QUICK)
-        tool.setup.show_setup(SETUPS[0].model_dump())
-        type_in(tool, 1, BEAM, "6")
-        return tool
-
-    return make
-
-
-def test_window_and_command_make_the_same_fit_and_make_it_again(
-    viewer, of_files, files, run, tmp_path
-):
-    tool = of_files(*files)
+    planes = [predict_image(TRUTH, SETUPS[0], setup, source=beam) for setup in SETUPS] + noise
+    for name, plane in zip(("fast.txt", "slow.txt", "beam.txt"), [*planes, beam], strict=True):
+        np.savetxt(name, plane)
+        viewer.open(tmp_path / name, plugin="napari-shadowinv")
+    tool = opened(FitImages)
+    tool.options.restore(QUICK)
+    tool.setup.show_setup(SETUPS[0].model_dump())
+    type_in(tool, 1, BEAM, "6")
     tool.source.layer = viewer.layers["beam"]
     tool.choices.restore({"brightness": "free", "noise": "poisson", "psf": 0.6})
     tool.steps.add("crop", {"y": (0, 48), "x": (4, 64)})
@@ -324,7 +296,7 @@ def test_window_and_command_make_the_same_fit_and_make_it_again(
     assert [image.file for image in provenance.images] == ["fast.txt", "slow.txt"]
     assert [image.source.file for image in provenance.images] == ["beam.txt"] * 2
     assert all(image.sha256 and image.source.sha256 for image in provenance.images)
-    save(viewer, result, tmp_path / "window.shadowinv")
+    write(tmp_path / "window.shadowinv", result)
     output = command("rerun", "window.shadowinv", "--out", "again.shadowinv")
     assert "changed nothing" in output
     assert "bit for bit" in output
