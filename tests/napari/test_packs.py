@@ -11,6 +11,7 @@ from napari_shadowinv import write
 from napari_shadowinv._napari.layer_metadata import frame_for, role_of, setup_of, usable_of
 from napari_shadowinv._napari.viewer_sync import connect_viewer
 from napari_shadowinv._napari.widgets.film_pack import film_layers
+from napari_shadowinv._napari.widgets.fit_images import entries_of
 
 PLUGIN = "napari-shadowinv"
 
@@ -81,6 +82,10 @@ def test_images_for_a_fit_know_setup_energy_and_usable_pixels(pack_doses):
         np.testing.assert_array_equal(usable_of(layer), usable)
         np.testing.assert_array_equal(layer.data, np.where(usable, lost.fluence[k], 0))
         np.testing.assert_allclose(layer.scale, 1e6 * setup.object_pixel_size)
+    # Without a setup they know their energy only.
+    first, *_ = film_layers(replace(lost, setups=()), frame, "trio")
+    assert setup_of(first[1]) is None
+    assert entries_of(first[1]) == {"energy": lost.energies[0]}
 
 
 def test_layers_that_are_no_measurement_are_marked(pack_doses):

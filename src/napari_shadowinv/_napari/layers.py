@@ -223,7 +223,7 @@ def _predicted_images(fit: Fit, frame: Frame, name: str, facts: dict[str, Any]) 
     if np.ptp(fit.source[0]):
         # One plane unless the beams differ in more than their brightness.
         beams = fit.source / fit.source.mean(axis=(1, 2), keepdims=True)
-        is_common = np.abs(beams - beams[0]).max() < _MAX_BEAM_DIFFERENCE
+        is_common = np.allclose(beams, beams[0], rtol=_MAX_BEAM_DIFFERENCE)
         contents = {"source": (fit.source[:1] if is_common else fit.source, grey), **contents}
     layers: LayerData = []
     for role, (planes, limits) in contents.items():

@@ -153,15 +153,14 @@ def shot_in_memory(shot: Shot, name: str, source_name: str = "") -> Shot:
 def stack_layers(paths: Sequence[Path], name: str = "") -> LayerData:
     """Describe a run of shots as a lazy stack; only the first readable shot is read now."""
     # Unreadable shots, or shots of another shape, are zero and give a warning when shown.
-    first, index = _first_readable(paths)
+    first = _first_readable(paths)
+    file = "" if first.path is None else first.path.name
     for caution in first.cautions:
-        show_caution(f"{paths[index].name}: {caution.text}")
+        show_caution(f"{file}: {caution.text}")
     height, width = first.image.shape
-    plane_of = partial(_plane_of, shape=(height, width))
-    stack = lazy_stack(plane_of, paths, (height, width), ready=first.image, ready_index=index)
-    origin = paths[index].name + (f", one of {len(paths)} shots" if len(paths) > 1 else "")
+    origin = file + (f", one of {len(paths)} shots" if len(paths) > 1 else "")
     layer = shot_layer(
-        stack,
+        lazy_stack(partial(_plane_of, shape=(height, width)), paths, (height, width)),
         name or paths[0].parent.name or "shots",
         first.setup,
         intensity_limits(first.image),
@@ -182,31 +181,25 @@ def frame_layers(frames: xarray.Dataset, name: str) -> LayerData:
 
 
 def lazy_stack(
-    make: Callable[..., FloatArray],
-    items: Sequence[Any],
-    shape: tuple[int, int],
-    ready: FloatArray | None = None,
-    ready_index: int = 0,
+    make: Callable[..., FloatArray], items: Sequence[Any], shape: tuple[int, int]
 ) -> Any:
-    """Stack the planes that `make` returns for items, a chunk each; one may be in memory."""
+    """Stack the planes that `make` returns for items, a chunk each."""
     from dask import array
     from dask.delayed import delayed
 
     delayed_make = delayed(make, pure=True)
     planes = [
-        array.from_array(ready, chunks=shape)  # type: ignore[no-untyped-call]
-        if ready is not None and index == ready_index
-        else array.from_delayed(delayed_make(item), shape=shape, dtype=np.float64)  # type: ignore[no-untyped-call]
-        for index, item in enumerate(items)
+        array.from_delayed(delayed_make(item), shape=shape, dtype=np.float64)  # type: ignore[no-untyped-call]
+        for item in items
     ]
     return array.stack(planes)  # type: ignore[no-untyped-call]
 
 
-def _first_readable(paths: Sequence[Path]) -> tuple[Shot, int]:
+def _first_readable(paths: Sequence[Path]) -> Shot:
     messages: list[str] = []
-    for index, path in enumerate(paths):
+    for path in paths:
         try:
-            return io.read_shot(path), index
+            return io.read_shot(path)
         except (FileFormatError, InputError) as error:
             messages.append(str(error))
     raise FileFormatError(f"none of {len(paths)} files can be read as a shot: {messages[0]}")

@@ -172,7 +172,7 @@ def film_layers(doses: FilmDoses, frame: about.Frame, name: str) -> LayerData:
             setup_origin=f"{about.CAME_WITH} {name}" if doses.setups else None,
             usable=used,
             part=str(k + 1),
-            energies=[float(doses.energies[k])],
+            fit=None if doses.setups else {"energy": float(doses.energies[k])},
         )
         layer[1]["visible"] = not layers
         layers.append(layer)

@@ -305,7 +305,7 @@ class ImageTable(QTableWidget):
                 use = entries_of(image).get("use", image.data.shape == common_shape)
                 name = QTableWidgetItem(image.name)
                 name.setFlags(_READABLE | Qt.ItemFlag.ItemIsUserCheckable)
-                name.setToolTip(f"<qt>{image.name}: {_setup_summary(image)}.</qt>")
+                name.setToolTip(image.name)
                 name.setCheckState(Qt.CheckState.Checked if use else Qt.CheckState.Unchecked)
                 self.setItem(row, 0, name)
                 self.setItem(row, 1, QTableWidgetItem())
@@ -366,11 +366,3 @@ class ImageTable(QTableWidget):
     def _is_image(self, layer: Any) -> bool:
         is_grey = kind_of(layer) == "image" and not getattr(layer, "rgb", False)
         return is_grey and layer.ndim == 2 and self._suits(layer)
-
-
-def _setup_summary(image: Any) -> str:
-    """Return the origin of an image's setup, for the tooltip."""
-    setup, origin = about.setup_of(image), about.setup_origin_of(image)
-    if setup is None:
-        return "with the setup below"
-    return f"with its own setup ({setup.probe}{f', {origin}' if origin else ''})"
