@@ -119,7 +119,7 @@ def test_a_source_is_moved_by_whole_pixels_only():
     reference = Image(beam, scale=(2, 2), name="ref")
     np.testing.assert_array_equal(source_on(reference, beam, image), beam[3:23, 4:34])
     for translate, words in (
-        ((1, 0), r"50 × 40 px \(pixels of 2 × 2 px\), the image 'shot' 30 × 20 px"),  # half a pixel
+        ((1, 0), r"50 × 40 px \(scale 2 × 2\), the image 'shot' 30 × 20 px"),  # half a pixel
         ((8, 0), "only a part"),
     ):
         reference.translate = translate

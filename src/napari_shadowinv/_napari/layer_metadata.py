@@ -427,8 +427,9 @@ def _sizes(role: str, layer: Any, image: Any) -> str:
 def _size(layer: Any) -> str:
     (height, width), frame = _shape(layer), frame_of(layer)
     dy, dx = frame.scale
-    place = f" (pixels of {dx:.4g} × {dy:.4g} {layer.units[-1]:~P})"
-    return f"{width} × {height} px{'' if frame == Frame() else place}"
+    unit = "" if frame.units == Frame().units else f" {layer.units[-1]:~P}"
+    place = "" if frame == Frame() else f" (scale {dx:.4g} × {dy:.4g}{unit})"
+    return f"{width} × {height} px{place}"
 
 
 def _shape(layer: Any) -> tuple[int, int]:

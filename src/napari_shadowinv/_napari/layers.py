@@ -204,9 +204,11 @@ def _fitted_fields(fit: Fit, frame: Frame, name: str, facts: dict[str, Any]) -> 
             variables["mask"] = PLANE, fit.mask.any(axis=0)
         if (std := per_pixel_of(field.errors)) is not None:
             variables["displacement_uncertainty"] = VECTOR, std
-        more = facts | {"displacement": field.displacement} | ({"part": field.name} if m else {})
+        cause = deflector_titles()[field.name]
+        more = facts | {"displacement": field.displacement, "cause": cause}
+        more |= {"part": field.name} if m else {}
         title = name if len(fit.fields) == 1 else f"{name} {field.name}"
-        view = View(xr.Dataset(variables), fit.setup, deflector=deflector_titles()[field.name])
+        view = View(xr.Dataset(variables), fit.setup, deflector=cause)
         for layer in dataset_layers(view, frame, title, more):
             layer[1]["visible"] &= m == 0
             layers.append(layer)

@@ -244,10 +244,8 @@ def _strongest_shot(dataset: xarray.Dataset, path: Path) -> int:
 
 
 def _shot_names(dataset: xarray.Dataset) -> list[str]:
-    for name in ("name", "shot"):
-        if name in dataset.variables and dataset[name].dims == ("shot",):
-            return [str(value) for value in dataset[name].values]
-    return [str(shot) for shot in range(dataset.sizes["shot"])]
+    names = dataset["name"].values if "name" in dataset else range(dataset.sizes["shot"])
+    return list(map(str, names))
 
 
 _followed: weakref.WeakSet[Any] = weakref.WeakSet()  # lists of layers

@@ -16,7 +16,6 @@ from napari_shadowinv.io.public_images import fetch_burner
 from napari_shadowinv.physics import phantoms
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.setup import OpticalSetup, ProtonSetup, setup_from_dict
-from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.shot import Shot
 
 _SHAPE = (200, 200)
@@ -77,9 +76,8 @@ def two_energies() -> LayerData:
 def wakefield_run() -> LayerData:
     """Twenty optical shots of a plasma wave that moves, grows and fades, computed when shown."""
     stack = lazy_stack(_wakefield_shot, range(_RUN_LENGTH), _RUN_SHAPE)
-    limits = intensity_limits(_wakefield_shot(_RUN_LENGTH // 2))
     shots = Shot(stack, setup=OpticalSetup.example(), source=_wakefield_beam())
-    return layers_of_shot(shots, "wakefield run", limits)
+    return layers_of_shot(shots, "wakefield run")
 
 
 # For an image without channels napari adds no layer; it refuses an empty list.

@@ -20,7 +20,7 @@ from napari_shadowinv._napari.layer_metadata import (
     metadata_of,
     source_on,
 )
-from napari_shadowinv._napari.layers import FullLayerData, LayerData, Limits
+from napari_shadowinv._napari.layers import FullLayerData, LayerData
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import show_caution
 from napari_shadowinv._typing import BoolArray, FloatArray
@@ -35,10 +35,11 @@ if TYPE_CHECKING:
     from napari_shadowinv.physics.setup import Setup
 
 
-def layers_of_shot(shot: Shot, name: str = "", limits: Limits | None = None) -> LayerData:
+def layers_of_shot(shot: Shot, name: str = "") -> LayerData:
     """Describe an image or a stack, above its undisturbed beam and mask of unusable pixels."""
     name = name or ("shot" if shot.path is None else shot.path.stem)
-    limits = limits or intensity_limits(shot.image)
+    image = shot.image if shot.image.ndim == 2 else shot.image[len(shot.image) // 2]
+    limits = intensity_limits(np.asarray(image))
     frame = _frame(shot)
     layers: LayerData = []
     facts = _facts(shot, f"the sample '{name}'" if shot.path is None else shot.path.name)

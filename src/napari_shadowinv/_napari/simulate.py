@@ -25,7 +25,7 @@ from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
 from napari_shadowinv.physics.phantom_models import PHANTOMS, PhantomRecipe
-from napari_shadowinv.physics.setup import Setup, deflector_titles
+from napari_shadowinv.physics.setup import Setup
 from napari_shadowinv.physics.units import intensity_limits
 from napari_shadowinv.pipeline.experiment import plan_experiment
 from napari_shadowinv.pipeline.experiment_object import (
@@ -165,12 +165,11 @@ class Simulate(panels.ToolPanel):
                 "there is no result to start from: invert a shot (Plugins → Shadowinv → Invert), "
                 "open a .shadowinv file (File → Open), or select a simulated object"
             )
-        displacement = np.asarray(about.displacement_of(layer), dtype=np.float64)
-        fields: Any = getattr(result.content, "fields", ())  # of a fit, each with its cause
-        names = [each.name for each in fields if np.array_equal(each.displacement, displacement)]
-        cause = deflector_titles().get(names[0]) if names else None
         return object_of_displacement(
-            displacement, result.content.setup, deflector=cause, title=name_of_result(layer)
+            np.asarray(about.displacement_of(layer), dtype=np.float64),
+            result.content.setup,
+            deflector=about.metadata_of(layer).get("cause"),  # of a field of a fit
+            title=name_of_result(layer),
         )
 
     def _image_job(

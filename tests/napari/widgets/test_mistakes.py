@@ -135,9 +135,9 @@ def of_a_product(tool, viewer, solved):
     yield "There is no result to measure"
     add_to_viewer(viewer, solved, EXAMPLE)
     tool.product.set_kind("flux")
-    yield "There is no shape for the flux across a line"
+    yield "There is no line or path for the flux across a line"
     choose("current", "add_lines", [[3.0, 3.0], [9.0, 9.0]])
-    yield "expected a closed shape"
+    yield "There is no closed shape, such as an ellipse, for the"
     choose("azimuthal", "add_rectangles", [[5.0, 5.0], [15.0, 25.0]])
     yield "is no circle"
 

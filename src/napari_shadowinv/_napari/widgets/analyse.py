@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -153,7 +153,7 @@ class Analyse(qt.Docked):
         shapes, layers = self.lines.layer, self.layers
         line = None
         if shapes is not None:
-            line = selected_shape(shapes, lambda kind: kind in OPEN_SHAPES)
+            line = selected_shape(shapes, OPEN_SHAPES)
         self.profiles, problem = [], ""
         if shapes is not None and line is not None and layers:
             vertices = np.array([shapes.data_to_world(end)[-2:] for end in shapes.data[line]])
@@ -304,21 +304,15 @@ class ProductForm(ToolPanel):
 
     def _outline(self, layer: Any) -> dict[str, Any]:
         """Return the fields of a product that the selected shape stands for, in px."""
-        shapes = self.shapes.layer
-        if shapes is None or not len(shapes.data):
-            raise InputError(
-                f"there is no shape for the {self.kind.title}: press ✎ and draw one on the image"
-            )
         is_closed = "center" in self.kind.model_fields
-        index = selected_shape(
-            shapes,
-            lambda kind: is_closed != (kind in OPEN_SHAPES) or (is_closed and kind == "path"),
-        )
+        kinds = {"ellipse", "rectangle", "polygon", "path"} if is_closed else set(OPEN_SHAPES)
+        shapes: Any = self.shapes.layer
+        index = None if shapes is None else selected_shape(shapes, kinds)
         if index is None:
-            expected = "a closed shape, such as an ellipse" if is_closed else "a line or a path"
+            expected = "closed shape, such as an ellipse," if is_closed else "line or path"
             raise InputError(
-                f"'{shapes.name}' has no shape for the {self.kind.title}, expected {expected}: "
-                "press ✎ and draw one"
+                f"there is no {expected} for the {self.kind.title}: press ✎ and draw one on the "
+                "image"
             )
         corners = mapped(matrix_between(shapes, layer), shapes.data[index])
         values = shape_fields(shapes.shape_type[index], corners)
@@ -398,9 +392,9 @@ def _has_fields(layer: Any) -> bool:
     return about.result_of(layer) is not None
 
 
-def selected_shape(shapes: Any, suits: Callable[[str], bool]) -> int | None:
-    """Return the index of the selected shape of a suitable type, or else of the last one."""
-    suitable = [index for index, kind in enumerate(shapes.shape_type) if suits(kind)]
+def selected_shape(shapes: Any, kinds: Collection[str]) -> int | None:
+    """Return the index of the selected shape of some kinds, or else of the last one."""
+    suitable = [index for index, kind in enumerate(shapes.shape_type) if kind in kinds]
     selected = [index for index in suitable if index in shapes.selected_data]
     return next(reversed(selected or suitable), None)
 
