@@ -45,6 +45,7 @@ LayerData = list[FullLayerData]
 Limits = tuple[float, float]
 
 _ARROW_COLOUR = "#00c8ff"
+_LABEL_COLOURS = "#5dff5d", "#00c8ff"
 
 _FIELD_VARIABLES = ("displacement", "potential", "displacement_uncertainty")
 _MASKED_VARIABLES = (*_FIELD_VARIABLES, "reprojection", "residual")
@@ -287,7 +288,7 @@ def pack_layers(
             data: AnyArray = np.where(doses.usable, 0, EXCLUDED).astype(np.uint8)
             if by_hand is not None:
                 data[by_hand] = BY_HAND
-            look: dict[str, Any] = {"opacity": 0.5}
+            look = _label_look()
         else:
             data = getattr(doses, kind.variable)
             limits = list(map(film_limits, data, doses.usable))
@@ -439,7 +440,14 @@ def _field(view: View, role: str) -> tuple[Any, Limits, dict[str, str]]:
 
 
 def _labels(view: View, kind: Kind) -> Content:
-    return view.dataset["caustic"].data.astype(np.uint8), {}, {"opacity": 0.5}
+    return view.dataset["caustic"].data.astype(np.uint8), {}, _label_look()
+
+
+def _label_look() -> dict[str, Any]:
+    """Return colours of labels that are seen on a field; napari's own first one is brown."""
+    from napari.utils import CyclicLabelColormap
+
+    return {"colormap": CyclicLabelColormap(["transparent", *_LABEL_COLOURS]), "opacity": 0.5}
 
 
 def _arrows(view: View, kind: Kind) -> Content:
