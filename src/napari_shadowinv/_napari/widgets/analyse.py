@@ -117,7 +117,8 @@ class Analyse(qt.Docked):
         layers, dims, plot = self.viewer.layers, self.viewer.dims, self._schedule_plot
         qt.while_alive(self, layers, ("inserted", "removed", "reordered"), plot)
         qt.while_alive(self, dims, "current_step", plot)
-        qt.layers_while_alive(self, layers, ("set_data", "visible", "name"), plot)
+        qt.layers_while_alive(self, layers, ("visible", "name"), plot)
+        qt.layers_while_alive(self, layers, "set_data", self._on_data)
         self.lines.picked.connect(plot)
         self.width_px.changed.connect(plot)
 
@@ -203,6 +204,10 @@ class Analyse(qt.Docked):
     def _schedule_plot(self, _: Any = None) -> None:
         if not self._timer.isActive():
             self._timer.start()
+
+    def _on_data(self, event: Any) -> None:
+        if event.source in (self.lines.layer, *self.layers):
+            self._schedule_plot()
 
     @qt.notify_errors
     def _draw(self) -> None:
