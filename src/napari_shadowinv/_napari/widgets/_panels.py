@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import html
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.jobs import Finished, FitJob, ImageJob, Job
 from napari_shadowinv._napari.layer_metadata import Result, kind_of, main_layers, result_of
-from napari_shadowinv._napari.layers import FullLayerData, LayerData, add_layers
+from napari_shadowinv._napari.layers import FullLayerData, add_layers
 from napari_shadowinv._napari.result_files import missing_layers
 from napari_shadowinv._napari.run import Outcome, Run
 from napari_shadowinv._napari.viewer_sync import show_caution
@@ -383,15 +384,19 @@ class ResultLayers(QObject):
         super().__init__(parent)
         self._viewer = viewer
         self._layers: dict[str, Any] = {}
-        self._order: list[str] = []
-        self._waiting: LayerData = []
-        self._select, self._before, self._fit = True, None, False
-        self._timer = timer(self, 0, self._add_next)
+        self._work: Iterator[None] = iter(())
+        # Adding a layer takes napari some tenths of a second: one at a time, the window responds.
+        self._timer = timer(self, 0, self._go_on, once=True)
 
     @property
     def layers(self) -> list[Any]:
         """The layers that are still in the viewer."""
         return [layer for layer in self._layers.values() if layer in self._viewer.layers]
+
+    @property
+    def layer_keys(self) -> set[str]:
+        """Keys of the layers that are still in the viewer."""
+        return {about.layer_key(layer) for layer in self.layers}
 
     @property
     def busy(self) -> bool:
@@ -404,43 +409,14 @@ class ResultLayers(QObject):
 
         With `fit`, the camera is then fitted to all layers.
         """
-        # Adding a layer takes napari some tenths of a second: one at a time, the window responds.
-        self._select, self._fit = select, fit
-        self._before = self._viewer.layers.selection.active
-        present = self.layers
-        self._order = [about.layer_key(keywords) for _, keywords, _ in layer_data]
-        for key in [key for key in self._layers if key not in self._order]:
-            layer = self._layers.pop(key)
-            if layer in present:
-                self._viewer.layers.remove(layer)
-        waiting = []
-        for data, keywords, kind in layer_data:
-            layer = self._layers.get(about.layer_key(keywords))
-            if layer is None or layer not in present:
-                waiting.append((data, keywords, kind))
-            elif kind != "points":  # napari redraws them
-                _update(layer, data, keywords)
-            else:
-                keywords = {**keywords, "visible": layer.visible}
-                self._viewer.layers.remove(layer)
-                waiting.append((data, keywords, kind))
-        self._waiting = sorted(waiting, key=lambda layer: not layer[1].get("visible", True))
-        if self._waiting:
-            self._timer.start()
-        else:
-            self._finish()
+        self._work = self._show(layer_data, select, fit)
+        self._go_on()
 
     def extend(self, layer_data: Sequence[FullLayerData]) -> None:
         """Add layers of the same result below the others, keeping the selection."""
-        self._select, self._before = False, self._viewer.layers.selection.active
-        self._order = [about.layer_key(keywords) for _, keywords, _ in layer_data] + self._order
-        self._waiting += layer_data
-        self._timer.start()
-
-    @property
-    def layer_keys(self) -> set[str]:
-        """Keys of the layers that are still in the viewer."""
-        return {key for key, layer in self._layers.items() if layer in self._viewer.layers}
+        lowest = next((layer for layer in self._viewer.layers if layer in self.layers), None)
+        self._work = chain(self._work, self._add(layer_data, lowest))
+        self._go_on()
 
     def take_over(self, earlier: ResultLayers) -> None:
         """Take the layers of an earlier result, to update them with the next one."""
@@ -451,32 +427,41 @@ class ResultLayers(QObject):
         for layer in self.layers:
             layer.visible = False
 
-    def _add_next(self) -> None:
-        if self._waiting:
-            layer = self._waiting.pop(0)
-            key = about.layer_key(layer[1])
-            (self._layers[key],) = add_layers(self._viewer, [layer], below=self._next_above(key))
-            # Hidden layers must not take the selection.
-            main = self._layers.get("field") or self._layers.get("fluence")
-            active = main if self._select else self._before
-            if active is not None and active in self._viewer.layers:
-                self._viewer.layers.selection.active = active
-        if not self._waiting:
-            self._timer.stop()
-            self._finish()
+    def _go_on(self) -> None:
+        work = self._work
+        is_over = next(work, True)
+        if work is self._work:
+            (self.complete.emit if is_over else self._timer.start)()
 
-    def _finish(self) -> None:
-        if self._fit:
+    def _show(self, layer_data: Sequence[FullLayerData], select: bool, fit: bool) -> Iterator[None]:
+        described = {about.layer_key(each[1]): each for each in layer_data}
+        for layer in self.layers:
+            if about.layer_key(layer) not in described:
+                self._viewer.layers.remove(layer)
+        self._layers = {about.layer_key(layer): layer for layer in self.layers}
+        for key, layer in self._layers.items():
+            _update(layer, *described[key][:2])
+        above = None
+        for key, each in reversed(described.items()):
+            if key not in self._layers:
+                yield from self._add([each], above, select=select)
+            above = self._layers[key]
+        if fit:
             # Only now all layers of an earlier result have the new units.
-            self._fit = False
             self._viewer.reset_view()
-        self.complete.emit()
 
-    def _next_above(self, key: str) -> Any | None:
-        """Return the lowest present layer of the result that belongs above this one."""
-        higher = self._order[self._order.index(key) + 1 :]
-        layers = map(self._layers.get, higher)
-        return next((layer for layer in layers if layer in self._viewer.layers), None)
+    def _add(
+        self, layer_data: Sequence[FullLayerData], above: Any | None, *, select: bool = False
+    ) -> Iterator[None]:
+        for each in reversed(layer_data):
+            before = self._viewer.layers.selection.active
+            (above,) = add_layers(self._viewer, [each], below=above)
+            self._layers[about.layer_key(above)] = above
+            main = self._layers.get("field") or self._layers.get("fluence")
+            # Hidden layers must not take the selection.
+            if (active := main if select else before) is not None:
+                self._viewer.layers.selection.active = active
+            yield
 
 
 class LastResults:
