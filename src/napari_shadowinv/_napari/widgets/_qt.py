@@ -191,16 +191,14 @@ def notify_errors(method: Method) -> Method:
 class Docked(QWidget):
     """A widget that opens as a tab of the docks on its side, where napari would squeeze it below.
 
-    Choosing a tab in the background again in the menu brings it to the front, where napari would
-    hide it. napari gives its viewer to a parameter `napari_viewer`.
+    napari gives its viewer to a parameter `napari_viewer`.
     """
 
-    _dock: QDockWidget | None = None
-    _in_front = True
     spare_width = 30  # px, in which a new dock is wider than needed
 
     def __init__(self) -> None:
         super().__init__()
+        self._is_placed = False
         self.setMinimumWidth(_WIDTH_PX)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
 
@@ -209,45 +207,35 @@ class Docked(QWidget):
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
-        if self._dock is None:
-            # napari lays out the docks after this event.
-            QTimer.singleShot(0, self._join)
+        if not self._is_placed:
+            QTimer.singleShot(0, self._join)  # napari lays out the docks after this event
 
-    def hideEvent(self, event: Any) -> None:
-        super().hideEvent(event)
-        dock = self._dock
-        if dock is not None and dock.isHidden() and not self._in_front:
-            QTimer.singleShot(0, self.come_to_front)
-
-    def come_to_front(self) -> None:
-        """Show the dock in front of the others, also after it was closed."""
-        if self._dock is not None and self._dock.parent().isVisible():
-            self._in_front = True
-            self._dock.show()
-            self._dock.raise_()
-
-    def _on_visibility(self, visible: bool) -> None:
-        if self._dock is not None and not self._dock.isHidden():
-            self._in_front = visible
-
-    def _join(self) -> None:
+    @property
+    def _dock(self) -> QDockWidget | None:
         dock = self.parent()
         while dock is not None and not isinstance(dock, QDockWidget):
             dock = dock.parent()
+        return dock
+
+    def come_to_front(self) -> None:
+        """Show the dock in front of the others, also after it was closed."""
+        if (dock := self._dock) is not None:
+            dock.show()
+            dock.raise_()
+
+    def _join(self) -> None:
+        dock = self._dock
         window = None if dock is None else dock.parent()
-        if self._dock is not None or dock is None or not isinstance(window, QMainWindow):
+        if self._is_placed or dock is None or not isinstance(window, QMainWindow):
             return
-        self._dock = dock
-        dock.visibilityChanged.connect(self._on_visibility)
+        self._is_placed = True
+        if dock.isFloating() or window.tabifiedDockWidgets(dock):
+            return
         side = window.dockWidgetArea(dock)
-        is_docked = not dock.isFloating() and side != Qt.DockWidgetArea.NoDockWidgetArea
-        if not is_docked or window.tabifiedDockWidgets(dock):
-            return
         for neighbour in window.findChildren(QDockWidget):
-            is_on_side = neighbour is not dock and window.dockWidgetArea(neighbour) == side
-            if not is_on_side or not neighbour.isVisible() or neighbour.isFloating():
-                continue
-            if neighbour.objectName() not in _NAPARI_DOCKS:
+            is_beside = neighbour is not dock and window.dockWidgetArea(neighbour) == side
+            is_shown = neighbour.isVisible() and not neighbour.isFloating()
+            if is_beside and is_shown and neighbour.objectName() not in _NAPARI_DOCKS:
                 window.tabifyDockWidget(neighbour, dock)
                 dock.raise_()
                 return
