@@ -1,16 +1,12 @@
 """The manifest, and the imports that it causes."""
 
-from importlib.metadata import entry_points, version
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import napari_shadowinv
 from napari_shadowinv.io import formats
 
 ROOT = Path(napari_shadowinv.__file__).parent
-
-
-# Menus that napari 0.7 does not have yet; it leaves them out.
-NEW_MENUS = {"napari/layers/metadata"}
 
 
 def test_it_is_valid_and_each_command_can_be_imported(manifest):
@@ -52,10 +48,9 @@ def test_its_menus_exist_and_are_short(manifest):
     from napari._app_model.constants._menus import MenuId
 
     menus = manifest.contributions.menus
-    layers = ("measure", "filter", "transform", "register", "metadata")
+    layers = ("measure", "filter", "transform", "register")
     assert set(menus) == {"napari/file/acquire", *(f"napari/layers/{name}" for name in layers)}
-    missing = set(menus) - {str(menu) for menu in MenuId.contributables()}
-    assert missing == (NEW_MENUS if version("napari").startswith("0.7.") else set())
+    assert not set(menus) - {str(menu) for menu in MenuId.contributables()}
     assert max(map(len, menus.values())) <= 4
 
 

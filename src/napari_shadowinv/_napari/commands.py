@@ -171,7 +171,6 @@ refine = _opens("Invert", lambda tool, layer: tool.refine(layer))
 plot_along_line = _opens("Analyse", lambda tool, layer: tool.plot_layer(layer))
 measure_products = _opens("Analyse", lambda tool, layer: tool.measure_layer(layer))
 predict_image = _opens("Simulate", lambda tool, layer: tool.start_from(layer))
-edit_setup = _opens("Invert", lambda tool, layer: tool.edit_setup(layer))
 watch_folder = _opens("Invert", lambda tool, _: tool.choose_folder())
 
 

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from qtpy.QtWidgets import QComboBox
 
-from napari_shadowinv._napari.layer_metadata import role_of, setup_of, setup_origin_of
+from napari_shadowinv._napari.layer_metadata import role_of
 from napari_shadowinv._napari.layers import add_layers, inversion_layers
 from napari_shadowinv._napari.preferences import preference
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._napari.simulate import Simulate
 from napari_shadowinv._napari.widgets.analyse import Analyse
-from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv._system.machine import available_threads, set_default_threads
 
 
@@ -78,34 +77,6 @@ def test_an_image_is_predicted_from_the_selected_potential(window, choose, solve
     choose("predict_image")
     assert "is selected: select the field or the potential of a result" in messages[-1]
     assert forward.field.layer is potential
-
-
-def test_a_setup_is_stored_with_its_image(window, choose, proton_setup, solved, messages):
-    stack = window.add_image(np.ones((3, 20, 30)), name="shots")
-    mask = window.add_labels(np.zeros((20, 30), int))
-    window.layers.selection.active = stack
-    choose("edit_setup")
-    widget = docked(window, Invert)
-    widget.setup.set_kind("proton")
-    widget.setup.scale_button.click()
-    assert "'Kinetic energy (MeV)' is missing" in messages[-1]
-    assert widget.panel.status.text() == messages[-1]
-    widget.setup.form.restore(proton_setup.model_dump())
-    assert widget.area.horizontalScrollBar().maximum() == 0
-    widget.setup.scale_button.click()
-    assert setup_of(stack) == proton_setup
-    assert setup_origin_of(stack) == "typed for 'shots'"
-    np.testing.assert_allclose(stack.scale, (1, 1.5, 1.5))
-    np.testing.assert_allclose(mask.scale, (1.5, 1.5))
-    # The same widget shows another image, whose setup is none, and refuses a result.
-    image = window.add_image(np.ones((20, 30)), name="other")
-    choose("edit_setup")
-    assert docked(window, Invert) is widget
-    assert widget.image.layer is image
-    assert widget.setup.setup() is None
-    (window.layers.selection.active,) = add_some(window, solved, "field")
-    choose("edit_setup")
-    assert "is no image of a shot" in messages[-1]
 
 
 def test_the_dialog_of_napari_shows_and_keeps_the_preferences(preferences, window, qtbot):

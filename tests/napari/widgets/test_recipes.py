@@ -271,7 +271,7 @@ def test_the_window_does_what_the_command_saves(
     assert tool.steps.steps() == (Bin(factor=2), LowPassFilter(width=1.5))
     assert tool.setup.setup().pixel_size == 2e-6
     tool.request()
-    assert setup_origin_of(image) == "loaded from how.toml for 'shot'"
+    assert setup_origin_of(image) == "loaded from how.toml"
     mine = run_job(tool.request())
     np.testing.assert_array_equal(mine.displacement, reloaded.displacement)
     assert mine.provenance.recipe.steps[0] == Crop(y=(4, 44), x=(10, 60))

@@ -143,8 +143,8 @@ def test_a_loaded_setup_goes_with_the_image_until_run(viewer, opened, plain, pro
     tool.request()
     assert setup_of(plain) is None
     assert setup_of(second).energy == 5.0
-    assert setup_origin_of(second) == "loaded from tcc.toml, changed by hand for 'other'"
-    assert tool.setup.note.text() == "Loaded from tcc.toml, changed by hand for 'other'."
+    assert setup_origin_of(second) == "loaded from tcc.toml, changed by hand"
+    assert tool.setup.note.text() == "Loaded from tcc.toml, changed by hand."
     # From then on it is the setup of this image only.
     tool.image.layer = plain
     assert tool.setup.setup() is None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from napari_shadowinv._napari.widgets import _layers as layers
 from napari_shadowinv._napari.widgets import _qt as qt
 from napari_shadowinv._napari.widgets._files import RecipeButton
 from napari_shadowinv._napari.widgets._layers import LAYER
-from napari_shadowinv._napari.widgets._panels import ResultView, ToolPanel, place_together
+from napari_shadowinv._napari.widgets._panels import ResultView, ToolPanel
 from napari_shadowinv._typing import BoolArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.io import read_toml
@@ -49,8 +49,6 @@ _UNSTATED = {
 }
 _CHANGED = ", changed by hand"
 _EARLIER = ", in an earlier session"
-# Errors that a saved state causes which another version wrote in another form.
-_UNREADABLE = AttributeError, LookupError, TypeError, ValueError
 UNIFORM, FILE, SUPPLIED, UNKNOWN = "uniform", "file", "own", "unknown"
 """Kinds of sources; all other kinds are estimates."""
 SHOT_SOURCES = tuple(dict.fromkeys((UNIFORM, LAYER, FILE, SUPPLIED, *preprocessing.ESTIMATES)))
@@ -65,29 +63,25 @@ _SOURCE_TITLES = {
 }
 
 
-@dataclass(frozen=True)
-class _Entry:
-    """Values of a setup's form, and where they come from."""
-
-    values: dict[str, Any]
-    origin: str
-
-
 class SetupPicker(forms.ModelPicker):
     """A setup, stored with its image; the user's setups are offered to the next image.
 
-    With a viewer, a loaded setup goes with whatever image is chosen until `keep` is called, and the
-    image can be shown at its scale.
+    If it `waits`, a loaded setup goes with whatever image is chosen until `keep` is called.
     """
 
-    def __init__(self, name: str, viewer: Any = None) -> None:
-        self._saved_as, self._viewer, self._is_loaded = name, viewer, False
+    def __init__(self, name: str, *, waits: bool = False) -> None:
+        self._saved_as, self._waits, self._is_loaded = name, waits, False
         self._layer: Any = None
         self._name, self._stores = "", True
-        self._last = _NONE  # the kind that the user chose last
-        self._entered: dict[str, _Entry] = {}  # by the user
-        self._origins: dict[str, str] = {}  # of what the forms show
         self._before: Any = None  # kind and values before an edit
+        self._origins: dict[str, str] = {}  # by kind, of what the forms show
+        state = qt.saved_state(name)
+        self._last = state.get("last", _NONE)  # the kind that the user chose last
+        # Values and origins of the setups that the user entered, by kind.
+        self._entered: dict[str, Any] = {
+            kind: (values, origin.removesuffix(_EARLIER) + _EARLIER)
+            for kind, (values, origin) in state.get("own", {}).items()
+        }
         self.geometry_label = forms.WrappingLabel()
         self.warning_label = forms.WrappingLabel(style=forms.PROBLEM_STYLE)
         self.note = forms.WrappingLabel()
@@ -102,18 +96,11 @@ class SetupPicker(forms.ModelPicker):
         self.save_button = qt.push_button(
             "Save…", "Write setup to a TOML file, for use here or on the command line.", self._save
         )
-        self.scale_button = qt.push_button(
-            "Show at scale",
-            "Store the setup with the image, and show the image at its scale, without a run.",
-            self.show_at_scale,
-        )
-        self.scale_button.setVisible(viewer is not None)
-        buttons = (self.load_button, 0), (self.save_button, 0), (self.scale_button, 0)
+        buttons = qt.side_by_side((self.load_button, 0), (self.save_button, 0), (QWidget(), 1))
         below = QWidget()
-        row = qt.side_by_side(*buttons, (QWidget(), 1))
-        qt.column(below, self.geometry_label, self.warning_label, self.note, row)
+        qt.column(below, self.geometry_label, self.warning_label, self.note, buttons)
         self.layout().addWidget(below)
-        self._restore()
+        self._show_default()
 
     def setup(self) -> Setup | None:
         return self.model()  # type: ignore[return-value]
@@ -128,27 +115,12 @@ class SetupPicker(forms.ModelPicker):
     @property
     def origin(self) -> str:
         """Where the setup comes from, such as ``"typed for 'shot'"``; empty without a setup."""
-        return self._origins.get(self.kind, self._typed_origin()) if self.form else ""
+        return self._origins.get(self.kind, self._typed_origin) if self.form else ""
 
     @property
     def summary(self) -> str:
         kind = self.choice.current_choice
         return f"{kind}, {self.origin}" if self.origin else kind
-
-    def _keep(self) -> None:
-        """Save the setups that the user entered; the selection depends on the image."""
-        entries = {kind: asdict(entry) for kind, entry in self._entered.items()}
-        qt.save_state(self._saved_as, {"own": entries, "last": self._last})
-
-    def _restore(self) -> None:
-        """Offer the setups of earlier sessions; select the last only if the user prefers that."""
-        state = qt.saved_state(self._saved_as)
-        with suppress(*_UNREADABLE):
-            for kind, entry in state.get("own", {}).items():
-                origin = str(entry["origin"]).removesuffix(_EARLIER) + _EARLIER
-                self._entered[kind] = _Entry(dict(entry["values"]), origin)
-            self._last = str(state.get("last", _NONE))
-        self._show_default()
 
     def follow(self, layer: Any, name: str = "", *, store: bool = True) -> None:
         """Show the setup of another image, or of files; with `store`, the image stores changes."""
@@ -160,16 +132,16 @@ class SetupPicker(forms.ModelPicker):
         setup = None if layer is None else about.setup_of(layer)
         if self._is_loaded:
             self._show_notes()
-            self.changed.emit()
         elif setup is not None:
-            self.suggest(setup, about.setup_origin_of(layer) or f"{about.CAME_WITH} '{layer.name}'")
+            origin = about.setup_origin_of(layer) or f"{about.CAME_WITH} '{layer.name}'"
+            self._show_setups(setup.model_dump(), origin)
         elif not is_typed_before:
             self._show_default()
-            self.changed.emit()
+        self.changed.emit()
 
     def suggest(self, setup: Setup, origin: str) -> None:
         """Show a setup that the user did not enter; editing it makes it the user's."""
-        self._show_setups(setup.kind, _Entry(setup.model_dump(), origin))
+        self._show_setups(setup.model_dump(), origin)
         self.changed.emit()
 
     def choose_kind(self, kind: str) -> None:
@@ -180,84 +152,68 @@ class SetupPicker(forms.ModelPicker):
 
     def show_setup(self, values: Mapping[str, Any], origin: str = "") -> None:
         """Show a setup from the user: loaded from `origin`, or typed if that is empty."""
-        kind = str(values["kind"])
-        entry = _Entry(dict(values), origin or self._typed_origin())
-        self._last = kind
-        self._is_loaded = bool(origin) and self._viewer is not None
-        self._show_setups(kind, entry)
-        self._enter(entry.origin)
+        self._is_loaded = bool(origin) and self._waits
+        self._show_setups(values, origin or self._typed_origin)
+        self._enter()
+        self._store()
         self.changed.emit()
 
     def keep(self) -> None:
         """Store a loaded setup with the image that is chosen now."""
         if self._is_loaded:
             self._is_loaded = False
-            self._enter(self.origin + self._typed_origin().removeprefix("typed"))
-
-    @qt.notify_errors
-    def show_at_scale(self) -> None:
-        """Store the setup with the image; place all images of its size."""
-        if self._layer is None:
-            raise InputError("there is no image: open one (File → Open), or a sample")
-        setup = self.setup()
-        self.keep()
-        self._store_with_image()
-        if setup is not None:
-            place_together(self._viewer, self._layer, setup, ())
+            self._store()
 
     def _show_default(self) -> None:
         """Show the setup of images without one of their own: none, or the user's last."""
-        is_last = preference("widgets", "last_setup") and self._last in self._entered
-        self._show_setups(self._last if is_last else _NONE)
+        self._show_setups(None)
+        if preference("widgets", "last_setup") and self._last in self._entered:
+            with QSignalBlocker(self):
+                self.set_kind(self._last)
+            self._show_notes()
 
-    def _show_setups(self, kind: str, entry: _Entry | None = None) -> None:
+    def _show_setups(self, values: Mapping[str, Any] | None, origin: str = "") -> None:
         """Show a setup or none; the forms of other kinds get the user's entries."""
-        setups = self._entered | ({} if entry is None else {kind: entry})
-        self._origins = {each: setup.origin for each, setup in setups.items()}
-        values = {each: setup.values for each, setup in setups.items()}
+        setups: dict[str, Any] = dict.fromkeys(self._forms, ({}, "")) | self._entered
+        kind = _NONE if values is None else str(values["kind"])
+        if values is not None:
+            setups[kind] = values, origin
+        self._origins = {each: origin for each, (_, origin) in setups.items() if origin}
         with QSignalBlocker(self):
-            empty: dict[str, dict[str, Any]] = {each: {} for each in self._forms}
-            self.restore(kind, empty | values)
+            self.restore(kind, {each: values for each, (values, _) in setups.items()})
         self._show_notes()
 
     def _on_entry(self) -> None:
-        if self._before is not None and not self.signalsBlocked():
-            self._on_edit()
-            self.changed.emit()
-
-    def _on_edit(self) -> None:
         """Store what the user has chosen or typed."""
-        kind, (earlier_kind, earlier_values) = self.kind, self._before
-        self._last = kind
-        if kind != earlier_kind:
+        if self._before is None or self.signalsBlocked():
+            return
+        kind, values = self._before
+        if self.kind != kind:
             self._is_loaded = False
         # Leaving a field as it was changes no values.
-        elif self.form is not None and self.form.state() != earlier_values:
-            origin = self._origins.get(kind, "typed")
-            is_typed = origin.startswith("typed")
-            self._enter(
-                self._typed_origin() if is_typed else origin.removesuffix(_CHANGED) + _CHANGED
-            )
-            return
-        self._show_notes()
-        self._keep()
-        self._store_with_image()
+        elif self.form is not None and self.form.state() != values:
+            is_typed = self.origin.startswith("typed")
+            changed = self.origin.removesuffix(_CHANGED) + _CHANGED
+            self._origins[kind] = self._typed_origin if is_typed else changed
+            self._enter()
+        self._store()
+        self.changed.emit()
 
-    def _enter(self, origin: str) -> None:
-        """Offer the setup shown, which the user entered, to other images, too."""
-        assert self.form is not None
-        self._origins[self.kind] = origin
-        if not origin.startswith(about.CAME_WITH):
-            self._entered[self.kind] = _Entry(self.form.state(), origin)
-        self._show_notes()
-        self._keep()
-        self._store_with_image()
+    def _enter(self) -> None:
+        """Offer the setup shown to other images, too, unless it came with an image."""
+        if self.form is not None and not self.origin.startswith(about.CAME_WITH):
+            self._entered[self.kind] = self.form.state(), self.origin
 
-    def _store_with_image(self) -> None:
+    def _store(self) -> None:
+        """Keep the user's setups for later sessions, and the setup shown with its image."""
+        self._last = self.kind
+        qt.save_state(self._saved_as, {"own": self._entered, "last": self._last})
+        self._show_notes()
         if self._layer is not None and self._stores and not self._is_loaded:
             with suppress(InputError):  # incomplete: the image keeps its setup
                 about.store_setup(self._layer, self.setup(), self.origin)
 
+    @property
     def _typed_origin(self) -> str:
         name = self._name if self._layer is None else self._layer.name
         return f"typed for '{name}'" if name else "typed"
@@ -278,11 +234,6 @@ class SetupPicker(forms.ModelPicker):
         self.geometry_label.show_text("" if setup is None else geometry_text(setup, shape))
         self.warning_label.show_text("\n".join(caution.text for caution in cautions))
 
-    def _file_geometry(self) -> dict[str, Any]:
-        """Return the part of a setup in the image's file."""
-        metadata = {} if self._layer is None else about.metadata_of(self._layer).get("file")
-        return dict((metadata or {}).get("geometry", {}))
-
     @qt.notify_errors
     def _save(self) -> None:
         setup = self.setup()
@@ -298,9 +249,11 @@ class SetupPicker(forms.ModelPicker):
             self.load(read_toml(path), path)
 
     def load(self, entries: dict[str, Any], path: str) -> None:
-        values = complete_setup(entries, self._file_geometry(), path).model_dump()
-        owner = "" if self._viewer is not None else self._typed_origin().removeprefix("typed")
-        self.show_setup(values, f"loaded from {Path(path).name}{owner}")
+        """Show a setup of a file, which the sizes in the image's file complete."""
+        file = None if self._layer is None else about.metadata_of(self._layer).get("file")
+        geometry = dict((file or {}).get("geometry", {}))
+        setup = complete_setup(entries, geometry, path)
+        self.show_setup(setup.model_dump(), f"loaded from {Path(path).name}")
 
 
 class SourcePicker(layers.LayerPicker):

@@ -84,7 +84,7 @@ class Invert(ImagePanel):
             "The beam without the object: ideally a measured reference image, otherwise uniform "
             "or estimated from the shot.",
             InversionOptions,
-            SetupPicker("invert", self.viewer),
+            SetupPicker("invert", waits=True),
         )
         self.source_masks = layers.MaskPicker(
             self.viewer,
@@ -141,19 +141,6 @@ class Invert(ImagePanel):
         """Take the shots from a watched folder, and ask which."""
         self.image.set_kind(FOLDER)
         self.image.choose_path()
-
-    @qt.notify_errors
-    def edit_setup(self, layer: Any) -> None:
-        """Show the setup of a layer, or raise an `InputError` if it can have none."""
-        if layer is None:
-            raise InputError("no layer is selected: select an image in the layer list")
-        if not any(layer is offered for offered in self.image.offered):
-            raise InputError(
-                f"layer '{layer.name}' is no image of a shot: select a shot, or a stack of shots "
-                "with a common setup"
-            )
-        self.image.layer = layer
-        self.reveal(self.setup)
 
     def all_steps(self) -> tuple[Step, ...]:
         """Return the preprocessing steps, the crop first, or raise an `InputError`."""
