@@ -204,7 +204,7 @@ class Simulate(panels.ToolPanel):
 
     def show_result(self, finished: Finished, job: Job) -> None:
         content = finished.content
-        self.results = self._last.layers_for_next(job.subject)
+        self.results = self.results_for(job.subject)
         self.results.show(finished.layer_data)
         if isinstance(content, Prediction):
             self.viewer.reset_view()

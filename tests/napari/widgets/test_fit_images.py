@@ -158,7 +158,7 @@ def test_a_good_verdict_is_shown_and_a_bad_one_is_told(viewer, tool, show, fitte
     assert message.endswith(f"; {explanation}")
     # The layers of the same images' earlier fit are replaced.
     assert len(viewer.layers) == count
-    tool._last.keep_earlier.setChecked(True)
+    tool.keep_earlier.setChecked(True)
     show(tool, fitted)
     assert len(viewer.layers) > count
     tool.images.item(0, 0).setCheckState(Qt.CheckState.Unchecked)

@@ -18,7 +18,6 @@ import numpy as np
 from napari.utils.notifications import show_info, show_warning
 from qtpy import QtWidgets
 from qtpy.QtCore import QObject, Signal
-from qtpy.QtWidgets import QCheckBox
 
 from napari_shadowinv._napari import form as forms
 from napari_shadowinv._napari import layer_metadata as about
@@ -134,13 +133,25 @@ class ToolPanel(qt.Docked):
         self._ready = False
         self.previewing = False  # the running job is a preview
         self.results = ResultLayers(viewer, self)
-        self._last = LastResults(viewer, self)
-        self.keep_earlier = self._last.keep_earlier
+        self._last: dict[Any, ResultLayers] = {}  # of each shot, by its layer or name
+        tip = (
+            "<qt>Keep the layers of earlier runs. Otherwise each new result replaces the previous "
+            "result of the same shot.</qt>"
+        )
+        self.keep_earlier = QtWidgets.QCheckBox("Keep earlier results", toolTip=tip)
         self.area, self.column = qt.scrolling_column(self)
         self._revealed: QtWidgets.QWidget | None = None
         self._revealing = qt.timer(self, _SETTLE_MS, self._reveal, once=True)
         panel.button.clicked.connect(lambda: self._run_or_cancel())
         panel.ended.connect(self._on_end)
+
+    def results_for(self, shot: Any) -> ResultLayers:
+        """Return the layers for the next result of a shot, which replaces its last one."""
+        results, last = ResultLayers(self.viewer, self), self._last.get(shot)
+        if last is not None and not self.keep_earlier.isChecked():
+            results.take_over(last)
+        self._last[shot] = results
+        return results
 
     def reveal(self, widget: QtWidgets.QWidget) -> None:
         """Scroll to a widget once the column has been laid out."""
@@ -211,12 +222,11 @@ class ResultView(QtWidgets.QWidget):
     def __init__(
         self,
         tool: ToolPanel,
-        last: LastResults,
         content: type | tuple[type, ...],
         save_tip: str,
     ) -> None:
         super().__init__()
-        self._tool, self._last, self._content = tool, last, content
+        self._tool, self._content = tool, content
         self._result: Result[Any] | None = None
         self._recipe: Recipe | None = None  # that was run for the result, if it is the form's
         self.changes = forms.WrappingLabel()
@@ -265,7 +275,7 @@ class ResultView(QtWidgets.QWidget):
         fit, tool = finished.content, self._tool
         moved = place_inputs(tool.viewer, job)
         self.show_report(finished.result, job, fit.facts_with_names(job.names))
-        results = self._last.layers_for_next((job.image, job.name))
+        results = tool.results_for((job.image, job.name))
         results.show(main_layers(finished.layer_data, also=results.layer_keys), fit=moved)
         return results
 
@@ -330,16 +340,18 @@ def result_frame(image: Any, recipe: Recipe) -> about.Frame:
 
 def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any]) -> bool:
     """Place an image and the layers on it with the setup's pixels; return whether it moved."""
-    # napari warns about each layer while pixels and lengths are mixed.
-    old = about.frame_of(image)
-    same_size = [
+    old, shape = about.frame_of(image), tuple(image.data.shape[-2:])
+
+    def is_of_size(layer: Any) -> bool:
+        return kind_of(layer) in ("image", "labels") and tuple(layer.data.shape[-2:]) == shape
+
+    on_image = [
         layer
         for layer in viewer.layers
-        if kind_of(layer) in ("image", "labels")
-        and tuple(layer.data.shape[-2:]) == tuple(image.data.shape[-2:])
-        and about.frame_of(layer) == old
+        if about.frame_of(layer).units == old.units
+        and layer is not image
+        and (layer in companions or is_of_size(layer))
     ]
-    on_image = [layer for layer in companions if about.frame_of(layer).units == old.units]
     upright = about.frame_for(image.data.shape, setup)
     image.scale = (*image.scale[:-2], *upright.scale)
     image.units = (*image.units[:-2], *upright.units)
@@ -348,9 +360,7 @@ def place_together(viewer: Any, image: Any, setup: Any, companions: Sequence[Any
     if new == old:
         return False
     ratio = np.divide(new.scale, old.scale)
-    for layer in dict.fromkeys((*on_image, *same_size)):
-        if layer is image:
-            continue
+    for layer in on_image:
         frame = about.frame_of(layer)
         shift = ratio * np.subtract(frame.translate, old.translate)
         layer.translate = (*layer.translate[:-2], *(new.translate + shift))
@@ -462,37 +472,6 @@ class ResultLayers(QObject):
             if (active := main if select else before) is not None:
                 self._viewer.layers.selection.active = active
             yield
-
-
-class LastResults:
-    """The last result of each shot, which the next one replaces unless earlier ones are kept."""
-
-    def __init__(self, viewer: Any, parent: QObject) -> None:
-        self._viewer, self._parent = viewer, parent
-        self._last: dict[Any, ResultLayers] = {}  # by image layer or name
-        tip = (
-            "<qt>Keep the layers of earlier runs. Otherwise each new result replaces the previous "
-            "result of the same shot.</qt>"
-        )
-        self.keep_earlier = QCheckBox("Keep earlier results", toolTip=tip)
-
-    def layers_of(self, shot: Any) -> list[Any]:
-        """Return the layers of a shot's last result that are still in the viewer."""
-        return self._last[shot].layers if shot in self._last else []
-
-    def shot_of(self, layer: Any) -> Any | None:
-        """Return the shot to whose last result a layer belongs, or None."""
-        shots = (shot for shot, last in self._last.items() if layer in last.layers)
-        return next((shot for shot in shots if shot in self._viewer.layers), None)
-
-    def layers_for_next(self, shot: Any) -> ResultLayers:
-        """Return the layers for the next result of a shot, which is an image layer or a name."""
-        results = ResultLayers(self._viewer, self._parent)
-        last = self._last.pop(shot, None)
-        if last is not None and not self.keep_earlier.isChecked():
-            results.take_over(last)
-        self._last[shot] = results
-        return results
 
 
 def _update(layer: Any, data: Any, keywords: dict[str, Any]) -> None:

@@ -324,15 +324,13 @@ class StackView(QWidget):
         self._viewer, self._report = viewer, report
         self.job: StackJob | None = None  # whose layers are shown
         self.results = ResultLayers(viewer, self)
-        self._applied: dict[str, tuple[float, float]] = {}  # by role; other contrast is the user's
-        self._failed, self._newest = 0, 0
-        self._resets_view, self._moves = False, False
+        self._applied: dict[str, Any] = {}  # limits by role; other contrast is the user's
+        self._newest: int | None = None  # shot that was moved to
         self._shown: LayerData = []  # all layers of the store as it was
         self._refresh_timer = qt.timer(self, _REFRESH_INTERVAL_MS, self._refresh, once=True)
-        self._report_timer = qt.timer(self, _REFRESH_INTERVAL_MS, self.show_report, once=True)
         self.failures_title, self.failures = QLabel("Failed shots"), panels.ReportView()
         qt.column(self, self.failures_title, self.failures)
-        qt.while_alive(self, viewer.dims, "current_step", self._on_step)
+        qt.while_alive(self, viewer.dims, "current_step", self._schedule)
         self.empty()
 
     @property
@@ -345,23 +343,26 @@ class StackView(QWidget):
 
     def empty(self) -> None:
         """Forget the failures of the last run; its layers stay."""
-        self.show_failures([])
+        self._show_failures([])
 
     def show_run(self, job: StackJob) -> None:
         """Show the failures and layers of a run."""
-        if len(job.status.failures) != self._failed:
-            self.show_failures(list(job.status.failures))
+        self._show_failures(list(job.status.failures))
         if job.layer_data and job is not self.job:
             self._begin(job)
-        if job.layer_data is not self._shown and not self._refresh_timer.isActive():
+        if job.layer_data is not self._shown:
+            self._schedule()
+
+    def _schedule(self, _: Any = None) -> None:
+        if not self._refresh_timer.isActive():
             self._refresh_timer.start()
 
     def _begin(self, job: StackJob) -> None:
         is_resumed = self.job is not None and self.job.out == job.out and bool(self.results.layers)
         if not is_resumed:
-            self.results, self._applied, self._newest = ResultLayers(self._viewer, self), {}, 0
+            self.results, self._applied, self._newest = ResultLayers(self._viewer, self), {}, None
             self.results.complete.connect(self._on_layers)
-        self.job, self._resets_view = job, not is_resumed and job.image is None
+        self.job = job
         if job.image is not None and job.recipe.setup is not None:
             place_together(self._viewer, job.image, job.recipe.setup, job.companions)
         self._show(main_layers(job.layer_data, also=self.results.layer_keys), select=not is_resumed)
@@ -369,25 +370,23 @@ class StackView(QWidget):
     def _refresh(self) -> None:
         """Show the shots that have ended since; layers that the user deleted stay so."""
         if self.results.busy:
-            self._refresh_timer.start()
-        elif self.job is not None and self.job.layer_data is not self._shown:
+            self._schedule()
+            return
+        if self.job is not None and self.job.layer_data is not self._shown:
             keys = self.results.layer_keys
             self._show([each for each in self.job.layer_data if layer_key(each[1]) in keys])
+        self.show_report()
 
     def _show(self, layer_data: LayerData, *, select: bool = False) -> None:
         assert self.job is not None
-        self._shown, shot = self.job.layer_data, self.shot_in_view
-        # The newest shot is followed only if it was in view.
-        self._moves = not self.images or (shot is not None and shot >= self._newest)
-        current: dict[str, Any] = {
-            str(role_of(layer)): tuple(layer.contrast_limits) for layer in self.images
-        }
+        self._shown = self.job.layer_data
+        current = {str(role_of(layer)): layer.contrast_limits for layer in self.images}
         for _, keywords, kind in self._shown:
             if kind != "image":
                 continue
             role, limits = str(role_of(keywords)), keywords["contrast_limits"]
             applied: Any = self._applied.get(role, limits)
-            change = np.subtract(current.get(role) or applied, applied)
+            change = np.subtract(current.get(role, applied), applied)
             if np.abs(change).max() > _SAME_LIMITS * np.ptp(applied):
                 keywords["contrast_limits"] = current[role]
             else:
@@ -395,15 +394,17 @@ class StackView(QWidget):
         self.results.show(layer_data, select=select)
 
     def _on_layers(self) -> None:
+        job, shot, is_first = self.job, self.shot_in_view, self._newest is None
+        if job is None:
+            return
         # The setup places the results of files, perhaps far outside the view.
-        if self._resets_view:
-            self._resets_view = False
+        if is_first and job.image is None:
             self._viewer.reset_view()
-        if self.job is not None and self.job.is_watch:
-            # A failed shot would leave a black canvas.
-            self._newest = max(self._newest, min(self.job.newest, self._last))
-            if self._moves:
-                self._viewer.dims.set_current_step(self._viewer.dims.ndim - 3, self._newest)
+        # The newest shot is followed if it was in view; a failed one would leave a black canvas.
+        is_followed = is_first or (shot is not None and shot >= (self._newest or 0))
+        self._newest = max(self._newest or 0, min(job.newest, self._last))
+        if job.is_watch and is_followed:
+            self._viewer.dims.set_current_step(self._viewer.dims.ndim - 3, self._newest)
         follow_arrows(self._viewer)
 
     @property
@@ -418,9 +419,6 @@ class StackView(QWidget):
         shot = int(dims.current_step[dims.ndim - 3]) if dims.ndim > 2 else -1
         return shot if 0 <= shot <= self._last else None
 
-    def _on_step(self, _: Any) -> None:
-        self._report_timer.start()
-
     def show_report(self) -> None:
         """Show the origins of the results, and the quantities of the shot in view."""
         job, shot = self.job, self.shot_in_view
@@ -431,12 +429,13 @@ class StackView(QWidget):
             rows += [] if shot is None else shot_rows(job.out, shot)
         self._report.show_rows(rows)
 
-    def show_failures(self, failures: list[tuple[str, str]]) -> None:
+    def _show_failures(self, failures: list[tuple[str, str]]) -> None:
         """Show the first failures, and the number of further ones."""
-        self._failed = len(failures)
         hidden = failures[_MAX_FAILURES:]
         more = [("…", f"and {len(hidden)} more")] if hidden else []
-        self.failures.show_rows(failures[:_MAX_FAILURES] + more)
+        rows = failures[:_MAX_FAILURES] + more
+        if rows != self.failures.rows:
+            self.failures.show_rows(rows)
         self.failures_title.setVisible(bool(failures))
 
     def end(self, outcome: Outcome) -> str:

@@ -308,7 +308,7 @@ class FilmPack(panels.ToolPanel):
     def show_result(self, finished: Finished, job: Job) -> None:
         for layer in corner_layers(self.viewer):
             self.viewer.layers.remove(layer)
-        self.results = self._last.layers_for_next(job.subject)
+        self.results = self.results_for(job.subject)
         self.results.complete.connect(self._follow_result)
         self.results.show(finished.layer_data, fit=not self.viewer.layers)
 

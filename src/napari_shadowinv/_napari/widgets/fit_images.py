@@ -85,7 +85,7 @@ class FitImages(inputs.ImagePanel):
             "Save the selected or last fit: complete with its layers (.shadowinv), or its field "
             "for other programs (.h5)."
         )
-        self.view = ResultView(self, self._last, Fit, tip)
+        self.view = ResultView(self, Fit, tip)
         self.add(self.images, self.fields, self.source, self.masks, self.choices)
         self.add(self.setup_section, *self.settings)
         self.add(side_by_side((self.keep_earlier, 1), (self.recipes, 0)), self.cost, self.panel)

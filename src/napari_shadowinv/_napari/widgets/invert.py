@@ -106,7 +106,7 @@ class Invert(ImagePanel):
         refine = self.refine_form, self.refine_button
         self.refine_section = forms.section("Refine the result", *refine)
         self._refined = ResultLayers(self.viewer, self)
-        self.view = ResultView(self, self._last, (Inversion, Fit), _SAVE_TIP)
+        self.view = ResultView(self, (Inversion, Fit), _SAVE_TIP)
         self.verdict, self.report = self.view.verdict, self.view.report
         self.stack_view = StackView(self.viewer, self.report)
         self.show_source = qt.push_button(
@@ -220,19 +220,20 @@ class Invert(ImagePanel):
             raise InputError(
                 "Invert is running: wait until it finishes, or press Cancel, then refine"
             )
-        fields = field_of(self._last.layers_of(self.image.layer))
         chosen: Any = layer
         if layer is None:
+            last = self._last.get(self.image.layer)
+            fields = [] if last is None else field_of(last.layers)
             chosen = next(iter(fields), self.viewer.layers.selection.active)
         if chosen is None or about.result_of(chosen) is None:
             raise InputError(
                 "there is no inversion of this image to refine: press Run first, then Refine"
             )
         self.refine_section.expand()
-        image = self._last.shot_of(chosen)
-        name = jobs.name_of_result(chosen) if image is None else str(image.name)
+        shots = [shot for shot, last in self._last.items() if chosen in last.layers]
+        image = next((shot for shot in shots if shot in self.viewer.layers), chosen)
+        name = jobs.name_of_result(image)
         choices: Any = self.refine_form.model()
-        image = chosen if image is None else image
         job = jobs.refinement(chosen, image, name, choices.psf or 0.0)
         self.start(job, partial(self._show_refinement, job=job))
 
@@ -292,7 +293,7 @@ class Invert(ImagePanel):
         # They refine an earlier result and would cover the new one.
         self._refined.hide()
         self.previewed.hide()
-        self.results = self._last.layers_for_next(job.image)
+        self.results = self.results_for(job.image)
         layer_data = main_layers(finished.layer_data, also=self.results.layer_keys)
         self.results.show(layer_data, fit=moved)
 
@@ -301,7 +302,7 @@ class Invert(ImagePanel):
         self.results = self._refined = self.view.show_fit(job, finished)
 
     def _show_estimate(self, finished: jobs.Finished, image: Any) -> None:
-        self._last.layers_for_next((image, about.SOURCE)).show(finished.layer_data)
+        self.results_for((image, about.SOURCE)).show(finished.layer_data)
 
     def on_change(self) -> None:
         """Update the preview, the estimated cost, and what is said of the result."""
