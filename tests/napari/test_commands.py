@@ -106,16 +106,10 @@ def placed_shot(viewer, shot, setup):
     return layer
 
 
-@pytest.mark.parametrize("selected", ["image", "rectangle"])
-def test_a_crop_keeps_place_setup_source_and_mask(viewer, shot, proton_setup, selected):
+def test_a_crop_keeps_place_setup_source_and_mask(viewer, shot, proton_setup):
     layer = placed_shot(viewer, shot, proton_setup)
-    rectangle = outline(viewer, layer, 5, 14)
-    if selected == "rectangle":
-        rectangle.name = "crop – shot"  # drawn for it, whatever lies above
-        viewer.add_image(np.ones((50, 50)), name="other")
-    ((data, keywords, _),) = commands.crop(
-        {"image": layer, "rectangle": rectangle}[selected], viewer
-    )
+    outline(viewer, layer, 5, 14)
+    ((data, keywords, _),) = commands.crop(layer, viewer)
     np.testing.assert_array_equal(data, shot[5:15, 5:15])
     cropped = viewer.add_image(data, **keywords)
     assert cropped.name == "shot cropped to 10 × 10 px"

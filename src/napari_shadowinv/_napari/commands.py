@@ -15,7 +15,7 @@ from napari_shadowinv import preprocessing
 from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari import layers as results
 from napari_shadowinv._napari import viewer_sync
-from napari_shadowinv._napari.layer_metadata import frame_of, layer_name, main_layers, source_on
+from napari_shadowinv._napari.layer_metadata import frame_of, main_layers, source_on
 from napari_shadowinv._napari.shots import shot_layer, shot_of_layer
 from napari_shadowinv._napari.viewer_sync import without_proxy
 from napari_shadowinv._system.progress import ShouldStop
@@ -101,30 +101,19 @@ def high_pass(selection: _Selection, _: ShouldStop) -> results.LayerData:
 def crop(
     layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
 ) -> list[napari.types.LayerDataTuple]:
-    """Cut the selected image to the rectangle of the topmost shapes, or begin to draw one."""
-    from napari.utils.notifications import show_info
+    """Cut the selected image to the selected or last rectangle of the topmost shapes."""
+    from napari_shadowinv._napari.widgets._layers import crop_of, image_of
 
-    from napari_shadowinv._napari.jobs import name_of_result
-    from napari_shadowinv._napari.widgets._layers import crop_of, image_of, new_shapes
-
-    layer, viewer = without_proxy(layer), without_proxy(viewer)
+    selection = _select_image(layer, viewer, about.may_be_source)
+    image_of(selection.layer)
     visible = [] if viewer is None else [each for each in viewer.layers if each.visible]
     shapes = [each for each in visible if _has_outline(each)]
-    if layer in shapes:
-        shapes, images = [layer], [each for each in visible if _is_image(each)]
-        drawn_for = [
-            each for each in images if layer.name == layer_name("crop", name_of_result(each))
-        ]
-        layer = next(reversed(drawn_for or images), None)
-    selection = _select_image(layer, viewer, about.may_be_source)
-    image_of(layer)
-    step = crop_of(shapes[-1], layer) if shapes else None
+    step = crop_of(shapes[-1], selection.layer) if shapes else None
     if step is None:
-        if viewer is None or not viewer_sync.in_event_loop():
-            raise InputError("there is no rectangle to crop to: draw one in a shapes layer")
-        new_shapes(viewer, layer, "crop", "add_rectangle")
-        show_info(f"Draw a rectangle on '{selection.name}', then choose this again")
-        return []
+        raise InputError(
+            f"there is no rectangle to crop to: draw one in a shapes layer, then select "
+            f"'{selection.name}' again"
+        )
     height, width = step.shape_after(selection.shot.shape)
     return [_moved(selection, step, f"cropped to {width} × {height} px")]
 

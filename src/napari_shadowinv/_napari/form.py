@@ -519,37 +519,18 @@ class ModelPicker(QWidget):
 class StepForm(QWidget):
     """A step: a section with its name and form, and buttons to move or remove it."""
 
-    changed = Signal()
-
     def __init__(self, kind: type[Step], move: Callable[..., None]) -> None:
         super().__init__()
         self.kind, self.form = kind, ModelForm(kind)
-        self.folded = titled_section(self.form)
+        self.folded = section(kind.title, self.form)
         self.up = qt.small_button("↑", "Move this step up.", lambda: move(self, -1))
         self.down = qt.small_button("↓", "Move this step down.", lambda: move(self, 1))
         self.remove = qt.small_button("✕", "Remove this step.", lambda: move(self, None))
-        for button in (self.up, self.down, self.remove):
-            button.setAutoRaise(True)
-        title = self.folded.toggleButton()
-        line = qt.side_by_side((title, 1), (self.up, 0), (self.down, 0), (self.remove, 0))
-        line.layout().setSpacing(0)
+        buttons = [(button, 0) for button in (self.up, self.down, self.remove)]
+        line = qt.side_by_side((self.folded.toggleButton(), 1), *buttons)
         self.folded.layout().insertWidget(0, line)
-        qt.column(self, self.folded)
-        self.form.changed.connect(self._show_title)
-        self.form.changed.connect(self.changed)
-        self.folded.toggled.connect(self._show_title)
         self.folded.expand(animate=False)
-        self._show_title()
-
-    def _show_title(self) -> None:
-        """Show the step's name; with a folded form also its parameters."""
-        title = self.kind.title
-        if not self.folded.isExpanded():
-            try:
-                title = self.form.model().summary  # type: ignore[attr-defined]
-            except InputError:
-                self.folded.expand(animate=False)  # it shows the problem
-        self.folded.setText(title)
+        qt.column(self, self.folded)
 
 
 class StepsSection(QWidget):
@@ -580,7 +561,7 @@ class StepsSection(QWidget):
         step_form = StepForm(STEPS[name], self._move)
         if values is not None:
             step_form.form.restore(values)
-        step_form.changed.connect(self._on_change)
+        step_form.form.changed.connect(self._on_change)
         self.forms.append(step_form)
         self._list.layout().addWidget(step_form)
         self._on_change()

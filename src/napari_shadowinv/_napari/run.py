@@ -49,7 +49,8 @@ _STAGES = {
     "register": "Aligning the films",
     "unfold": "Unfolding the spectra",
 }
-_MAILBOX_POLL_MS, _CROSS_POLL_MS, _PROGRESS_POLL_MS = 10, 100, 500
+_POLL_MS, _CROSS_POLL_MS = 10, 100
+_SHOW_INTERVAL_S = 0.5  # of the progress
 # Handling an event of the window may need the interpreter a dozen times: threads hand it over
 # after this time instead of 5 ms.
 _SWITCH_INTERVAL_S = 1e-3
@@ -73,6 +74,7 @@ class _Mailbox:
     detach_at: float = math.inf
     stop: threading.Event = field(default_factory=threading.Event)
     progress: Progress | None = None
+    told: Progress | None = None  # the last that the window has heard of
     outcome: Outcome | None = None
 
     def fill(self, work: Work) -> None:
@@ -122,10 +124,8 @@ class Run(QtWidgets.QWidget):
         self.status = forms.WrappingLabel()
         qt.column(self, self.button, self.bar, self.status)
         self._quiet = False
-        self._progress: Progress | None = None
-        self._start_time = 0.0
-        self._mailbox_timer = qt.timer(self, _MAILBOX_POLL_MS, self._poll)
-        self._progress_timer = qt.timer(self, _PROGRESS_POLL_MS, self._show_progress)
+        self._start_time = self._shown_at = 0.0
+        self._timer = qt.timer(self, _POLL_MS, self._poll)
         # Closing a window stops its work; this object no longer exists then.
         qt.when_destroyed(self, partial(_stop, self._to_stop))
 
@@ -160,7 +160,7 @@ class Run(QtWidgets.QWidget):
         if not quiet:
             self._show_start()  # napari handles events meanwhile
         threading.Thread(target=box.fill, args=(work,), name="shadowinv", daemon=False).start()
-        self._mailbox_timer.start()
+        self._timer.start()
         self.started.emit()
 
     def cancel(self) -> None:
@@ -182,16 +182,17 @@ class Run(QtWidgets.QWidget):
         if box is None:
             return
         outcome, progress = box.outcome, box.progress
-        if progress is not None:
-            box.progress = None
-            if not box.stop.is_set():
-                self._progress = progress
+        if progress is not None and not box.stop.is_set():
+            if progress is not box.told:
+                box.told = progress
                 self.progressed.emit(progress)
+            if not self._quiet and time.monotonic() > self._shown_at + _SHOW_INTERVAL_S:
+                self._show_progress(progress)
         if outcome is None:
             if time.monotonic() < box.detach_at:
                 return
             outcome = Outcome(cancelled=True, tag=box.tag)
-        self._mailbox_timer.stop()
+        self._timer.stop()
         self._box = None
         self._to_stop.clear()
         pending, self._pending = self._pending, None
@@ -202,27 +203,23 @@ class Run(QtWidgets.QWidget):
             self.start(work, tag, quiet=quiet)
 
     def _show_start(self) -> None:
-        self._progress, self._start_time = None, time.monotonic()
+        self._start_time = self._shown_at = time.monotonic()
         self.button.setText("Cancel")
         self.bar.setRange(0, 1)
         self.bar.setValue(0)
         self.bar.setVisible(True)
         self.say("Starting…")
-        self._progress_timer.start()
 
-    def _show_progress(self) -> None:
-        progress = self._progress
-        if progress is None or self.cancelling:
-            return
+    def _show_progress(self, progress: Progress) -> None:
+        self._shown_at = time.monotonic()
         stage = _STAGES.get(progress.stage, progress.stage)
         self.bar.setRange(0, progress.total or 1)
         self.bar.setValue(progress.step if progress.total else 0)
         text = f"{stage}: {progress.text}" if progress.text else f"{stage}…"
-        seconds = time.monotonic() - self._start_time
+        seconds = self._shown_at - self._start_time
         self.say(f"{text} ({seconds:.0f} s)" if seconds >= _MIN_SHOWN_TIME_S else text)
 
     def _show_end(self, outcome: Outcome) -> None:
-        self._progress_timer.stop()
         self.bar.setVisible(False)
         self.button.setText(self._text)
         self.button.setEnabled(True)

@@ -194,16 +194,14 @@ def cancelled(wait, rest, qtbot, messages):
 
 @pytest.fixture
 def choose(monkeypatch):
-    """Answer the dialogs for a file with a path and the first filter, and whether to replace it."""
-    from qtpy.QtWidgets import QFileDialog, QMessageBox
+    """Answer the dialogs for a file with a path and the first filter."""
+    from qtpy.QtWidgets import QFileDialog
 
-    def answer(path, replace=False):
+    def answer(path):
         def ask(parent, title, proposal="", filters="", **_):
             return str(path), filters.split(";;")[0]
 
-        button = QMessageBox.StandardButton.Yes if replace else QMessageBox.StandardButton.No
         monkeypatch.setattr(QFileDialog, "getSaveFileName", ask)
         monkeypatch.setattr(QFileDialog, "getOpenFileName", ask)
-        monkeypatch.setattr(QMessageBox, "question", lambda *_: button)
 
     return answer

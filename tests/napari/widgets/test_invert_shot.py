@@ -311,7 +311,7 @@ def test_the_beam_under_a_painted_mask_is_predicted_with_its_error(viewer, opene
     assert result.content.errors.beam_variation < 0.01
 
 
-def test_save_asks_before_it_replaces_a_file_and_leaves_none_that_fails(
+def test_save_replaces_what_the_dialog_asked_about_and_leaves_no_file_that_fails(
     tool, run, refused, tmp_path, choose
 ):
     save, path = tool.view.save_result.click, tmp_path / "a.shadowinv"
@@ -320,9 +320,9 @@ def test_save_asks_before_it_replaces_a_file_and_leaves_none_that_fails(
     assert not list(tmp_path.glob("a*"))
     run(tool)
     path.write_text("precious")
-    save()
+    refused(tool, "a.shadowinv exists", save)
     assert path.read_text() == "precious"
-    choose(tmp_path / "a", replace=True)
+    choose(path)
     save()
     assert read(path)["displacement"].shape == (2, 48, 60)
     assert str(path) in tool.panel.status.text()

@@ -108,6 +108,7 @@ class RecipeButton(QPushButton):
         if path:
             self.load(Path(path))
 
+    @notify_errors
     def _ask_and_save(self) -> None:
         if path := ask_file(self, "Save recipe", "recipe.toml", TOML):
             self.save(path)

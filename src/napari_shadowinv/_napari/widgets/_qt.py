@@ -17,7 +17,6 @@ from qtpy.QtWidgets import (
     QFrame,
     QHBoxLayout,
     QMainWindow,
-    QMessageBox,
     QPushButton,
     QScrollArea,
     QSizePolicy,
@@ -33,7 +32,7 @@ from napari_shadowinv._napari.viewer_sync import (
     error_text,
     show_user_error,
 )
-from napari_shadowinv.io import replacing
+from napari_shadowinv.io import check_output, replacing
 from napari_shadowinv.io.formats import RESULT, TABLE
 
 Method = TypeVar("Method", bound=Callable[..., Any])
@@ -107,28 +106,22 @@ def ask_file(parent: QWidget, title: str, proposal: str, filters: str) -> Path |
     """Ask for a file to write, which may be replaced if it exists; None if the user cancels.
 
     It has an ending of Qt's `filters`, such as ``"TIFF (*.tif *.tiff);;PNG (*.png)"``; a name
-    without one gets the first of the chosen filter.
+    without one gets the first of the chosen filter, and must be new.
     """
 
-    def complete(name: str, chosen: str = filters) -> Path:
+    def complete(name: str, chosen: str) -> Path:
         path = Path(name).expanduser()
-        if path.suffix.lower() in re.findall(r"\*(\.\w+)", filters):
-            return path
-        return path.with_name(path.name + re.findall(r"\*(\.\w+)", chosen)[0])
+        has_ending = path.suffix.lower() in re.findall(r"\*(\.\w+)", filters)
+        ending = "" if has_ending else re.findall(r"\*(\.\w+)", chosen)[0]
+        return path.with_name(path.name + ending)
 
-    # The dialog would ask about the name as entered, perhaps without its ending.
-    entered, chosen = QFileDialog.getSaveFileName(
-        parent,
-        title,
-        str(complete(proposal)),
-        filters,
-        options=QFileDialog.Option.DontConfirmOverwrite,
-    )
-    path = complete(entered, chosen or filters) if entered else None
-    if path is None or not path.exists():
-        return path
-    answer = QMessageBox.question(parent, title, f"{path.name} already exists. Replace it?")
-    return path if answer == QMessageBox.StandardButton.Yes else None
+    proposed = str(complete(proposal, filters))
+    entered, chosen = QFileDialog.getSaveFileName(parent, title, proposed, filters)
+    if not entered:
+        return None
+    path = complete(entered, chosen or filters)
+    check_output(path, overwrite=path.name == Path(entered).name)  # Qt asked about this name only
+    return path
 
 
 def write_text(path: Path, text: str) -> None:
