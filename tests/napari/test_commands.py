@@ -64,7 +64,7 @@ def test_the_shot_that_is_shown_is_taken_of_a_stack(viewer, shot):
     assert keywords["name"] == "shot 1 high-pass σ=4.8 px"
 
 
-def test_filters_take_hot_pixels_and_slopes(viewer, noisy):
+def test_filters_and_estimates(viewer, noisy, shot, proton_setup):
     layer = add_shot(viewer, noisy)
     ((data, keywords, _),) = commands.remove_hot_pixels(layer)
     assert keywords["name"] == "shot without 1 hot or dead pixels"
@@ -108,6 +108,9 @@ def placed_shot(viewer, shot, setup):
 
 def test_a_crop_keeps_place_setup_source_and_mask(viewer, shot, proton_setup):
     layer = placed_shot(viewer, shot, proton_setup)
+    viewer.add_shapes([[(3, 3), (20, 20)]], shape_type="line", name="profile")
+    with pytest.raises(InputError, match="no rectangle to crop to: draw one in a shapes layer"):
+        commands.crop(layer, viewer)
     outline(viewer, layer, 5, 14)
     ((data, keywords, _),) = commands.crop(layer, viewer)
     np.testing.assert_array_equal(data, shot[5:15, 5:15])
@@ -117,13 +120,6 @@ def test_a_crop_keeps_place_setup_source_and_mask(viewer, shot, proton_setup):
     assert setup_of(cropped) == proton_setup
     np.testing.assert_array_equal(source_of(cropped), 2 * data)
     np.testing.assert_array_equal(usable_of(cropped), data < shot.max())
-
-
-def test_without_a_rectangle_there_is_no_crop(viewer, shot):
-    layer = add_shot(viewer, shot)
-    viewer.add_shapes([[(3, 3), (20, 20)]], shape_type="line", name="profile")
-    with pytest.raises(InputError, match="no rectangle to crop to: draw one in a shapes layer"):
-        commands.crop(layer, viewer)
 
 
 def test_binned_pixels_are_larger_and_stay_in_place(viewer, shot, proton_setup):

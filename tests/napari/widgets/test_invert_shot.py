@@ -12,7 +12,7 @@ from helpers.jobs import run_job
 from helpers.layers import in_its_unit, layer_of
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
-from napari_shadowinv._napari.layer_metadata import frame_of, metadata_for, result_of, role_of
+from napari_shadowinv._napari.layer_metadata import metadata_for, result_of, role_of
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent
@@ -194,27 +194,6 @@ def test_whole_numbers_and_the_finest_of_many_scales_are_inverted(
     assert messages == []
     assert tool.verdict.text().startswith("<b>Depends on the beam</b>")
     assert field.name.startswith("± ")
-
-
-def test_the_result_lies_on_an_image_that_was_turned(viewer, tool, shot, run, messages):
-    turned = viewer.add_image(
-        shot, name="turned", rotate=30, shear=[0.2], scale=(2, 3), translate=(7, -4),
-        affine=[[1, 0.1, 5], [0, 1.2, 6], [0, 0, 1]],
-    )  # fmt: skip
-    tool.image.layer = turned
-    corners = np.array([[5, 8], [5, 50], [40, 50], [40, 8]])
-    tool.crop.layer = viewer.add_shapes(corners, **frame_of(turned).keywords())
-    run(tool)
-    for role in ("field", "arrows", "residual", "caustic"):
-        layer = layer_of(viewer, role)
-        for y, x in ((0.0, 0.0), (20.0, 30.0)):
-            expected = turned.data_to_world((y + 5, x + 8))
-            np.testing.assert_allclose(layer.data_to_world((y, x)), expected)
-    stacked = frame_of(turned).keywords(stacked=True)
-    stack = viewer.add_image(np.ones((2, *shot.shape)), name="stacked", **stacked)
-    np.testing.assert_allclose(stack.data_to_world((1, 3, 4))[1:], turned.data_to_world((3, 4)))
-    assert frame_of(stack) == frame_of(turned)
-    assert [text.partition(":")[0] for text in messages] == ["Too uncertain"]
 
 
 def test_the_preview_follows_in_its_own_layers(window, tool_in_window, qtbot, wait, messages):

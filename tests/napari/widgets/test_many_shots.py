@@ -7,20 +7,15 @@ import numpy as np
 import pytest
 
 from helpers.forms import enter
-from helpers.jobs import run_job
 from helpers.layers import layer_of
 from helpers.reports import texts_of
 from napari_shadowinv import InversionOptions, ProtonSetup, invert, read
 from napari_shadowinv._napari.layer_metadata import metadata_of, role_of
-from napari_shadowinv._napari.widgets._stacks import StackJob
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.inversion.variables import setup_from_dataset
 from napari_shadowinv.io.store import DONE, FAILED, PENDING, StackStore, read_stack
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob, toroid
-from napari_shadowinv.pipeline.run_options import RunOptions
-from napari_shadowinv.preprocessing import Recipe
-from napari_shadowinv.shot import Shot
 from napari_shadowinv.stack import _worker
 
 FEW = {"n_sites": 100}
@@ -317,23 +312,3 @@ def test_layers_grow_and_the_newest_shot_is_in_view_unless_one_steps_back(
     assert (StackStore(out).statuses() == DONE).sum() == 5
     tool.panel.button.click()
     rest(tool)
-
-
-def test_a_shot_is_looked_at_before_the_books_count_it(stack, out):
-    counted = []
-
-    class CountingJob(StackJob):
-        def _update(self, status):
-            if status.outcome is not None:
-                counted.append((status.outcome.index, self.status.ended))
-
-    options = RunOptions(workers=1)
-    job = CountingJob(
-        shots=Shot(stack[:2]),
-        out=out,
-        recipe=Recipe(options=InversionOptions(**FEW)),
-        options=options,
-    )
-    run_job(job)
-    assert counted == [(0, 0), (1, 1)]
-    assert job.status.ended == 2

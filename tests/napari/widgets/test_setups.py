@@ -1,14 +1,12 @@
 """The setup of an image: its form, whose it is, and where it came from."""
 
-import pickle
-
 import numpy as np
 import pytest
 from napari.layers import Image
 
 from helpers.forms import enter
 from helpers.image_files import save_pradformat
-from napari_shadowinv import InputError, ProtonSetup
+from napari_shadowinv import ProtonSetup
 from napari_shadowinv._napari.layer_metadata import (
     metadata_for,
     role_of,
@@ -18,12 +16,10 @@ from napari_shadowinv._napari.layer_metadata import (
 )
 from napari_shadowinv._napari.layers import add_to_viewer
 from napari_shadowinv._napari.simulate import Simulate
-from napari_shadowinv._napari.viewer_sync import error_text
 from napari_shadowinv._napari.widgets._inputs import SetupPicker, fields_of
 from napari_shadowinv._napari.widgets.fit_images import ImageTable
 from napari_shadowinv._napari.widgets.invert import Invert
 from napari_shadowinv.io import read_shot
-from napari_shadowinv.physics.setup import setup_from_dict
 
 
 @pytest.fixture
@@ -201,17 +197,6 @@ def test_the_form_shows_geometry_and_doubts(viewer, opened, plain, picker):
     swapped = {"source_object_distance": 1.0, "object_image_distance": 0.01}
     tool.setup.show_setup({**paper.model_dump(), **swapped})
     assert "the magnification is 1.01" in doubt.text()
-
-
-def test_an_error_calls_the_fields_of_a_setup_by_their_labels():
-    with pytest.raises(InputError) as caught:
-        setup_from_dict({"kind": "proton", "object_image_distance": 0}, "the setup")
-    assert "'object_image_distance' is 0" in str(caught.value)
-    text = error_text(caught.value)
-    assert "'Object to image (m)' is 0" in text
-    assert "_" not in text
-    sent = pickle.loads(pickle.dumps(caught.value))
-    assert (type(sent), str(sent)) == (InputError, str(caught.value))
 
 
 def test_sizes_in_the_file_complete_a_setup(tmp_path, picker):
