@@ -408,11 +408,11 @@ def photograph_menus(viewer: napari.Viewer, name: str, *titles: str) -> None:
 
 
 def menus_window() -> None:
-    """The menus with entries of the plugin, and the setup of an image."""
+    """The menus with entries of the plugin."""
     viewer = new_window("menus", height=560)
     viewer.open_sample(PLUGIN, "toroid")
     settle()
-    photograph_menus(viewer, "napari-menus.png", "Measure", "Transform")
+    photograph_menus(viewer, "napari-menus.png", "Filter", "Transform")
     viewer.close()
 
 

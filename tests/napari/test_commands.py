@@ -88,8 +88,6 @@ def test_a_wrong_layer_is_one_sentence(viewer, shot):
         for layer, words in grey.items():
             with pytest.raises(InputError, match=words):
                 command(layer)
-    with pytest.raises(InputError, match="there is no window: choose this in a menu"):
-        commands.refine(colours, viewer)
 
 
 def outline(viewer, layer, low, high):

@@ -49,7 +49,7 @@ def test_its_menus_exist_and_are_short(manifest):
 
     menus = manifest.contributions.menus
     layers = ("measure", "filter", "transform", "register")
-    assert set(menus) == {"napari/file/acquire", *(f"napari/layers/{name}" for name in layers)}
+    assert set(menus) == {f"napari/layers/{name}" for name in layers}
     assert not set(menus) - {str(menu) for menu in MenuId.contributables()}
     assert max(map(len, menus.values())) <= 4
 

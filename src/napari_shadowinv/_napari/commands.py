@@ -1,6 +1,6 @@
 """Commands of the menus *Layers > Measure*, *Filter*, *Transform* and *Register*.
 
-They work on the selected image or shown shot, or open a widget for it.
+They work on the selected image or shown shot.
 """
 
 from __future__ import annotations
@@ -145,24 +145,6 @@ def align_source(
     return _start(selection, align, "Aligning the source with", viewer)
 
 
-def _opens(title: str, show: Callable[[Any, Any], None]) -> Callable[..., None]:
-    """Return the command that opens a widget by its title, and shows the selected layer in it."""
-
-    def command(
-        layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-    ) -> None:
-        show(_open_widget(viewer, title), without_proxy(layer))
-
-    return viewer_sync.notify_errors(otherwise=lambda: None)(command)
-
-
-refine = _opens("Invert", lambda tool, layer: tool.refine(layer))
-plot_along_line = _opens("Analyse", lambda tool, layer: tool.plot_layer(layer))
-measure_products = _opens("Analyse", lambda tool, layer: tool.measure_layer(layer))
-predict_image = _opens("Simulate", lambda tool, layer: tool.start_from(layer))
-watch_folder = _opens("Invert", lambda tool, _: tool.choose_folder())
-
-
 def _source_for(selection: _Selection, viewer: Any) -> tuple[FloatArray, str]:
     """Return the source of an image and its name: selected with it, supplied, or the only one."""
     layer = selection.layer
@@ -267,18 +249,3 @@ def _derived(
         setup_origin=about.setup_origin_of(layer) or None,
         **place,
     )
-
-
-def _open_widget(viewer: Any, name: str) -> Any:
-    """Open one of the plugin's widgets, or bring it to the front, and return it."""
-    window = getattr(viewer, "window", None)
-    if window is None:
-        raise InputError("there is no window: choose this in a menu of napari")
-    # napari's menus know the plugin by another name, under which it would be opened twice.
-    for title, widget in window.dock_widgets.items():
-        if title.startswith(f"{name} ("):
-            widget = without_proxy(widget)
-            widget.come_to_front()
-            return widget
-    _, widget = window.add_plugin_dock_widget("napari-shadowinv", name)
-    return widget

@@ -20,7 +20,7 @@ from napari_shadowinv._napari.shots import shot_layer
 from napari_shadowinv._napari.widgets import _panels as panels
 from napari_shadowinv._napari.widgets._inputs import InstrumentForm, SetupPicker
 from napari_shadowinv._napari.widgets._layers import LayerPicker
-from napari_shadowinv._napari.widgets._qt import Plot, column, notify_errors
+from napari_shadowinv._napari.widgets._qt import Plot, column
 from napari_shadowinv._system.validation import validate
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.options import Instrument
@@ -124,18 +124,6 @@ class Simulate(panels.ToolPanel):
             part.changed.connect(self._on_change)
         for line in (self.side, self.energies):
             line.textChanged.connect(lambda _: self._on_change())
-
-    @notify_errors
-    def start_from(self, layer: Any) -> None:
-        """Select the field of a result, whose image is to be predicted."""
-        if layer is None or not any(layer is offered for offered in self.field.offered):
-            name = "no layer" if layer is None else f"layer '{layer.name}'"
-            raise InputError(
-                f"{name} is selected: select the field or the potential of a result of one shot"
-            )
-        self.task.set_kind(_IMAGE)
-        self.object.set_kind(_LAYER)
-        self.field.layer = layer
 
     def request(self) -> Job:
         setup = self.setup.setup()

@@ -51,8 +51,8 @@ def test_a_store_lies_beside_the_files_unless_another_is_chosen(opened, tmp_path
     folder = str(tmp_path / "night")
     monkeypatch.setattr(QFileDialog, "getExistingDirectory", lambda *_: folder)
     tool = opened(Invert)
-    tool.choose_folder()  # as the menu does
-    assert tool.image.kind == "folder"
+    tool.image.set_kind("folder")
+    tool.image.choose_path()
     assert tool.image.shots() == tmp_path / "night"
     assert tool.store.path == tmp_path / "night.shadowinv.zarr"
     tool.image.set_kind("files")

@@ -210,12 +210,6 @@ class Docked(QWidget):
             dock = dock.parent()
         return dock
 
-    def come_to_front(self) -> None:
-        """Show the dock in front of the others, also after it was closed."""
-        if (dock := self._dock) is not None:
-            dock.show()
-            dock.raise_()
-
     def _join(self) -> None:
         dock = self._dock
         window = None if dock is None else dock.parent()

@@ -132,24 +132,6 @@ class Analyse(qt.Docked):
         images = [layer for layer in reversed(self.viewer.layers) if kind_of(layer) == "image"]
         return [layer for layer in images if not layer.rgb and layer.ndim >= 2]
 
-    @qt.notify_errors
-    def plot_layer(self, layer: Any) -> None:
-        """Show only one of the images; without a line yet, begin to draw it."""
-        images = self._images
-        if layer not in images:
-            raise InputError("no image is selected: select a grey image in the layer list")
-        self.tabs.setCurrentIndex(0)
-        for image in images:
-            image.visible = image is layer
-        if self.lines.layer is None:
-            self._draw()
-
-    @qt.notify_errors
-    def measure_layer(self, layer: Any) -> None:
-        """Show the form for products of the result that a layer belongs to."""
-        self.tabs.setCurrentWidget(self.products)
-        self.products.choose(layer)
-
     def update_plot(self) -> None:
         shapes, layers = self.lines.layer, self.layers
         line = None
@@ -327,17 +309,6 @@ class ProductForm(ToolPanel):
                 "with the Shift key held down"
             )
         return values
-
-    def choose(self, layer: Any) -> None:
-        """Select the result that a layer belongs to, or raise an `InputError`."""
-        together = [] if layer is None else about.layers_of(self.viewer, layer)
-        of_result = [each for each in together if each in self.result.offered]
-        if not of_result:
-            raise InputError(
-                "no result is selected: select a layer of an inversion or a fit; of a store, save "
-                "the result of a shot, or use shadowinv analyse"
-            )
-        self.result.layer = layer if layer in of_result else of_result[-1]
 
     def forget(self) -> None:
         self.measured = []

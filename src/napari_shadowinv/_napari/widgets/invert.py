@@ -30,7 +30,6 @@ from napari_shadowinv._napari.widgets._panels import (
     result_frame,
 )
 from napari_shadowinv._napari.widgets._stacks import (
-    FOLDER,
     ShotPicker,
     StackJob,
     StackView,
@@ -137,11 +136,6 @@ class Invert(ImagePanel):
         """Return the layer of the shot or of the stack; None for files."""
         return self.image.layer
 
-    def choose_folder(self) -> None:
-        """Take the shots from a watched folder, and ask which."""
-        self.image.set_kind(FOLDER)
-        self.image.choose_path()
-
     def all_steps(self) -> tuple[Step, ...]:
         """Return the preprocessing steps, the crop first, or raise an `InputError`."""
         has_crop = not self.image.is_stack
@@ -214,22 +208,19 @@ class Invert(ImagePanel):
         return Shot(self.image.shots(), source=source, mask=self.masks.usable(layer))
 
     @qt.notify_errors
-    def refine(self, layer: Any = None) -> None:
-        """Refine the inversion of a layer; by default the image's last one, or the selected."""
+    def refine(self) -> None:
+        """Refine the image's last inversion, or that of the selected layer."""
         if self.is_busy:
             raise InputError(
                 "Invert is running: wait until it finishes, or press Cancel, then refine"
             )
-        chosen: Any = layer
-        if layer is None:
-            last = self._last.get(self.image.layer)
-            fields = [] if last is None else field_of(last.layers)
-            chosen = next(iter(fields), self.viewer.layers.selection.active)
+        last = self._last.get(self.image.layer)
+        fields = [] if last is None else field_of(last.layers)
+        chosen = next(iter(fields), self.viewer.layers.selection.active)
         if chosen is None or about.result_of(chosen) is None:
             raise InputError(
                 "there is no inversion of this image to refine: press Run first, then Refine"
             )
-        self.refine_section.expand()
         shots = [shot for shot, last in self._last.items() if chosen in last.layers]
         image = next((shot for shot in shots if shot in self.viewer.layers), chosen)
         name = jobs.name_of_result(image)
