@@ -38,7 +38,7 @@ from napari_shadowinv.io.formats import RESULT, TABLE
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 COLOURS = ("#4fa3ff", "#ffb347", "#7ddf64", "#ff6f91", "#b39ddb", "#4dd0e1")
-_WIDTH_PX = 330  # of a panel
+_WIDTH_PX, _SPARE_WIDTH_PX = 330, 40  # of a panel, and of its dock beyond
 _LEGEND_CHARACTERS, _HANDLE_CHARACTERS = 56, 5  # of a row above a plot
 # napari's docks, which users expect to see next to a plugin's.
 _NAPARI_DOCKS = {"layer list", "layer controls", "console"}
@@ -187,8 +187,6 @@ class Docked(QWidget):
     napari gives its viewer to a parameter `napari_viewer`.
     """
 
-    spare_width = 30  # px, in which a new dock is wider than needed
-
     def __init__(self) -> None:
         super().__init__()
         self._is_placed = False
@@ -196,22 +194,17 @@ class Docked(QWidget):
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
 
     def sizeHint(self) -> QSize:
-        return QSize(_WIDTH_PX + self.spare_width, 600)
+        return QSize(_WIDTH_PX + _SPARE_WIDTH_PX, 600)
 
     def showEvent(self, event: Any) -> None:
         super().showEvent(event)
         if not self._is_placed:
             QTimer.singleShot(0, self._join)  # napari lays out the docks after this event
 
-    @property
-    def _dock(self) -> QDockWidget | None:
-        dock = self.parent()
+    def _join(self) -> None:
+        dock: Any = self.parent()
         while dock is not None and not isinstance(dock, QDockWidget):
             dock = dock.parent()
-        return dock
-
-    def _join(self) -> None:
-        dock = self._dock
         window = None if dock is None else dock.parent()
         if self._is_placed or dock is None or not isinstance(window, QMainWindow):
             return
@@ -250,15 +243,11 @@ def _settings() -> QSettings:
     )
 
 
-def _plain_style() -> AbstractContextManager[None]:
-    """Draw in matplotlib's own style, whatever the user's matplotlibrc says."""
-    from napari_shadowinv.plotting import own_style
-
-    return own_style({})
-
-
 class Plot(QWidget):
-    """A figure, hidden until the first drawing; it grows with the window unless it is `fixed`."""
+    """A figure, hidden until the first drawing; it grows with the window unless it is `fixed`.
+
+    It is drawn in napari's colours, whatever the user's matplotlibrc says.
+    """
 
     def __init__(self, height: int, *, fixed: bool = False) -> None:
         super().__init__()
@@ -273,30 +262,15 @@ class Plot(QWidget):
         self.ink, self.paper = "", ""
         self._canvas: Any = None
 
-    def _fresh_axes(self, rows: int = 1) -> list[Any]:
-        """Return empty axes in a column with a common x axis."""
-        if self._canvas is None:
-            self._make_canvas()
-        self.ink, self.paper = self._colours()
-        self.figure.clear()
-        self.figure.set_facecolor(self.paper)
-        with _plain_style():
-            axes = list(self.figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
-        for axis in axes:
-            axis.set_facecolor(self.paper)
-            axis.tick_params(colors=self.ink, which="both", labelsize=8)
-            for label in (axis.xaxis.label, axis.yaxis.label):
-                label.set(color=self.ink, fontsize=8)
-            for spine in axis.spines.values():
-                spine.set_color(self.ink)
-            axis.grid(color=self.ink, alpha=0.15)
-        return axes
-
     def show_drawing(self, draw: Callable[[list[Any]], Any], rows: int = 1) -> None:
         """Draw on empty axes in a column, with the names of their curves above them."""
         self.setVisible(True)
-        axes = self._fresh_axes(rows)
-        with _plain_style():
+        with self._style():
+            if self._canvas is None:
+                self._make_canvas()
+            self.figure.clear()
+            self.figure.set_facecolor(self.paper)
+            axes = list(self.figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0])
             draw(axes)
             for each in axes:
                 self._name_curves(each)
@@ -308,31 +282,42 @@ class Plot(QWidget):
             axes.get_legend().remove()
         _, names = axes.get_legend_handles_labels()
         if len(names) == 1 and not axes.patches:  # bars are there without a name
-            axes.set_title(names[0], loc="left", color=self.ink, fontsize=7)
+            axes.set_title(names[0], loc="left")
         elif names:
             columns = max(1, _LEGEND_CHARACTERS // (max(map(len, names)) + _HANDLE_CHARACTERS))
-            above: Any = {"loc": "lower left", "bbox_to_anchor": (0, 1), "borderaxespad": 0.2}
-            compact: Any = {"fontsize": 7, "handlelength": 1.0, "columnspacing": 0.8}
-            axes.legend(ncols=columns, frameon=False, labelcolor=self.ink, **above, **compact)
+            axes.legend(ncols=columns, loc="lower left", bbox_to_anchor=(0, 1))
 
     def _make_canvas(self) -> None:
         # Importing matplotlib takes half a second.
         from matplotlib.backends.backend_qtagg import FigureCanvasQTAgg
         from matplotlib.figure import Figure
 
-        # matplotlib's class is untyped.
-        untyped: Any = FigureCanvasQTAgg
+        untyped: Any = FigureCanvasQTAgg  # as matplotlib's classes are
+        style = self._style
 
         class Canvas(untyped):
             def draw(self) -> None:
-                with _plain_style():  # also of labels that are made when they are drawn
+                with style():  # also of labels that are made when they are drawn
                     super().draw()
 
-        with _plain_style():
-            self.figure = Figure(layout="constrained")
-            self._canvas = Canvas(self.figure)
+        self.figure = Figure(layout="constrained")
+        self._canvas = Canvas(self.figure)
         self._canvas.setMinimumSize(100, 100)
         self.layout().addWidget(self._canvas)
+
+    def _style(self) -> AbstractContextManager[None]:
+        from napari_shadowinv.plotting import own_style
+
+        self.ink, self.paper = self._colours()
+        inked = ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color")
+        return own_style(
+            dict.fromkeys((*inked, "grid.color"), self.ink)
+            | {"axes.facecolor": self.paper, "axes.grid": True, "grid.alpha": 0.15}
+            | dict.fromkeys(("axes.labelsize", "xtick.labelsize", "ytick.labelsize"), 8)
+            | dict.fromkeys(("axes.titlesize", "legend.fontsize"), 7)
+            | {"legend.frameon": False, "legend.borderaxespad": 0.2}
+            | {"legend.handlelength": 1.0, "legend.columnspacing": 0.8}
+        )
 
     def _colours(self) -> tuple[str, str]:
         from napari.settings import get_settings

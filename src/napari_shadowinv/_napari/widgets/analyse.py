@@ -74,8 +74,6 @@ def draw_profiles(
 class Analyse(qt.Docked):
     """Plot the visible images along a line in their units, and measure products of a result."""
 
-    spare_width = 50
-
     def __init__(self, napari_viewer: Any) -> None:
         super().__init__()
         self.viewer = napari_viewer
