@@ -55,15 +55,6 @@ def test_invert_makes_the_layers_of_the_default_inversion(viewer, shot, proton_s
     assert "Setup" not in result_of(keywords).origins
 
 
-def test_the_shot_that_is_shown_is_taken_of_a_stack(viewer, shot):
-    layer = add_shot(viewer, np.stack([np.full_like(shot, 5), shot]))
-    viewer.dims.set_point(0, 1)
-    ((data, keywords, _),) = commands.high_pass(layer, viewer)
-    ((alone, _, _),) = commands.high_pass(add_shot(viewer, shot))
-    np.testing.assert_array_equal(data, alone)
-    assert keywords["name"] == "shot 1 high-pass σ=4.8 px"
-
-
 def test_filters_and_estimates(viewer, noisy, shot, proton_setup):
     layer = add_shot(viewer, noisy)
     ((data, keywords, _),) = commands.remove_hot_pixels(layer)
@@ -74,6 +65,11 @@ def test_filters_and_estimates(viewer, noisy, shot, proton_setup):
     assert data.mean() == pytest.approx(noisy.mean())
     slope = data[:, -10:].mean() - data[:, :10].mean()
     assert abs(slope) < 60  # 167 before
+    stack = add_shot(viewer, np.stack([np.full_like(noisy, 5), noisy]))
+    viewer.dims.set_point(0, 1)
+    ((shown, keywords, _),) = commands.high_pass(stack, viewer)
+    np.testing.assert_array_equal(shown, data)
+    assert keywords["name"].startswith("shot [1] 1 high-pass σ=")
 
 
 def test_a_wrong_layer_is_one_sentence(viewer, shot):
@@ -169,9 +165,6 @@ def test_from_the_menu_the_selected_image_is_not_its_own_source(make_napari_view
     qtbot.waitUntil(lambda: len(window.layers) == 3, timeout=30_000)
     moved = window.layers[-1]
     assert moved.name.startswith("beam moved by y +2.")
-    in_loop(registered("bin_pixels"))
-    qtbot.waitUntil(lambda: len(window.layers) == 4, timeout=30_000)
-    np.testing.assert_allclose(window.layers[-1].data[0, 0], moved.data[:2, :2].sum())
     assert beam in window.layers
 
 
