@@ -44,28 +44,42 @@ class _Selection:
         return str(self.shot.name)
 
 
-Work = Callable[[_Selection, ShouldStop], results.LayerData]
+Work = Callable[[ShouldStop], results.LayerData]
 
 
-def _in_thread(
-    activity: str, usable: Callable[[Any], bool] = about.may_be_shot
-) -> Callable[[Work], Callable[..., list[Any]]]:
-    """Make work on an image a command of the menus for the selected image."""
+def _command(
+    activity: str, usable: Callable[[Any], bool] = about.may_be_source
+) -> Callable[[Callable[[_Selection, Any], Work]], Callable[..., list[Any]]]:
+    """Make a command of the menus of a function of the selected image and its viewer.
 
-    def as_command(work: Work) -> Callable[..., list[Any]]:
+    The work that it returns is done now, or in a thread if there is a window.
+    """
+
+    def as_command(plan: Callable[[_Selection, Any], Work]) -> Callable[..., list[Any]]:
         def command(
             layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
         ) -> list[napari.types.LayerDataTuple]:
-            return _start(_select_image(layer, viewer, usable), work, activity, viewer)
+            selection = _select_image(layer, viewer, usable)
+            work = plan(selection, without_proxy(viewer))
+            if viewer is None or not viewer_sync.in_event_loop():
+                return list(work(lambda: False))
+            from napari_shadowinv._napari.run import run_in_background
 
-        command.__name__, command.__doc__ = work.__name__, work.__doc__
+            run_in_background(
+                f"{activity} {selection.name}",
+                lambda _, should_stop: work(should_stop),
+                lambda layers: results.add_layers(viewer, layers),
+            )
+            return []
+
+        command.__name__, command.__doc__ = plan.__name__, plan.__doc__
         return viewer_sync.notify_errors(otherwise=list)(command)
 
     return as_command
 
 
-@_in_thread("Inverting")
-def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
+@_command("Inverting", about.may_be_shot)
+def invert_uniform(selection: _Selection, _: Any) -> Work:
     """Invert the selected image against a uniform source, with the default options."""
     from napari_shadowinv._napari.jobs import InversionJob
 
@@ -78,33 +92,35 @@ def invert_uniform(selection: _Selection, should_stop: ShouldStop) -> results.La
         origins={title: text for title, text in origins.items() if text},
         shot=replace(selection.shot, name=None, setup=None, source=None, mask=None),
     )
-    return main_layers(job.work(lambda _: None, should_stop).layer_data)
+    return lambda should_stop: main_layers(job.work(lambda _: None, should_stop).layer_data)
 
 
-@_in_thread("Removing hot pixels from", about.may_be_source)
-def remove_hot_pixels(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
+@_command("Removing hot pixels from")
+def remove_hot_pixels(selection: _Selection, _: Any) -> Work:
     """Replace pixels that stand out of the noise by the median of their neighbours."""
     before = selection.shot.image
-    image = preprocessing.HotPixelFilter().filter_image(before, should_stop=should_stop)
-    return [_derived(selection, image, f"without {(image != before).sum()} hot or dead pixels")]
+
+    def remove(should_stop: ShouldStop) -> results.LayerData:
+        image = preprocessing.HotPixelFilter().filter_image(before, should_stop=should_stop)
+        title = f"without {(image != before).sum()} hot or dead pixels"
+        return [_derived(selection, image, title)]
+
+    return remove
 
 
-@_in_thread("Filtering", about.may_be_source)
-def high_pass(selection: _Selection, _: ShouldStop) -> results.LayerData:
+@_command("Filtering")
+def high_pass(selection: _Selection, _: Any) -> Work:
     """Remove structures larger than about 0.15 of the image's shorter side; keep the mean."""
-    width = 0.15 * min(selection.shot.shape)
-    image = preprocessing.HighPassFilter(width=width).filter_image(selection.shot.image)
-    return [_derived(selection, image, f"high-pass σ={width:.3g} px")]
+    image, width = selection.shot.image, 0.15 * min(selection.shot.shape)
+    step, title = preprocessing.HighPassFilter(width=width), f"high-pass σ={width:.3g} px"
+    return lambda _: [_derived(selection, step.filter_image(image), title)]
 
 
-@viewer_sync.notify_errors(otherwise=list)
-def crop(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> list[napari.types.LayerDataTuple]:
+@_command("Cropping")
+def crop(selection: _Selection, viewer: Any) -> Work:
     """Cut the selected image to the selected or last rectangle of the topmost shapes."""
     from napari_shadowinv._napari.widgets._layers import crop_of, image_of
 
-    selection = _select_image(layer, viewer, about.may_be_source)
     image_of(selection.layer)
     visible = [] if viewer is None else [each for each in viewer.layers if each.visible]
     shapes = [each for each in visible if _has_outline(each)]
@@ -115,24 +131,21 @@ def crop(
             f"'{selection.name}' again"
         )
     height, width = step.shape_after(selection.shot.shape)
-    return [_moved(selection, step, f"cropped to {width} × {height} px")]
+    return lambda _: [_moved(selection, step, f"cropped to {width} × {height} px")]
 
 
-@_in_thread("Binning", about.may_be_source)
-def bin_pixels(selection: _Selection, _: ShouldStop) -> results.LayerData:
+@_command("Binning")
+def bin_pixels(selection: _Selection, _: Any) -> Work:
     """Sum blocks of 2 × 2 pixels of the selected image."""
-    return [_moved(selection, preprocessing.Bin(factor=2), "binned 2 × 2")]
+    return lambda _: [_moved(selection, preprocessing.Bin(factor=2), "binned 2 × 2")]
 
 
-@viewer_sync.notify_errors(otherwise=list)
-def align_source(
-    layer: napari.layers.Layer | None = None, viewer: napari.Viewer | None = None
-) -> list[napari.types.LayerDataTuple]:
+@_command("Aligning the source with", about.may_be_shot)
+def align_source(selection: _Selection, viewer: Any) -> Work:
     """Shift a source so that it fits the selected image."""
-    selection = _select_image(layer, viewer)
-    source, name = _source_for(selection, without_proxy(viewer))
+    source, name = _source_for(selection, viewer)
 
-    def align(selection: _Selection, should_stop: ShouldStop) -> results.LayerData:
+    def align(_: ShouldStop) -> results.LayerData:
         measured = preprocessing.measure_shift(selection.shot.image, source, selection.shot.mask)
         if not measured.is_significant.any():
             raise InputError(f"'{name}' need not be moved, or cannot: its shift is {measured.text}")
@@ -142,7 +155,7 @@ def align_source(
         beam = replace(selection, shot=replace(selection.shot, name=name))
         return [_derived(beam, aligned, title, role=about.SOURCE, made_from=made_from)]
 
-    return _start(selection, align, "Aligning the source with", viewer)
+    return align
 
 
 def _source_for(selection: _Selection, viewer: Any) -> tuple[FloatArray, str]:
@@ -206,20 +219,6 @@ def _select_image(
         mask=about.usable_of(layer),
     )
     return _Selection(without_proxy(layer), shot)
-
-
-def _start(selection: _Selection, work: Work, activity: str, viewer: Any) -> list[Any]:
-    """Do the work now, or in a thread if there is a window."""
-    if viewer is None or not viewer_sync.in_event_loop():
-        return list(work(selection, lambda: False))
-    from napari_shadowinv._napari.run import run_in_background
-
-    run_in_background(
-        f"{activity} {selection.name}",
-        lambda _, should_stop: work(selection, should_stop),
-        lambda layers: results.add_layers(viewer, layers),
-    )
-    return []
 
 
 def _moved(selection: _Selection, step: Step, title: str) -> results.FullLayerData:
