@@ -67,8 +67,8 @@ def test_filters_and_estimates(viewer, noisy, shot, proton_setup):
     assert abs(slope) < 60  # 167 before
     stack = add_shot(viewer, np.stack([np.full_like(noisy, 5), noisy]))
     viewer.dims.set_point(0, 1)
-    ((shown, keywords, _),) = commands.high_pass(stack, viewer)
-    np.testing.assert_array_equal(shown, data)
+    ((plane, keywords, _),) = commands.high_pass(stack, viewer)
+    np.testing.assert_array_equal(plane, data)
     assert keywords["name"].startswith("shot [1] 1 high-pass σ=")
 
 

@@ -74,7 +74,7 @@ class _Mailbox:
     detach_at: float = math.inf
     stop: threading.Event = field(default_factory=threading.Event)
     progress: Progress | None = None
-    told: Progress | None = None  # the last that the window has heard of
+    shown_progress: Progress | None = None
     outcome: Outcome | None = None
 
     def fill(self, work: Work) -> None:
@@ -183,8 +183,8 @@ class Run(QtWidgets.QWidget):
             return
         outcome, progress = box.outcome, box.progress
         if progress is not None and not box.stop.is_set():
-            if progress is not box.told:
-                box.told = progress
+            if progress is not box.shown_progress:
+                box.shown_progress = progress
                 self.progressed.emit(progress)
             if not self._quiet and time.monotonic() > self._shown_at + _SHOW_INTERVAL_S:
                 self._show_progress(progress)

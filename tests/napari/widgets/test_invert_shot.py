@@ -136,8 +136,16 @@ def test_a_run_replaces_the_last_result_of_its_shot(
     rest(tool)
     first = list(viewer.layers)
     added = {role_of(layer) for layer in viewer.layers} - set(few)
-    others = {"image", "reprojection", "potential", "field y", "field x", "direction", "sites"}
-    assert added == others
+    roles_of_more = {
+        "image",
+        "reprojection",
+        "potential",
+        "field y",
+        "field x",
+        "direction",
+        "sites",
+    }
+    assert added == roles_of_more
     visible = {role_of(layer) for layer in viewer.layers if layer.visible}
     assert visible == {None, "field", "arrows"}
     tool.view.more_layers.click()

@@ -101,9 +101,9 @@ def test_steps_are_added_moved_and_removed(qtbot):
     section.show_steps([Bin(factor=3)])
     assert section.steps() == (Bin(factor=3),)
     rows = section.add("crop").form.entries["y"]
-    for text, kept in (("10:40", (10, 40)), ("10:", (10, None)), ("", (0, None))):
+    for text, rows_used in (("10:40", (10, 40)), ("10:", (10, None)), ("", (0, None))):
         enter(rows, text)
-        assert section.steps()[1] == Crop(y=kept)
+        assert section.steps()[1] == Crop(y=rows_used)
     enter(rows, "ten")
     with pytest.raises(InputError, match="such as 10:200"):
         section.steps()

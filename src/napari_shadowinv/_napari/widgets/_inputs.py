@@ -274,31 +274,18 @@ class SourcePicker(layers.LayerPicker):
     @property
     def is_estimated(self) -> bool:
         """Whether it is estimated from the shot, where a mask can exclude the object."""
-        estimate = preprocessing.ESTIMATES.get(self.kind)
-        return estimate is not None and estimate.uses_mask
-
-    @property
-    def is_supplied(self) -> bool:
-        """Whether it came with the shot."""
-        return self.kind == SUPPLIED
+        return self.is_made and preprocessing.ESTIMATES[self.kind].uses_mask
 
     @property
     def summary(self) -> str:
         if self.layer is not None:
             return f"layer '{self.layer.name}'"
-        if self.kind in (SUPPLIED, UNKNOWN):
-            return "came with the shot" if self.is_supplied else "fitted"
         model: Any = self.model()
+        if model is None:
+            return "came with the shot" if self.kind == SUPPLIED else "fitted"
         if self.kind == FILE:
             return f"file {model.file.name}"
-        return f"estimate: {model.summary}" if self.is_estimated else model.summary
-
-    @property
-    def short_name(self) -> str:
-        """The estimated source in the name of a result; empty if uniform or measured."""
-        if self.kind == UNIFORM:
-            return ""
-        return f"{self.kind} source" if self.kind in preprocessing.ESTIMATES else ""
+        return f"estimate: {model.summary}" if self.is_estimated else str(model.summary)
 
     def recipe_source(self) -> preprocessing.Estimate | preprocessing.MeasuredSource | None:
         """Return the source as a recipe describes it, None if it is fitted; or an `InputError`."""
@@ -309,15 +296,13 @@ class SourcePicker(layers.LayerPicker):
 
     def show(self, source: Any) -> None:
         """Show the source of a recipe; None for uniform."""
-        if isinstance(source, preprocessing.Estimate):
-            name = source.name()
-            self.restore(name, {name: source.values()})
-        elif source is None:
+        if source is None:
             self.set_kind(UNIFORM)
-        elif source.file is None:
+        elif isinstance(source, preprocessing.MeasuredSource) and source.file is None:
             self.set_kind(SUPPLIED)
         else:
-            self.restore(FILE, {FILE: source.values()})
+            kind = source.name() if isinstance(source, preprocessing.Estimate) else FILE
+            self.restore(kind, {kind: source.values()})
 
     def measured(self, image: Any) -> Shot | None:
         """Return the measured source of an image layer; None for estimates and files."""
@@ -325,7 +310,7 @@ class SourcePicker(layers.LayerPicker):
             data = layers.image_of(self.layer, "source image")
             beam = source_of_shot(self.layer, data, image)
             return replace(beam, cautions=layers.cautions_of(self.layer))
-        if not self.is_supplied:
+        if self.kind != SUPPLIED:
             return None
         supplied = about.source_of(image)
         if supplied is None:
@@ -356,7 +341,7 @@ class SourcePicker(layers.LayerPicker):
         source = recipe.source
         if not isinstance(source, preprocessing.MeasuredSource) or source.file is not None:
             return None
-        is_in_shot = self.is_supplied and bool(about.metadata_of(image).get("path"))
+        is_in_shot = self.kind == SUPPLIED and bool(about.metadata_of(image).get("path"))
         return None if is_in_shot else self.measured(image)
 
     def check(self, mask: BoolArray | None) -> None:
@@ -378,13 +363,13 @@ class SourcePicker(layers.LayerPicker):
 
     def _preferred(self, before: Any) -> Sequence[Any]:
         """Return the image's own source, the chosen one, or else its only likely beam."""
-        image, own, likely = self._image, None, None
+        image, supplied, likely = self._image, None, None
         if image is not None and about.source_of(image) is not None:
-            own = SUPPLIED
+            supplied = SUPPLIED
         if image is not None and self.chosen is None:
             likely = layers.likely_beam(image, self.offered)
-        first = own if self._takes_supplied else None
-        return first, self.chosen, own, likely, UNIFORM
+        first = supplied if self._takes_supplied else None
+        return first, self.chosen, supplied, likely, UNIFORM
 
     def _suits_image(self, layer: Any) -> bool:
         # An image cannot be its own source.

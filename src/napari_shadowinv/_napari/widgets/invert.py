@@ -190,8 +190,9 @@ class Invert(ImagePanel):
                 options=self.store.options(self.image.kind),
                 **described,
             )
+        estimated = [f"{self.source.kind} source"] if self.source.is_made else []
         return jobs.InversionJob(
-            name=", ".join(filter(None, (jobs.name_of_result(layer), self.source.short_name))),
+            name=", ".join([jobs.name_of_result(layer), *estimated]),
             frame=result_frame(layer, recipe),
             shot=shot,
             cache=self._cache,
