@@ -50,7 +50,7 @@ class Job:
     """
 
     patience: ClassVar[float] = 0.5
-    show: Callable[[Any], Any] | None = None  # what its work returned, unless its window does
+    show: Callable[[Any, Any], Any] | None = None  # its result, unless its window does
 
     def __init__(
         self, compute: Callable[..., Any], describe: Callable[[Any], LayerData], subject: Any = None
@@ -145,7 +145,7 @@ def source_job(estimate: Estimate, shot: Shot, image: Any, made_from: dict[str, 
         )
         return [layer]
 
-    return Job(compute, describe)
+    return Job(compute, describe, subject=(image, about.SOURCE))
 
 
 @dataclass(eq=False, kw_only=True)

@@ -230,30 +230,21 @@ def test_refine_starts_from_the_last_inversion(viewer, opened, run, refused):
     assert "Flux residual" in texts_of(tool.report)
 
 
-def test_the_menu_refines_an_inversion_of_a_file(
-    window, rest, in_loop, tmp_path, messages, refused
-):
-    from napari._app_model import get_app_model
-
-    def refine():
-        get_app_model().commands.execute_command("napari-shadowinv.refine").result()
-
+def test_an_inversion_of_a_file_is_refined(viewer, opened, rest, tmp_path, messages, refused):
     path = tmp_path / "shot.shadowinv"
     inversion = invert(images()[0][MIDDLE], options=InversionOptions(n_sites=600))
     write(path, inversion, setup=SETUPS[0])
-    window.open(str(path), plugin="napari-shadowinv")
-    window.layers.selection.active = layer_of(window, "arrows")
-    in_loop(refine)
-    (dock,) = window.window.dock_widgets.values()
-    tool = dock if hasattr(dock, "refine_section") else dock._magic_widget
-    assert tool.refine_section.isExpanded()
+    viewer.open(str(path), plugin="napari-shadowinv")
+    viewer.layers.selection.active = layer_of(viewer, "arrows")
+    tool = opened(Invert)
+    tool.refine_button.click()
     assert tool.panel.running
-    in_loop(refine)
+    tool.refine_button.click()
     assert messages[-1].startswith("Invert is running")
     rest(tool)
-    assert layer_of(window, "field", "shot refined").visible
+    assert layer_of(viewer, "field", "shot refined").visible
     assert texts_of(tool.view.report)["Start"] == "the inversion of 'shot'"
-    window.layers.selection.active = layer_of(window, "field", "refined")
+    viewer.layers.selection.active = layer_of(viewer, "field", "refined")
     refused(tool, "shows a fit: select a layer of an inversion", tool.refine_button.click)
 
 

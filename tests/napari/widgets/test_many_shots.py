@@ -91,7 +91,6 @@ def test_a_stack_layer_becomes_a_store_and_layers(
     assert messages == []
     assert (StackStore(out).statuses() == DONE).all()
     assert tool.panel.status.text() == "4 of 4 done, in run.shadowinv.zarr"
-    assert tool.panel.status.toolTip() == str(out)
     assert tool.stack_view.failures.isHidden()
     field, image = layer_of(viewer, "field"), viewer.layers["shots"]
     expected = invert(stack[2], options=InversionOptions(**FEW))

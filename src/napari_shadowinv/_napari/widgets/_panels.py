@@ -186,9 +186,9 @@ class ToolPanel(qt.Docked):
         raise NotImplementedError
 
     def start(
-        self, job: Job, show: Callable[[Any], Any] | None = None, *, preview: bool = False
+        self, job: Job, show: Callable[[Any, Any], Any] | None = None, *, preview: bool = False
     ) -> None:
-        """Do a job in the thread, then `show` it; a preview shows no progress."""
+        """Do a job in the thread, then `show` its result; a preview shows no progress."""
         self.previewing = preview
         if show is not None:
             job.show = show
@@ -205,12 +205,8 @@ class ToolPanel(qt.Docked):
     @qt.notify_errors
     def _on_end(self, outcome: Outcome) -> None:
         job = outcome.tag
-        if outcome.value is None:
-            return
-        if job.show is None:
-            self.show_result(outcome.value, job)
-        else:
-            job.show(outcome.value)
+        if outcome.value is not None:
+            (job.show or self.show_result)(outcome.value, job)
 
 
 class ResultView(QtWidgets.QWidget):

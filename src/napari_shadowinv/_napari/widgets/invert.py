@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -227,7 +226,7 @@ class Invert(ImagePanel):
         name = jobs.name_of_result(image)
         choices: Any = self.refine_form.model()
         job = jobs.refinement(chosen, image, name, choices.psf or 0.0)
-        self.start(job, partial(self._show_refinement, job=job))
+        self.start(job, self._show_refinement)
 
     @qt.notify_errors
     def _show_source(self) -> None:
@@ -244,7 +243,7 @@ class Invert(ImagePanel):
             made_from["source_mask"] = self.source_masks.summary(layer)
         shot = Shot(image, source_mask=hidden)
         job = jobs.source_job(estimate, shot, layer, made_from)
-        self.start(job, partial(self._show_estimate, image=layer))
+        self.start(job, self._show_estimate)
 
     def _on_progress(self, progress: Progress) -> None:
         job = self.panel.tag
@@ -265,11 +264,9 @@ class Invert(ImagePanel):
         elif text := self.stack_view.end(outcome):
             self.results = self.stack_view.results
             self.panel.say(text)
-            self.panel.status.setToolTip(str(job.out.absolute()))
 
     def forget(self) -> None:
         self.stack_view.empty()
-        self.panel.status.setToolTip("")
 
     def show_result(self, finished: jobs.Finished, job: jobs.InversionJob) -> None:
         inversion = finished.content
@@ -293,8 +290,8 @@ class Invert(ImagePanel):
         self.previewed.hide()
         self.results = self._refined = self.view.show_fit(job, finished)
 
-    def _show_estimate(self, finished: jobs.Finished, image: Any) -> None:
-        self.results_for((image, about.SOURCE)).show(finished.layer_data)
+    def _show_estimate(self, finished: jobs.Finished, job: jobs.Job) -> None:
+        self.results_for(job.subject).show(finished.layer_data)
 
     def on_change(self) -> None:
         """Update the preview, the estimated cost, and what is said of the result."""
