@@ -1,6 +1,6 @@
 """Products of a field against exact ones: the tables of docs/physics.md.
 
-    python benchmarks/products.py [--only maps integrals bands filaments] [--seeds 20] [--side 96]
+    python benchmarks/products.py [--only maps integrals bands] [--seeds 20] [--side 96]
 
 The truth is written out as formulae of the toroid, ∫B dz = D (r/σ) exp(½ - r²/2σ²): neither the
 package's phantoms nor its products compute it.
@@ -9,7 +9,6 @@ package's phantoms nor its products compute it.
   inversions
 - maps: ∫j_z dz of inversions, relative L2 error over the image
 - bands: share of the truth inside the band of 68 %, over seeds, for each product
-- filaments: the same for radius, spacing and strength of filaments
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ from napari_shadowinv.analysis import (
     Contrast,
     CurrentDensity,
     EnclosedCurrent,
-    Filaments,
     Flux,
     LineProfile,
     Product,
@@ -247,42 +245,10 @@ def bands(arguments: argparse.Namespace) -> None:
         print(f"| {name} | {np.mean(shares):.0%} |")
 
 
-def filament_bands(arguments: argparse.Namespace) -> None:
-    """Print how often the bands of filaments hold the numbers of the exact field."""
-    side, radius = arguments.side, arguments.side / 32
-    rows, columns = np.mgrid[:side, :side] - (side - 1) / 2
-    inside: dict[str, list[float]] = {}
-    for seed in range(arguments.seeds):
-        rng = np.random.default_rng([seed, 29])
-        potential, moved = np.zeros((side, side)), np.zeros((2, side, side))
-        for place in np.arange(-0.36, 0.37, 0.12) * side:  # regular, but each a little bent
-            phase = 2 * np.pi * (rows / side + rng.random())
-            across = (columns - place - 2 * np.sin(phase)) / radius
-            part = 4 * np.exp(-(across**2) / 2 - (rows / side) ** 2 * 18)
-            slope = across / radius * 4 * np.pi / side * np.cos(phase) - 36 * rows / side**2
-            potential += part
-            moved -= part * np.stack([slope, -across / radius])
-        image = rng.poisson(arguments.counts * synthetic_image(moved)).astype(float)
-        source, options = np.full(image.shape, arguments.counts), {"seed": seed}
-        inversion = invert(image, source=source, options=options)
-        exact = RetrievedField(dataset_from_field(moved, potential, SETUP))
-        (truth,) = analyse(exact, Filaments())
-        (result,) = analyse(inversion, Filaments(), setup=SETUP)
-        for name in ("radius", "spacing", "rms", "peak"):
-            low, high = result.band(name, SHARE)
-            if np.isfinite(low) and np.isfinite(truth[name].value):  # a spacing may not be stated
-                inside.setdefault(name, []).append(float(low <= truth[name].value <= high))
-    print(f"{arguments.seeds} seeds, {side}² px, {arguments.counts:g} counts a pixel\n")
-    print("| filaments | stated | number of the exact field in the band of 68 % |\n|-|-|-|")
-    for name, shares in inside.items():
-        print(f"| {name} | {len(shares)} | {np.mean(shares):.0%} |")
-
-
 PARTS: dict[str, Callable[[argparse.Namespace], None]] = {
     "integrals": integrals,
     "maps": maps,
     "bands": bands,
-    "filaments": filament_bands,
 }
 
 

@@ -1,4 +1,4 @@
-"""Make the pictures of products: the burner's profile, turbulence, filaments, a toroid's integrals.
+"""Make the pictures of products: the burner's profile, turbulence, a toroid's integrals.
 
     python docs/make_analysis_pictures.py [BURNER]
 
@@ -170,44 +170,6 @@ def turbulence(side: int = 200, slope: float = -5 / 3, contrast: float = 0.6) ->
     save(figure, "pictures/turbulence-spectrum.png")
 
 
-def filaments(side: int = 160, radius: float = 5.0, spacing: float = 29.0) -> None:
-    """Invert a shot of bent filaments, and draw the autocorrelations of its field."""
-    setup = ProtonSetup(
-        energy=14.7, source_object_distance=1e-2, object_image_distance=0.3, pixel_size=5e-6
-    )
-    y, x = np.mgrid[:side, :side] - (side - 1) / 2
-    along, across = (0.5 * y + 0.866 * x) / side, 0.866 * y - 0.5 * x
-    rng, potential = np.random.default_rng(0), np.zeros((side, side))
-    for number in range(-2, 3):
-        bent = across - number * spacing - 2 * np.sin(2 * np.pi * (along + rng.random()))
-        potential += 14 * np.exp(-0.5 * (bent / radius) ** 2 - 24 * along**2)
-    image = rng.poisson(1000 * synthetic_image(-np.stack(np.gradient(potential))))
-    inversion = invert(image, source=np.full(image.shape, 1000.0))
-    (measured,) = analyse(inversion, "filaments", setup=setup, unit="MG µm")
-    for fact in measured.facts:
-        print(f"{fact.title}: {fact.text}")
-    figure = Figure(figsize=(11, 3.5), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
-    show(left, image / 1000, "Proton image", "counts / beam", (0, 2.5))
-    strength = 1e4 * np.hypot(*setup.path_integrated_b(inversion.displacement))
-    show(middle, strength, "Field", "MG µm", (0, float(strength.max())), "inferno")
-    lag = 1e6 * measured.coordinates["lag"].values
-    for name, label, colour in (
-        ("autocorrelation", "across", BLUE),
-        ("along", "along", ORANGE),
-    ):
-        right.plot(lag, measured[name].value, color=colour, label=label)
-    right.axhline(0, color=DARK, lw=0.6)
-    for name, factor, text in (("radius", np.sqrt(2), "√2 a"), ("spacing", 1.0, "spacing")):
-        place = 1e6 * factor * float(measured[name].value)
-        right.axvline(place, color=DARK, lw=0.8, ls=":")
-        right.annotate(text, (place, 1.1), (4, 0), textcoords="offset points", fontsize=9)
-    right.set_ylim(-1, 1.25)
-    right.legend(frameon=False, loc="lower right")
-    tidy(right, "Autocorrelation of the field", "lag (µm)", "", 0.9)
-    save(figure, "pictures/filaments.png")
-
-
 def integrals(side: int = 160, sigma: float = 24e-6) -> None:
     """Draw a flux, a current and a region of a toroid, its azimuthal field, and the contrast."""
     setup, middle = ProtonSetup.example(), (side - 1) / 2
@@ -257,7 +219,6 @@ def integrals(side: int = 160, sigma: float = 24e-6) -> None:
 
 def main() -> None:
     turbulence()
-    filaments()
     integrals()
     if len(sys.argv) > 1:
         burner_profile(Path(sys.argv[1]))

@@ -9,12 +9,10 @@ import xarray as xr
 from helpers.exact_fields import SETUP, field_of
 from napari_shadowinv.analysis import (
     Contrast,
-    Flux,
     LineProfile,
     Region,
     analyse,
     analyse_shots,
-    time_series,
 )
 from napari_shadowinv.analysis.series import shot_times
 from napari_shadowinv.errors import InputError
@@ -27,16 +25,6 @@ TIMES = 1e-9 * np.arange(3)
 
 def field_at(time: float):
     return toroid((32, 32), SETUP, 20 * np.exp(RATE * time), 6e-6)
-
-
-def test_a_series_has_the_numbers_of_its_shots():
-    results = [analyse(field_of(field_at(time)), REGION)[0] for time in TIMES]
-    series = time_series(results, TIMES)
-    assert series.variables["rms"].unit == "T m"
-    ratio = series["peak"].value[1:] / series["peak"].value[:-1]
-    np.testing.assert_allclose(ratio, np.exp(RATE * 1e-9))
-    samples = [each.quantities["rms"].samples for each in results]
-    assert series["rms"].samples.shape == (len(samples[0]), 3)
 
 
 def stack_of(times, gap: int | None = None) -> xr.Dataset:
@@ -64,6 +52,7 @@ def test_wrong_stacks_and_times_are_refused():
         (stack.isel(shot=0), None, "no stack of shots"),
         (stack, [0.0, 1.0], "one for each of 3 shots"),
         (stack_of(TIMES[:2], gap=0), None, "1 of 2 shots have a field"),
+        (stack, [0.0, 1.0, 1.0], "do not increase"),
     ):
         with pytest.raises(InputError, match=message):
             analyse_shots(wrong, REGION, times)
@@ -94,16 +83,3 @@ def test_times_follow_from_the_time_between_two_shots():
     assert shot_times([1.0, 3.0], [0, 2], "--times") == [1, 3]
     with pytest.raises(InputError, match="--times, expected the time between two shots in s"):
         shot_times([1.0, 3.0], [0, 1, 2], "--times")
-
-
-def test_shots_that_do_not_belong_together_are_refused():
-    first, second = (analyse(field_of(field_at(time)), REGION)[0] for time in TIMES[:2])
-    (flux,) = analyse(field_of(field_at(0)), Flux(path=[(5, 5), (9, 9)]))
-    for results, times, message in (
-        ([first], [0.0], "at least two shots"),
-        ([first, second], [0.0], "a time for each"),
-        ([first, second], [1.0, 1.0], "do not increase"),
-        ([first, flux], [0.0, 1.0], "different products"),
-    ):
-        with pytest.raises(InputError, match=message):
-            time_series(results, times)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
+import xarray as xr
 
 from helpers.exact_fields import SETUP, field_of
-from napari_shadowinv.analysis import CurrentDensity, LineProfile, Region, analyse, time_series
+from napari_shadowinv.analysis import CurrentDensity, LineProfile, Region, analyse, analyse_shots
 from napari_shadowinv.inversion import invert
 from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import toroid
@@ -63,7 +64,10 @@ def test_words_are_on_the_page_and_not_over_each_other():
 
 def test_series_has_a_panel_for_each_unit():
     fields = [field_of(toroid((48, 48), SETUP, peak, 9e-6)) for peak in (20.0, 30.0)]
-    series = time_series([analyse(field, PRODUCTS[1])[0] for field in fields], [0.0, 2e-9])
+    stack = xr.concat([field.dataset for field in fields], "shot").assign_attrs(
+        fields[0].dataset.attrs
+    )
+    (series,) = analyse_shots(stack, PRODUCTS[1], [0.0, 2e-9])
     numbers, places = products_figure([series]).axes
     assert (numbers.get_ylabel(), places.get_ylabel()) == ("field (T m)", "µm")
     assert places.get_xlabel() == "time (ns)"

@@ -6,11 +6,11 @@
 - maps: `CurrentDensity`, `ChargeDensity`, `PhaseCurvature`
 - how strongly the field structures the image: `Contrast`
 - objects with an axis: `AxisymmetricProfile` from the side, `AzimuthalProfile` face-on
-- turbulence and filaments: `TurbulenceSpectrum`, `Filaments`
+- turbulence: `TurbulenceSpectrum`
 - all kinds: `PRODUCTS`; products of a table or a line of text: `product_from_dict`,
   `product_from_text`
 - products in files and tables: `add_products`, `products_in`, `products_table`
-- a product over successive shots: `analyse_shots` of a store, `time_series` of results
+- a product over successive shots: `analyse_shots` of a store
 - add a product: a subclass of `Product`, in a module that `kinds` imports
 """
 

@@ -2,7 +2,6 @@ from ._analyse import analyse
 from .axisymmetric import AxisymmetricProfile, AzimuthalProfile
 from .contrast import Contrast
 from .currents import EnclosedCharge, EnclosedCurrent, Flux
-from .filaments import Filaments
 from .frame import FIELD_UNITS, FieldFrame
 from .kinds import PRODUCTS, product_from_dict, product_from_text
 from .lines import LineProfile
@@ -10,7 +9,7 @@ from .maps import ChargeDensity, CurrentDensity, PhaseCurvature
 from .product import Product
 from .regions import Region
 from .result import ProductResult, add_products, products_in, products_table
-from .series import analyse_shots, time_series
+from .series import analyse_shots
 from .spectra import TurbulenceSpectrum
 
 __all__ = [
@@ -24,7 +23,6 @@ __all__ = [
     "EnclosedCharge",
     "EnclosedCurrent",
     "FieldFrame",
-    "Filaments",
     "Flux",
     "LineProfile",
     "PhaseCurvature",
@@ -39,5 +37,4 @@ __all__ = [
     "product_from_text",
     "products_in",
     "products_table",
-    "time_series",
 ]

@@ -17,7 +17,6 @@ from napari_shadowinv.analysis import (
     axisymmetric,
     contrast,
     currents,
-    filaments,
     lines,
     maps,
     regions,
@@ -28,7 +27,7 @@ from napari_shadowinv.errors import InputError
 from napari_shadowinv.preprocessing.steps import choices_of
 
 # Their products register themselves.
-_MODULES = (lines, regions, currents, maps, contrast, axisymmetric, spectra, filaments)
+_MODULES = (lines, regions, currents, maps, contrast, axisymmetric, spectra)
 
 PRODUCTS: dict[str, type[Product]] = choices_of(Product)
 """All kinds of products by their names."""

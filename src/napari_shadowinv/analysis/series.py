@@ -1,4 +1,4 @@
-"""A product over successive shots: `time_series`, `analyse_shots`.
+"""A product over successive shots: `analyse_shots`.
 
 - the time of each shot from the time between two: `shot_times`
 """
@@ -16,11 +16,7 @@ from numpy.typing import ArrayLike
 from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.analysis._analyse import analyse
-from napari_shadowinv.analysis.product import (
-    Coordinate,
-    Measurand,
-    Product,
-)
+from napari_shadowinv.analysis.product import Coordinate, Measurand, Product
 from napari_shadowinv.analysis.result import SERIES_AXES, ProductResult
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Fact
@@ -35,44 +31,8 @@ _TIME, _SHOT = SERIES_AXES
 _AXES = {"s": (_TIME, "time"), "": (_SHOT, "number of the shot")}
 
 
-def time_series(results: Sequence[ProductResult], times: ArrayLike | None = None) -> ProductResult:
-    """Join the numbers of one product in several shots.
-
-    Parameters
-    ----------
-    results : sequence of ProductResult
-        Of the same product and field, one for each shot, as `analyse` returns them.
-    times : array_like, shape (n,), optional
-        Of the shots, in s, increasing. Default: shots are numbered.
-
-    Returns
-    -------
-    ProductResult
-        The numbers along the axis of the shots; errors of different shots are independent in its
-        samples.
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two shots, the times do not increase, or the products differ.
-
-    Notes
-    -----
-    Samples of different shots are drawn by the same random numbers, so they are shuffled here.
-    Errors that all shots share, such as the energy's, then count as independent.
-    """
-    if times is None:
-        return _join(results, np.arange(float(len(results))), "")
-    return _join(results, np.asarray(times, dtype=np.float64), "s")
-
-
 def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> ProductResult:
     """Join results at times in s, or at numbers of shots."""
-    if len(results) < 2 or places.shape != (len(results),):
-        raise InputError(
-            f"got {len(results)} results and times of shape {places.shape}, expected a time for "
-            "each of at least two shots"
-        )
     if not (np.isfinite(places).all() and (np.diff(places) > 0).all()):
         places_in_words = "times" if unit else "numbers of the shots"
         raise InputError(
@@ -80,11 +40,6 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Pr
             f"{', in s' if unit else ''}"
         )
     first = results[0]
-    kinds = {(type(each.product), each.field) for each in results}
-    if len(kinds) > 1:
-        raise InputError("the results are of different products or fields, expected one of each")
-    count = min(len(next(iter(each.quantities.values())).samples) for each in results)
-    orders = [np.random.default_rng(shot).permutation(count) for shot in range(len(results))]
     axis, long_name = _AXES[unit]
     variables = {
         name: replace(variable, dims=(axis,)) for name, variable in _single_numbers(first).items()
@@ -92,9 +47,10 @@ def _join(results: Sequence[ProductResult], places: FloatArray, unit: str) -> Pr
     quantities = {}
     for name in variables:
         shots = [each.quantities[name] for each in results]
-        samples = [shot.samples[:count][order] for shot, order in zip(shots, orders, strict=True)]
         values = np.array([float(shot.value) for shot in shots])
-        quantities[name] = Quantity(values, np.stack(samples, axis=1), shots[0].is_maximum)
+        quantities[name] = Quantity(
+            values, np.stack([shot.samples for shot in shots], axis=1), shots[0].is_maximum
+        )
     result = replace(
         first,
         quantities=quantities,
@@ -176,12 +132,14 @@ def analyse_shots(
     Returns
     -------
     list of ProductResult
-        As of `time_series`, for each product, and each field that it is defined for.
+        The single numbers along the axis of the shots, for each product, and each field that it is
+        defined for.
 
     Raises
     ------
     InputError
-        If it is no stack, fewer than two shots have a field, or as of `analyse` and `time_series`.
+        If it is no stack, fewer than two shots have a field, the times do not increase, or as of
+        `analyse`.
     InversionCancelled
         If `should_stop` returned true.
     """
