@@ -95,6 +95,33 @@ def test_the_error_bars_are_as_large_as_the_error(found: Fit) -> None:
     assert found.total_error == pytest.approx(deviation / size)
 
 
+def test_a_folded_ring_as_narrow_as_a_few_pixels_is_determined() -> None:
+    """Of 5 px, by 10⁴ counts a pixel: finer than splines with a knot every 2 px can be."""
+    side = 36
+
+    def outward(y: FloatArray, x: FloatArray) -> FloatArray:
+        v, u = y - (side - 1) / 2, x - (side - 1) / 2
+        radius = np.hypot(v, u) + 1e-9
+        return 4 * np.exp(-4 * np.log(2) * ((radius - 10) / 5) ** 2) * np.stack([v, u]) / radius
+
+    rng, shots = np.random.default_rng(5), []
+    for strength in STRENGTHS:
+        image = counted(lambda y, x: strength * outward(y, x), (side, side), rays=60, margin=4)  # noqa: B023
+        counts = rng.poisson(1e4 * image).astype(float)
+        source = np.full(image.shape, 1e4)
+        shots.append(Shot(counts, source=source, strength=strength, noise="poisson"))
+    result = fit(shots, options=FitOptions(threads=1))
+    truth = on_pixels(outward, (side, side))
+    (field,) = result.fields
+    assert result.folded > 0.05
+    assert result.verdict is Verdict.DETERMINED
+    assert distance(field.displacement, truth) < 0.012
+    assert field.errors.per_pixel is not None
+    ring = np.hypot(*truth) > 0.2
+    ratio = ((field.displacement - truth) / field.errors.per_pixel)[:, ring]
+    assert 0.5 < np.sqrt(np.square(ratio).mean()) < 1.4
+
+
 def test_the_parts_of_a_result_belong_together(found: Fit, folded_shots: list[FloatArray]) -> None:
     (field,) = found.fields
     data = noisy(folded_shots, NOISE)

@@ -9,7 +9,6 @@ import pytest
 
 from helpers.fit_images import hessian_times
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.forward import Scene, blurred
 from napari_shadowinv.fitting.instrument import EXACT, Imperfect
 from napari_shadowinv.fitting.rays import at_rest
@@ -25,8 +24,8 @@ def waves(shape: tuple[int, int], phase: float) -> FloatArray:
     return np.asarray(np.cos(y / 5 + phase) * np.sin(x / 7 - phase))
 
 
-@pytest.fixture
-def scene() -> Scene:
+@pytest.fixture(params=[2, 1], ids=["knots every 2 px", "knots every px"])
+def scene(request: pytest.FixtureRequest) -> Scene:
     """Two images by two fields, with all that may be unknown."""
     rng = np.random.default_rng(0)
     weights = rng.uniform(100, 900, (2, *SIZE))
@@ -52,6 +51,7 @@ def scene() -> Scene:
         ),
         blur=0.7,
         spacing=1 / 3,
+        knot=request.param,
         threads=1,
         imperfect=Imperfect(
             {"gamma": 0.1, "background": 0.05},
@@ -68,7 +68,7 @@ def scene() -> Scene:
 def some(scene: Scene) -> Unknowns:
     """An object, a beam, brightness and frames."""
     unknowns = scene.nothing()
-    y, x = (KNOT * (np.arange(n) - 1.0) - PAD for n in scene.rays.shape)
+    y, x = (scene.knot * (np.arange(n) - 1.0) - PAD for n in scene.rays.shape)
     bump = np.exp(-((y[:, None] - 14) ** 2 + (x - 22) ** 2) / 2 / 5**2)
     unknowns.potentials[0] = -18 * bump
     unknowns.potentials[1] = 9 * bump * np.cos(x / 3)

@@ -7,7 +7,9 @@ import pytest
 
 from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.fitting._ray_kernels import KNOT
+from napari_shadowinv.fitting.descent import between_knots
 from napari_shadowinv.fitting.rays import Pulls, RayModel, TracedBeam, at_rest
+from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.physics.forward import synthetic_image
 
 SIZE = (40, 54)
@@ -260,6 +262,27 @@ def test_displacement_is_minus_the_slope_of_the_values() -> None:
         np.testing.assert_allclose(
             np.moveaxis(displacement[axis], axis, 0)[2:-2], -slope, atol=2e-3
         )
+
+
+def test_knots_twice_as_dense_hold_the_same_potential_and_image() -> None:
+    dense = RayModel(SIZE, 8, spacing=0.1, knot=1)
+    usual = RayModel(SIZE, 8, spacing=0.1)
+    potential, beam = wavy(usual, FOLDED), usual.around(uneven())
+    nothing = np.zeros(0)
+    held = Unknowns(potential[None], nothing, nothing, turned()[None], nothing)
+    between = between_knots(held).potentials[0]
+    assert between.shape == dense.shape
+    assert dense.around(uneven()).shape == beam.shape
+    np.testing.assert_allclose(dense.values(between), usual.values(potential), atol=1e-11)
+    np.testing.assert_allclose(
+        dense.displacement(between), usual.displacement(potential), atol=1e-12
+    )
+    images = [
+        model.image(TracedBeam(each, model.ray_counts(each), beam, turned()))
+        for model, each in ((usual, potential), (dense, between))
+    ]
+    assert images[1].sum() == pytest.approx(images[0].sum(), rel=1e-4)
+    assert np.sqrt(np.square(images[1] - images[0]).mean()) < 0.02
 
 
 def test_rays_land_as_densely_as_asked() -> None:

@@ -18,11 +18,11 @@ from napari_shadowinv._napari import layer_metadata as about
 from napari_shadowinv._napari.layer_metadata import Frame, Kind, Result, frame_for, role_of
 from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.viewer_sync import connect_viewer, show_scale_bar
-from napari_shadowinv._system.arrays import PLANE, VECTOR
 from napari_shadowinv._typing import AnyArray, BoolArray, FloatArray
 from napari_shadowinv.inversion.error_budget import per_pixel_of
 from napari_shadowinv.inversion.variables import VARIABLES
 from napari_shadowinv.io.store import field_in_si
+from napari_shadowinv.physics.arrays import PLANE, VECTOR
 from napari_shadowinv.physics.setup import deflector_titles
 from napari_shadowinv.physics.units import (
     ShownField,

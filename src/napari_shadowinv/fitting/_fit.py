@@ -35,6 +35,7 @@ from napari_shadowinv.fitting.search import (
     refine_minimum,
     search,
     settle_minimum,
+    with_finer_knots,
 )
 from napari_shadowinv.fitting.shots import Shots
 from napari_shadowinv.fitting.starts import collect_starts
@@ -181,6 +182,8 @@ def _with_smoothness(
 ) -> _Minima:
     is_near = data.near is not None
     scene, best = estimate_smoothness(minima.scene, minima.best, rng, on_step, is_near=is_near)
+    if not (data.options.smoothness or is_near):
+        scene, best = with_finer_knots(scene, best, rng, on_step)
     if data.counted:
         scene = _reweight_counts(data, scene, best)
         best = settle_minimum(scene, best, on_step)

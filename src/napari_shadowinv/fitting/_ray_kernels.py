@@ -42,12 +42,12 @@ class Rays(NamedTuple):
     size: tuple[int, int]
 
 
-def spline_tables(places: FloatArray) -> tuple[FloatArray, FloatArray]:
+def spline_tables(places: FloatArray, knot: int = KNOT) -> tuple[FloatArray, FloatArray]:
     """The four B-splines at places (0 to 1) of a cell, and their slopes per px; shape (4, n)."""
     t, s = places, 1 - places
     values = [s**3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6, (4 - 6 * s**2 + 3 * s**3) / 6, t**3 / 6]
     slopes = [-(s**2) / 2, (3 * t**2 - 4 * t) / 2, (4 * s - 3 * s**2) / 2, t**2 / 2]
-    return np.stack(values), np.stack(slopes) / KNOT
+    return np.stack(values), np.stack(slopes) / knot
 
 
 @njit(**_PART)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from napari_shadowinv._typing import FloatArray
+from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product, solve
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.preconditioner import Preconditioner
@@ -291,6 +292,7 @@ def coarser(scene: Scene, factor: int) -> Scene:
         fiducials=None if fiducials is None else Fiducials(*(part / factor for part in fiducials)),
         imperfect=scene.imperfect.coarsen(factor),
         bin=scene.bin * factor,
+        knot=KNOT,
     )
 
 
@@ -309,6 +311,14 @@ def _narrower(width: float | FloatArray, factor: int) -> float:
 
 def finer(unknowns: Unknowns) -> Unknowns:
     """Return the same unknowns in pixels half as wide, with knots twice as dense: no change."""
+    frames = unknowns.frames.copy()
+    frames[:, [0, 3]] *= 2
+    unknowns = between_knots(unknowns)
+    return unknowns._replace(potentials=4 * unknowns.potentials, frames=frames)
+
+
+def between_knots(unknowns: Unknowns) -> Unknowns:
+    """Return the same unknowns with knots twice as dense: no change."""
     potentials = unknowns.potentials
     for axis in (1, 2):
         old = np.moveaxis(potentials, axis, 0)
@@ -316,6 +326,4 @@ def finer(unknowns: Unknowns) -> Unknowns:
         new[0::2] = (old[:-1] + old[1:]) / 2
         new[1::2] = (old[:-2] + 6 * old[1:-1] + old[2:]) / 8
         potentials = np.moveaxis(new, 0, axis)
-    frames = unknowns.frames.copy()
-    frames[:, [0, 3]] *= 2
-    return unknowns._replace(potentials=4 * potentials, frames=frames)
+    return unknowns._replace(potentials=potentials)

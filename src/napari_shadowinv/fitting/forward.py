@@ -36,7 +36,7 @@ class Scene(PriorTerms):
     Of the six numbers of a frame, except the first image's, `free_frames` are unknown. The
     covariance of the numbers of `response_units` is by default as before the images. A `force` is
     subtracted from the objective's derivatives: a random one makes its least a sample of the prior.
-    For `pad`, `spacing` and `threads` see `RayModel`.
+    For `pad`, `spacing`, `knot` and `threads` see `RayModel`.
     """
 
     images: FloatArray  # (L, H, W)
@@ -49,6 +49,7 @@ class Scene(PriorTerms):
     free_frames: BoolArray = field(default_factory=lambda: np.zeros(6, bool))
     blur: float = 0.0  # of residuals, px
     spacing: float = 0.25
+    knot: int = 2
     threads: int | None = None
     imperfect: Imperfect = EXACT
     held: frozenset[str] = frozenset()  # imperfections whose numbers do not change
@@ -60,7 +61,7 @@ class Scene(PriorTerms):
         """The rays of all images."""
         beyond = max(_reach(width, self.imperfect.blur) for width in self.psf)
         size = self.images.shape[1], self.images.shape[2]
-        return RayModel(size, self.pad, beyond, self.spacing, self.threads)
+        return RayModel(size, self.pad, beyond, self.spacing, self.knot, self.threads)
 
     @cached_property
     def prior(self) -> Prior:

@@ -11,7 +11,6 @@ from scipy.fft import dct, dctn, idctn
 from scipy.ndimage import gaussian_filter, laplace
 
 from napari_shadowinv._typing import FloatArray, IntArray
-from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.unknowns import Unknowns
 from napari_shadowinv.instrument.effects import DARKEST, RESPONSES
@@ -44,14 +43,16 @@ class Preconditioner:
         widths = [psf if isinstance(psf, float) else 0.0 for psf in scene.psf]
         variances = scene.blur**2 + np.square(widths)
         weights = np.exp(-variances[:, None, None] * squares)
-        weights *= KNOT**2 * scene.weights.mean(axis=(1, 2))[:, None, None]
+        weights *= scene.knot**2 * scene.weights.mean(axis=(1, 2))[:, None, None]
         # An image's change by a weak potential is its Laplacian.
         laplacian = -squares * np.sqrt(prior.power_seen)
         data = np.einsum("lyx,li,lj->yxij", weights, scene.strengths, scene.strengths)
         data *= laplacian[:, :, None, None] ** 2
         of_data = np.moveaxis(np.diagonal(data, axis1=2, axis2=3), -1, 0)
         rough = prior.roughness
-        self._kept = np.divide(of_data, of_data + rough, out=np.ones_like(rough), where=rough > 0)
+        self.determined = np.divide(
+            of_data, of_data + rough, out=np.ones_like(rough), where=rough > 0
+        )
         of_prior = np.moveaxis(prior.of_potentials(), 0, -1)
         matrix = data + of_prior[..., None] * np.eye(of_prior.shape[-1])
         roots = np.linalg.inv(np.linalg.cholesky(matrix))
@@ -116,7 +117,7 @@ class Preconditioner:
 
     def damp(self, unknowns: Unknowns) -> Unknowns:
         """Return unknowns without the finest waves, which knots further apart leave behind."""
-        waves = dctn(unknowns.potentials, axes=(1, 2), norm="ortho") * self._kept
+        waves = dctn(unknowns.potentials, axes=(1, 2), norm="ortho") * self.determined
         return unknowns._replace(potentials=idctn(waves, axes=(1, 2), norm="ortho"))
 
     def times(self, scaled: Unknowns) -> Unknowns:
@@ -223,8 +224,8 @@ def _beam_cosines(
     lines: list[FloatArray] = []
     knots: list[FloatArray] = []
     for n, side in zip(scene.rays.shape, scene.rays.size, strict=True):
-        place = np.asarray(KNOT * (np.arange(float(n)) - 1) - scene.pad)
-        inside = np.clip(np.minimum(place, side - place) / KNOT + 0.5, 0, 1)
+        place = np.asarray(scene.knot * (np.arange(float(n)) - 1) - scene.pad)
+        inside = np.clip(np.minimum(place, side - place) / scene.knot + 0.5, 0, 1)
         lines.append(dct(np.diag(inside), axis=0, norm="ortho")[:longest])
         knots.append(place + scene.pad - 0.5)
     numbers, count = scene.nothing(), len(scene.images)

@@ -18,9 +18,10 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from napari_shadowinv._system.machine import available_threads, in_ranges, run_together
-from napari_shadowinv._typing import FloatArray, IntArray
+from napari_shadowinv._typing import AnyArray, FloatArray, IntArray
 from napari_shadowinv.fitting import _ray_kernels as kernels
 from napari_shadowinv.fitting._ray_kernels import KNOT, MOST_RAYS
+from napari_shadowinv.physics.arrays import block_sums
 
 _BANDS = 8  # of cells; each has an image of its own, so that threads do not change a sum
 _GUARD = 2  # px around the detector, for rays that miss it
@@ -48,21 +49,23 @@ class RayModel:
     """Image of a beam behind a potential, by ray tracing.
 
     A potential is an array of coefficients with `shape`, in px², of cubic B-splines with a knot
-    every 2 px. A beam is the flux of each pixel, including the strip: `around` continues one from
-    the image. A frame maps the landing point (y, x) to the detector: (f0 + f1 y + f2 x, f3 + f4 y +
-    f5 x), in px from the image's middle. The result does not depend on the number of threads.
+    every 2 px, or every one: the kernels then work in half pixels. A beam is the flux of each
+    pixel, including the strip: `around` continues one from the image. A frame maps the landing
+    point (y, x) to the detector: (f0 + f1 y + f2 x, f3 + f4 y + f5 x), in px from the image's
+    middle. The result does not depend on the number of threads.
     """
 
     size: tuple[int, int]  # height and width of the image
     pad: int = 12  # width, even, of the strip around the image from which rays may enter, px
     beyond: int = 0  # width of a strip around the image that is evaluated, too, px
     spacing: float = 0.25  # largest distance between landing points of neighbouring rays, px
+    knot: int = KNOT  # px between knots, or half as many
     threads: int | None = None  # all cores
 
     @property
     def _at_rest(self) -> int:
         """Rays along a cell's side where nothing stretches it."""
-        count = math.ceil(KNOT / self.spacing - 1e-9)
+        count = math.ceil(self.knot / self.spacing - 1e-9)
         # They shall not land on the kinks of their shares.
         return count + (count % 4 == 2)
 
@@ -70,7 +73,13 @@ class RayModel:
     def cells(self) -> tuple[int, int]:
         """Cells between knots along y and x, including the strip."""
         height, width = self.size
-        return math.ceil(height / KNOT) + self.pad, math.ceil(width / KNOT) + self.pad
+        rows, columns = math.ceil(height / KNOT) + self.pad, math.ceil(width / KNOT) + self.pad
+        return self._parts * rows, self._parts * columns
+
+    @property
+    def _parts(self) -> int:
+        """Pixels of the kernels along a pixel."""
+        return KNOT // self.knot
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -85,16 +94,16 @@ class RayModel:
 
     def around(self, image: FloatArray) -> FloatArray:
         """Return a beam that goes on beyond an image's edge as at its edge."""
-        rows, columns = (KNOT * n - self.pad - side for n, side in zip(self.cells, self.size))  # noqa: B905
+        rows, columns = (self.knot * n - self.pad - side for n, side in zip(self.cells, self.size))  # noqa: B905
         return np.pad(image, ((self.pad, rows), (self.pad, columns)), mode="edge")
 
     def ray_counts(self, potential: FloatArray) -> IntArray:
         """Return the rays along y and x that each cell needs to land so densely, (2, *cells)."""
         middle = potential[1:-1, 1:-1]
-        yy = (potential[2:, 1:-1] - 2 * middle + potential[:-2, 1:-1]) / KNOT**2
-        xx = (potential[1:-1, 2:] - 2 * middle + potential[1:-1, :-2]) / KNOT**2
+        yy = (potential[2:, 1:-1] - 2 * middle + potential[:-2, 1:-1]) / self.knot**2
+        xx = (potential[1:-1, 2:] - 2 * middle + potential[1:-1, :-2]) / self.knot**2
         yx = potential[2:, 2:] - potential[2:, :-2] - potential[:-2, 2:] + potential[:-2, :-2]
-        yx = yx / (2 * KNOT) ** 2
+        yx = yx / (2 * self.knot) ** 2
         stretch = np.stack([np.hypot(1 - yy, yx), np.hypot(1 - xx, yx)])
         # The curvature within a cell is a mean of that at its four corners.
         most = np.maximum(stretch[:, 1:], stretch[:, :-1])
@@ -123,13 +132,16 @@ class RayModel:
         The pull is a weight of each pixel, with the shape `seen`. Derivatives by beam and frame are
         zero unless they are wanted.
         """
-        potentials, beam = np.zeros((_BANDS, *self.shape)), np.zeros(traced.beam.shape)
-        pulls = Pulls(potentials, beam, np.zeros((_BANDS, 6)))
+        parts, (rows, columns) = self._parts, traced.beam.shape
+        beam = np.zeros((parts * rows, parts * columns))
+        pulls = Pulls(np.zeros((_BANDS, *self.shape)), beam, np.zeros((_BANDS, 6)))
         slopes = _slopes_between_pixels(np.pad(pull, _GUARD))
         sums = pulls.potential, pulls.beam, of_beam, pulls.frame, of_frame
         self._in_ranges(kernels.gather, _BANDS, traced, slopes, *sums)
-        about_middle = self._about_middle(pulls.frame.sum(axis=0))
-        return Pulls(pulls.potential.sum(axis=0), pulls.beam, about_middle)
+        about_middle = self._about_middle(pulls.frame.sum(axis=0) / _lengths(parts))
+        if parts > 1:
+            beam = block_sums(beam, parts) / parts**2
+        return Pulls(parts**2 * pulls.potential.sum(axis=0), beam, about_middle)
 
     def jacobian(
         self, traced: TracedBeam, *, of_beam: bool = True, of_frame: bool = True
@@ -151,14 +163,30 @@ class RayModel:
         used, pixels = np.zeros_like(ends), np.empty(most, np.int32)
         of_splines, of_instrument = np.empty((most, 16)), np.empty((most, instrument_columns))
         begins, lines = ends - areas, (used, pixels, of_splines, of_instrument)
-        places = begins, _GUARD, self._middle, (of_beam, of_frame)
+        middle = self._parts * self._middle[0], self._parts * self._middle[1]
+        places = begins, _GUARD, middle, (of_beam, of_frame)
         self._in_ranges(kernels.collect, len(reached), traced, reached, *places, *lines)
         rows = np.empty(math.prod(self.seen) + 1, np.int32)
-        entries = (16 + instrument_columns) * int(used.sum())
-        columns, values = np.empty(entries, np.int32), np.empty(entries, np.float32)
+        most = (16 + instrument_columns) * int(used.sum())
+        columns, values = np.empty(most, np.int32), np.empty(most, np.float32)
         kernels.merge(begins, *lines, of_beam, rows, columns, values)
+        entries: tuple[AnyArray, AnyArray] = values[: rows[-1]], columns[: rows[-1]]
+        if self._parts > 1:
+            entries = self._in_whole_pixels(traced, *entries)
         shape = (len(rows) - 1, traced.potential.size + traced.beam.size + 6)
-        return csr_array((values[: rows[-1]], columns[: rows[-1]], rows), shape=shape)
+        return csr_array((*entries, rows), shape=shape)
+
+    def _in_whole_pixels(
+        self, traced: TracedBeam, values: AnyArray, columns: AnyArray
+    ) -> tuple[AnyArray, AnyArray]:
+        """Values and columns of a Jacobian whose columns are in pixels of the kernels."""
+        parts, whole = self._parts, np.arange(traced.beam.size).reshape(traced.beam.shape)
+        pixels = whole.repeat(parts, axis=0).repeat(parts, axis=1).ravel()
+        first, after = traced.potential.size, traced.potential.size + traced.beam.size
+        scales = [np.full(first, parts**2), np.full(pixels.size, parts**-2), 1 / _lengths(parts)]
+        numbers = [np.arange(first), first + pixels, after + np.arange(6)]
+        scale, number = np.concatenate(scales), np.concatenate(numbers).astype(np.int32)
+        return values * scale[columns].astype(np.float32), number[columns]
 
     def push(self, jacobian: csr_array, change: FloatArray) -> FloatArray:
         """Return a Jacobian times a change of its columns, (n,), with the shape `seen`."""
@@ -206,7 +234,7 @@ class RayModel:
     def displacement(self, potential: FloatArray) -> FloatArray:
         """Return -∇ψ in px at the pixels' centres, shape (2, H, W), in axis order (y, x)."""
         height, width = self.size
-        values, slopes = kernels.spline_tables((np.arange(KNOT) + 0.5) / KNOT)
+        values, slopes = kernels.spline_tables((np.arange(self.knot) + 0.5) / self.knot, self.knot)
         along_y = _at_pixels(potential, slopes, self.pad, height)
         along_x = _at_pixels(potential.T, slopes, self.pad, width).T
         down = _at_pixels(along_y.T, values, self.pad, width).T
@@ -215,7 +243,7 @@ class RayModel:
     def values(self, potential: FloatArray) -> FloatArray:
         """Return ψ in px² at the pixels' centres, shape (H, W)."""
         height, width = self.size
-        values, _ = kernels.spline_tables((np.arange(KNOT) + 0.5) / KNOT)
+        values, _ = kernels.spline_tables((np.arange(self.knot) + 0.5) / self.knot)
         along_y = _at_pixels(potential, values, self.pad, height)
         return _at_pixels(along_y.T, values, self.pad, width).T
 
@@ -238,14 +266,18 @@ class RayModel:
         Fewer rays are not worth one. Near an edge, `shared` spacings at rest wide, rays count in
         both pixels, evenly then.
         """
-        potential, counts, beam, frame = traced
-        frame_px = self._to_pixels(at_rest() if frame is None else frame)
+        (potential, counts, beam, frame), parts = traced, self._parts
+        frame_px = self._to_pixels(at_rest() if frame is None else frame) / _lengths(parts)
+        if parts > 1:
+            potential = parts**2 * potential
+            beam = beam.repeat(parts, axis=0).repeat(parts, axis=1) / parts**2
         threads = available_threads(self.threads)
         if (counts[0] * counts[1]).sum() < fewest:
             threads = 1
-        steepness = self._at_rest / KNOT / shared
+        steepness = self._at_rest / self.knot / shared
         splines, size = _tables(), self._guarded
-        rays = kernels.Rays(potential, counts, beam, splines, frame_px, self.pad, steepness, size)
+        pad = parts * self.pad
+        rays = kernels.Rays(potential, counts, beam, splines, frame_px, pad, steepness, size)
         in_ranges(kernel, ranges, threads, rays, *rest, smallest=1, uneven=True)
 
     @property
@@ -290,6 +322,11 @@ def _entries(matrix: csr_array) -> kernels.Entries:
 _UNSIGNED = {4: np.uint32, 8: np.uint64}
 
 
+def _lengths(parts: int) -> FloatArray:
+    """Which of a frame's numbers are divided by how many parts a pixel has."""
+    return np.array([1.0, parts, parts, 1.0, parts, parts])
+
+
 def at_rest() -> FloatArray:
     """Return the frame of a detector that sees rays where they land."""
     return np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0])
@@ -307,7 +344,8 @@ def _tables() -> FloatArray:
 def _at_pixels(coefficients: FloatArray, table: FloatArray, pad: int, count: int) -> FloatArray:
     """Splines along the first axis at the pixels' centres; `table` has the values in a cell."""
     cells = len(coefficients) - 3
-    values = np.empty((KNOT * cells, coefficients.shape[1]))
-    for k in range(KNOT):
-        values[k::KNOT] = sum(table[i, k] * coefficients[i : i + cells] for i in range(4))
+    knot = table.shape[1]
+    values = np.empty((knot * cells, coefficients.shape[1]))
+    for k in range(knot):
+        values[k::knot] = sum(table[i, k] * coefficients[i : i + cells] for i in range(4))
     return values[pad : pad + count]

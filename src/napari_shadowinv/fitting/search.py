@@ -13,9 +13,15 @@ from scipy.ndimage import map_coordinates
 
 from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.fitting._ray_kernels import KNOT
 from napari_shadowinv.fitting.conjugate_gradients import SoftModes, product
-from napari_shadowinv.fitting.descent import NewtonSteps, coarser, descend, finer, settle
+from napari_shadowinv.fitting.descent import (
+    NewtonSteps,
+    between_knots,
+    coarser,
+    descend,
+    finer,
+    settle,
+)
 from napari_shadowinv.fitting.forward import Linear, Scene
 from napari_shadowinv.fitting.parallel import OnStep, run_in_parallel
 from napari_shadowinv.fitting.posterior import Posterior, Response
@@ -29,6 +35,7 @@ _USUAL, _ROUGH = NewtonSteps(), NewtonSteps(is_rough=True)
 COARSE_GAIN = 3.0
 # With numbers that resemble fields, an error of the model far below the noise changes the field.
 SPACING_WITH_NUMBERS = 0.1  # px
+SPACING_OF_FINE_KNOTS = 0.075  # px, for objects that are as sharp as a pixel
 SMALL_PX = 80  # shorter side of images with too few pixels for an instrument's numbers
 # An object's roughness is not spread evenly, as the likeliest λ and κ assume: they would round it
 # off where it is sharpest.
@@ -81,7 +88,7 @@ class Minimum:
 def _splines_of(scene: Scene, potential: FloatArray) -> FloatArray:
     """Return coefficients of a potential given at the recorded image's pixels, about."""
     rays = scene.rays
-    lines = ((KNOT * (np.arange(n) - 1.0) - rays.pad) * scene.bin - 0.5 for n in rays.shape)
+    lines = ((rays.knot * (np.arange(n) - 1.0) - rays.pad) * scene.bin - 0.5 for n in rays.shape)
     places = np.meshgrid(*lines, indexing="ij")
     inner = potential - border_mean(potential)
     values = map_coordinates(inner, places, order=1, mode="nearest")
@@ -189,6 +196,28 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
     # Without waves that larger pixels left behind.
     unknowns = Preconditioner(scene).damp(minimum.in_pixels(1))
     return Minimum(minimum.start, unknowns, minimum.value, scene.displacement(unknowns), 1)
+
+
+def with_finer_knots(
+    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+) -> tuple[Scene, Minimum]:
+    """Return the scene with knots as fine as the images determine, its λ and κ, and the minimum."""
+    while scene.knot > 1 and _determines_finest(scene):
+        if end.bin > 1:
+            end = in_recorded_pixels(scene, end)
+        else:
+            scene = replace(scene, knot=scene.knot // 2, spacing=SPACING_OF_FINE_KNOTS)
+            end = replace(end, unknowns=between_knots(end.unknowns), modes=SoftModes())
+        end = settle_minimum(scene, end, on_step)
+        smoothness, end = _likely_smoothness(scene, end, rng, on_step)
+        scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness)
+        end = settle_minimum(scene, end, on_step)
+    return scene, end
+
+
+def _determines_finest(scene: Scene, share: float = 0.5) -> bool:
+    """Whether images rather than the prior determine the finest waves between the knots."""
+    return float(Preconditioner(scene).determined[:, -1, 0].max()) > share
 
 
 def estimate_smoothness(
@@ -404,8 +433,8 @@ def refine_minimum(
     """
     minimum, steps = in_recorded_pixels(scene, minimum), 0
     unknowns, modes = minimum.unknowns, copy(minimum.modes)  # others use them at the same time
-    has_dense_rays = scene.imperfect.resembles_fields and not is_near
-    usual = [SPACING_WITH_NUMBERS] if has_dense_rays else list(spacings)
+    is_delicate = scene.imperfect.resembles_fields and not is_near
+    usual = [scene.spacing] if is_delicate or scene.knot == 1 else list(spacings)
     denser = usual if options.spacing is None else [options.spacing]
     most = -(-options.max_iterations // len(denser))
     scene = replace(scene, spacing=denser.pop(0))

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.fft import dctn, idctn
 
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
-from napari_shadowinv.fitting._ray_kernels import KNOT, add_ties, spline_tables
+from napari_shadowinv.fitting._ray_kernels import add_ties, spline_tables
 from napari_shadowinv.fitting.rays import RayModel, at_rest
 
 
@@ -113,7 +113,9 @@ class Prior(PriorTerms):
 
     def add_ties(self, potentials: FloatArray, slope: FloatArray) -> None:
         """Add the Hessian of potentials, but for λ and κ, times their change."""
-        add_ties(potentials, self._within, self.tie, self.tie * (KNOT / self.decay) ** 2, slope)
+        add_ties(
+            potentials, self._within, self.tie, self.tie * (self.rays.knot / self.decay) ** 2, slope
+        )
         if self.fiducials is not None:
             weights = 1 / self.fiducials.errors[:, None] ** 2
             self._add_there(slope, weights * self._displacements_there(potentials))
@@ -134,7 +136,7 @@ class Prior(PriorTerms):
         for axis, step_within in enumerate(within, 1):
             steps = rng.normal(size=(len(potentials), *step_within.shape)) * ~step_within
             potentials -= root * np.diff(steps, axis=axis, prepend=0, append=0)
-        fading = np.where(inside, 0.0, (KNOT / self.decay) ** 2)
+        fading = np.where(inside, 0.0, (self.rays.knot / self.decay) ** 2)
         potentials += root * np.sqrt(fading) * rng.normal(size=potentials.shape)
         if self.fiducials is not None:
             errors = self.fiducials.errors[:, None]
@@ -154,7 +156,7 @@ class Prior(PriorTerms):
     def of_rough(self) -> FloatArray:
         """Penalty of each field's cosines by λ and by κ, shape (M, 2, …)."""
         powers = np.stack([self.wave_numbers**power for power in POWERS])
-        return KNOT**2 * self.smoothness[:, :, None, None] * powers
+        return self.rays.knot**2 * self.smoothness[:, :, None, None] * powers
 
     @cached_property
     def roughness(self) -> FloatArray:
@@ -164,14 +166,15 @@ class Prior(PriorTerms):
     @cached_property
     def wave_numbers(self) -> FloatArray:
         """k² of each cosine of the coefficients, px⁻²."""
-        waves = [np.pi * np.arange(n) / (n * KNOT) for n in self.rays.shape]
+        waves = [np.pi * np.arange(n) / (n * self.rays.knot) for n in self.rays.shape]
         return np.asarray(waves[0][:, None] ** 2 + waves[1] ** 2)
 
     @cached_property
     def power_seen(self) -> FloatArray:
         """Power of each cosine of the coefficients that splines and pixels let through."""
         along_y, along_x = (
-            np.sinc(np.arange(n) / (2 * n)) ** 8 * np.sinc(np.arange(n) / (2 * n * KNOT)) ** 2
+            np.sinc(np.arange(n) / (2 * n)) ** 8
+            * np.sinc(np.arange(n) / (2 * n * self.rays.knot)) ** 2
             for n in self.rays.shape
         )
         return np.asarray(along_y[:, None] * along_x)
@@ -179,10 +182,10 @@ class Prior(PriorTerms):
     def of_potentials(self) -> FloatArray:
         """Return the approximate penalty of each field's cosines, shape (M, …)."""
         squares = self.wave_numbers
-        lowest = (np.pi / (max(self.rays.shape) * KNOT)) ** 2 + (0.2 / self.decay) ** 2
+        lowest = (np.pi / (max(self.rays.shape) * self.rays.knot)) ** 2 + (0.2 / self.decay) ** 2
         # A fifth of the coefficients or so lies in the pad.
         tied = self.tie * (0.2 * squares + lowest)
-        return np.asarray(self.roughness + KNOT**2 * tied)
+        return np.asarray(self.roughness + self.rays.knot**2 * tied)
 
     @cached_property
     def _weights(self) -> list[FloatArray]:
@@ -200,7 +203,7 @@ class Prior(PriorTerms):
     @cached_property
     def _within(self) -> BoolArray:
         lines = [
-            np.abs(KNOT * (np.arange(n) - 1.0) - self.rays.pad - side / 2) <= side / 2
+            np.abs(self.rays.knot * (np.arange(n) - 1.0) - self.rays.pad - side / 2) <= side / 2
             for n, side in zip(self.rays.shape, self.rays.size, strict=True)
         ]
         return np.asarray(lines[0][:, None] & lines[1])
@@ -209,9 +212,11 @@ class Prior(PriorTerms):
     def _splines_there(self) -> tuple[IntArray, IntArray, FloatArray]:
         """Rows and columns of coefficients around each fiducial; displacement by each, (y, x)."""
         assert self.fiducials is not None
-        place = (self.fiducials.places + self.rays.pad) / KNOT
+        place = (self.fiducials.places + self.rays.pad) / self.rays.knot
         cell = np.floor(place).astype(np.int64)
-        (value_y, slope_y), (value_x, slope_x) = map(spline_tables, (place - cell).T)
+        (value_y, slope_y), (value_x, slope_x) = (
+            spline_tables(each, self.rays.knot) for each in (place - cell).T
+        )
         each = np.arange(4)
         rows = (cell[:, :1] + each)[:, :, None]
         columns = (cell[:, 1:] + each)[:, None, :]
