@@ -27,7 +27,7 @@ from napari_shadowinv import (
 )
 from napari_shadowinv.fitting.measurements import collect_data
 from napari_shadowinv.inversion import plan_sites
-from napari_shadowinv.physics.arrays import block_sums, coordinate_spacing
+from napari_shadowinv.physics.arrays import block_sums, coordinate_spacing, order_by_value
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.pipeline.fit_run import collect_fit_inputs
 from napari_shadowinv.preprocessing.estimates import UniformEstimate
@@ -224,3 +224,11 @@ def test_block_sums_are_numpys_to_the_last_bit(side):
     counts = (blocks > 0.1).sum(axis=(1, 3))
     np.testing.assert_array_equal(block_sums(usable, side), counts)
     assert block_sums(plane.astype(np.float32), side).dtype == np.float32
+
+
+@pytest.mark.parametrize("scale", [1e-290, 1.0, 1e290])
+def test_order_by_value_sorts_at_any_scale(scale: float) -> None:
+    values = scale * np.random.default_rng(3).integers(-5, 50, 3000)
+    order = order_by_value(values)
+    assert np.array_equal(order, np.argsort(values, kind="stable"))
+    assert np.array_equal(order_by_value(np.full(7, scale)), np.arange(7))

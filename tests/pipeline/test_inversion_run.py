@@ -13,7 +13,7 @@ from napari_shadowinv.physics.forward import synthetic_image
 from napari_shadowinv.physics.phantoms import gaussian_blob
 from napari_shadowinv.physics.setup import ProtonSetup
 from napari_shadowinv.pipeline import Cache, run
-from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES, quick_source
+from napari_shadowinv.pipeline.inversion_run import PREVIEW_SITES
 from napari_shadowinv.preprocessing import (
     Crop,
     Estimate,
@@ -22,7 +22,6 @@ from napari_shadowinv.preprocessing import (
     IsotropicEstimate,
     LowPassEstimate,
     LowPassFilter,
-    PolynomialEstimate,
     Recipe,
     UniformEstimate,
 )
@@ -121,15 +120,3 @@ def test_a_preview_has_few_sites(shot: Array) -> None:
     assert many.size > PREVIEW_SITES
     assert run(Recipe(), many, preview=True).report.n_sites == PREVIEW_SITES
     assert run(Recipe(options=FEW), many, preview=True).report.n_sites == 500
-
-
-@pytest.mark.parametrize("estimate", [LowPassEstimate(width=40), PolynomialEstimate()])
-def test_a_quick_estimate_is_close_to_the_exact_one(estimate: Estimate) -> None:
-    y, x = np.mgrid[:90, :121]
-    beam = 100 * np.exp(-((y - 40) ** 2 + (x - 70) ** 2) / 9000)
-    usable = np.ones(beam.shape, bool)
-    usable[10:20, 30:50] = False
-    quick = quick_source(estimate, np.where(usable, beam, 1e9), usable, 3000)
-    exact = estimate.source(beam, usable)
-    assert quick[usable].sum() == pytest.approx(beam[usable].sum(), rel=1e-9)
-    assert abs(quick - exact)[usable].max() < 0.03 * exact.max()

@@ -57,11 +57,6 @@ def test_an_isotropic_estimate_is_that_of_its_experiment() -> None:
         .source(expected[10:22, 4:25], None)
     )
     np.testing.assert_allclose(part, expected[10:22, 4:25], rtol=1e-12)
-    # With pixels merged.
-    shifted = np.array([[1.0, 0, 11.5], [0, 1, -1.5], [0, 0, 1]])
-    chosen = preprocessing.IsotropicEstimate().adapt_to(NEAR, image.shape, shifted)
-    blocks = chosen.source(image, None).reshape(15, 2, 20, 2).mean(axis=(1, 3))
-    np.testing.assert_allclose(chosen.coarsen(2).source(blocks, None), blocks, rtol=1e-9)
 
 
 def test_an_isotropic_estimate_needs_the_setup_of_a_point_source() -> None:

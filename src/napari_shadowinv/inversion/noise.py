@@ -29,8 +29,8 @@ from scipy import ndimage
 from napari_shadowinv._typing import BoolArray, FloatArray, IntArray
 from napari_shadowinv.inversion.normalise import Prepared
 from napari_shadowinv.options import InversionOptions
-from napari_shadowinv.physics.arrays import complete_block_means
-from napari_shadowinv.preprocessing.noise import NORMAL_MAD, finest_differences, order_by_value
+from napari_shadowinv.physics.arrays import complete_block_means, order_by_value
+from napari_shadowinv.preprocessing.noise import NORMAL_MAD, finest_differences
 from napari_shadowinv.preprocessing.pixels import nonnegative_fit
 
 

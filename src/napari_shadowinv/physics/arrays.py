@@ -6,7 +6,7 @@
 - two masks together: `join_masks`; enough usable pixels: `check_usable`
 - size of a pixel by the coordinates: `coordinate_spacing`
 - blocks of a plane: `block_sums`, `block_means`, `complete_block_means`
-- a `checksum`
+- places of values in their order: `order_by_value`; a `checksum`
 
 Everything else, dask arrays included, passes through untouched.
 """
@@ -258,6 +258,21 @@ def block_means(values: FloatArray, block: int) -> FloatArray:
     """Return means over square blocks; incomplete ones at the far edges are mirrored."""
     padding = [(0, -side % block) for side in values.shape]
     return complete_block_means(np.pad(values, padding, mode="symmetric"), block)
+
+
+def order_by_value(values: FloatArray) -> AnyArray:
+    """Return the places of finite values from the lowest to the highest, in single precision.
+
+    Equal values stay in their sequence. NumPy counts integers of 16 bits instead of comparing
+    them, so sorting by the two halves of the numbers is several times as fast as `argsort`.
+    """
+    heights = values - values.min()
+    heights /= heights.max() or 1.0
+    # The bits of numbers that are not negative are in the order of the numbers.
+    bits = heights.astype(np.float32).view(np.uint32)
+    order = np.argsort(bits.astype(np.uint16), kind="stable")
+    highs = (bits >> 16).astype(np.uint16)
+    return np.asarray(order[np.argsort(highs[order], kind="stable")])
 
 
 def checksum(array: AnyArray) -> str:

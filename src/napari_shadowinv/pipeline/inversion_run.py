@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -22,7 +22,7 @@ from napari_shadowinv._system.progress import OnProgress, Reporter, ShouldStop
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._system.validation import as_model
 from napari_shadowinv._typing import BoolArray, FloatArray
-from napari_shadowinv.cautions import Caution, OnCaution
+from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.inversion import Inversion, invert, plan_sites
 from napari_shadowinv.inversion.compilation import ensure_compiled
@@ -104,44 +104,12 @@ class Cache:
         self._solved = plan, inversion
 
 
-def quick_source(
-    estimate: Estimate,
-    image: FloatArray,
-    mask: BoolArray | None,
-    most_pixels: int,
-    should_stop: ShouldStop | None = None,
-    on_caution: OnCaution | None = None,
-) -> FloatArray:
-    """Estimate a source from an image whose pixels are merged until there are few enough."""
-    # Linear between the middles of the merged pixels, with the flux of the image.
-    factor = int(np.ceil(np.sqrt(image.size / most_pixels)))
-    if factor == 1 or min(image.shape) < 8 * factor:
-        return estimate.source(image, mask, should_stop, on_caution)
-    from scipy.ndimage import map_coordinates
-    from skimage.transform import downscale_local_mean
-
-    # It comes without types.
-    merged: Callable[..., FloatArray] = downscale_local_mean
-    usable = np.ones(image.shape, bool) if mask is None else mask
-    share = merged(usable.astype(float), (factor, factor))
-    sums = merged(np.where(usable, image, 0.0), (factor, factor))
-    filled = share > 0
-    coarse = np.where(filled, sums / np.where(filled, share, 1.0), 0.0)
-    coarser = estimate.coarsen(factor)
-    beam = coarser.source(coarse, None if filled.all() else filled, should_stop, on_caution)
-    middle = (factor - 1) / 2
-    places = np.meshgrid(*((np.arange(n) - middle) / factor for n in image.shape), indexing="ij")
-    fine = map_coordinates(beam, places, order=1, mode="nearest")
-    return np.asarray(fine * (image[usable].sum() / fine[usable].sum()))
-
-
 def _is_close(first: FloatArray, second: FloatArray) -> bool:
     # A filter keeps the mean of a uniform source to rounding only.
     return first.shape == second.shape and bool(np.allclose(first, second, rtol=1e-9, atol=0))
 
 
 PREVIEW_SITES = 5_000
-PREVIEW_PIXELS = 10_000
 _BYTES_PER_PIXEL = 24  # of an image and copies that steps make; an inversion needs more
 
 AnyShot = Shot | ArrayLike | str | Path
@@ -332,18 +300,16 @@ def _source(
     estimate = inputs.estimate_for(shot)
     assert estimate is not None
     report("source", 0, None, estimate.title)
-    by = partial(quick_source, estimate, most_pixels=PREVIEW_PIXELS) if preview else None
-    return estimate_source(estimate, shot, report.should_stop, doubts.append, by=by)
+    return estimate_source(estimate, shot, report.should_stop, doubts.append)
 
 
 def _remaining_source(inputs: Inputs, shot: Shot, should_stop: ShouldStop | None) -> FloatArray:
-    """Return the source of a shot with another beam, quickly; flat if its error is stated."""
+    """Return the source of a shot with another beam; flat if its error is stated."""
     is_stated = inputs.recipe.instrument.beam_rms is not None
     estimate = None if is_stated else inputs.estimate_for(shot)
     if estimate is None:
         return np.ones(shot.shape)
-    by = partial(quick_source, estimate, most_pixels=PREVIEW_PIXELS)
-    return estimate_source(estimate, shot, should_stop, lambda caution: None, by=by)
+    return estimate_source(estimate, shot, should_stop, lambda caution: None)
 
 
 def collect_inputs(recipe: Recipe, shot: AnyShot) -> Inputs:

@@ -110,19 +110,9 @@ class Estimate(Choice):
         """Return the prior of the beam's difference from `source`, if the image determines it."""
         return None
 
-    def coarsen(self, factor: int) -> Estimate:
-        """Return the estimate for an image with pixels `factor` times as large."""
-        return self
-
 
 class UniformEstimate(Estimate):
-    """The mean of the image, everywhere.
-
-    Examples
-    --------
-    >>> UniformEstimate().source([[1, 2], [3, 6]])
-    array([[3., 3.], [3., 3.]])
-    """
+    """The mean of the image, everywhere."""
 
     title = "uniform"
     uses_mask = False
@@ -180,9 +170,6 @@ class LowPassEstimate(Estimate):
             wider, reached = _blur_masked(values, usable, width, report)
             beam, support = np.where(support, beam, wider), support | reached
         return pixels.with_flux_of(beam, values, usable)
-
-    def coarsen(self, factor: int) -> Estimate:
-        return self.model_copy(update={"width": self.width / factor})
 
 
 def _blur_masked(
@@ -381,7 +368,9 @@ class IsotropicEstimate(Estimate):
         middle = [(side - 1) / 2 for side in shape]
         if matrix is not None:
             middle = [float(v) for v in np.linalg.solve(matrix, [*middle, 1.0])[:2]]
-        return self._with(point_distance(setup), *middle)
+        estimate = self.model_copy()
+        estimate._point = point_distance(setup), (middle[0], middle[1])
+        return estimate
 
     def fall_over(self, shape: tuple[int, int]) -> float:
         """Return the fall of the fluence from the brightest pixel of an image to the dimmest."""
@@ -391,17 +380,6 @@ class IsotropicEstimate(Estimate):
         far = [max(place, side - 1 - place) for place, side in places]
         highest, lowest = ((1 + (math.hypot(*r) / distance) ** 2) ** -1.5 for r in (near, far))
         return float(1 - lowest / highest)
-
-    def coarsen(self, factor: int) -> Estimate:
-        if self._point is None:
-            return self
-        distance, axis = self._point
-        return self._with(distance / factor, *((c + 0.5) / factor - 0.5 for c in axis))
-
-    def _with(self, distance: float, y: float, x: float) -> Self:
-        estimate = self.model_copy()
-        estimate._point = distance, (y, x)
-        return estimate
 
     def _estimate(
         self, values: FloatArray, usable: BoolArray, report: Reporter, on_caution: OnCaution

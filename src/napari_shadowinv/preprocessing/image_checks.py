@@ -34,8 +34,8 @@ from scipy import ndimage
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.facts import percent
-from napari_shadowinv.physics.arrays import complete_block_means
-from napari_shadowinv.preprocessing.noise import NORMAL_MAD, order_by_value
+from napari_shadowinv.physics.arrays import complete_block_means, order_by_value
+from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 from napari_shadowinv.preprocessing.pixels import LEAST_LIGHT, complete_blocks, nonnegative_fit
 
 _WINDOW_PX = 4  # side of the squares in which noise is measured

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import reduce
 from operator import or_
@@ -238,15 +237,10 @@ def estimate_source(
     shot: Shot,
     should_stop: ShouldStop | None = None,
     on_caution: OnCaution | None = None,
-    *,
-    by: Callable[..., FloatArray] | None = None,
 ) -> FloatArray:
-    """Estimate the source of a shot after its steps, from the pixels that neither mask hides.
-
-    `by` is called instead of `Estimate.source`, such as a quick one.
-    """
+    """Estimate the source of a shot after its steps, from the pixels that neither mask hides."""
     beam, usable = _for_estimate(shot)
-    source = (by or estimate.source)(beam, usable, should_stop=should_stop, on_caution=on_caution)
+    source = estimate.source(beam, usable, should_stop, on_caution)
     bare = shot.source_mask
     if bare is None:
         return source
