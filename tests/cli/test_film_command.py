@@ -53,7 +53,7 @@ def test_a_pack_is_described_and_repeated(truth: Truth, folder: Path) -> None:
     assert repeated in done("rerun", "pack.shadowinv", "--other-folders")
     assert "pack_again.png" in content(folder)
     for command, out in (("invert", "x.shadowinv"), ("fit", "x.shadowinv"), ("forward", "x.tif")):
-        refused(command, "pack.shadowinv", "--out", out, names="film pack")
+        refused(command, "pack.shadowinv", "--out", out, names="pack.shadowinv")
 
 
 def test_without_distances_the_table_lists_strengths(truth: Truth, folder: Path) -> None:

@@ -148,7 +148,7 @@ MISTAKES: dict[str, str | tuple[str, ...]] = {
     "forward grid.nc --setup setup.toml --set trace.source_size=1e-5": "use output 'counts'",
     "forward grid.nc --setup setup.toml --set trace.step=3": "trace.step is '3'",
     "forward grid.nc --setup setup.toml --deflector plasma": "leave it out",
-    "forward grid.nc::4 --setup setup.toml": "no array '4'",
+    "forward grid.nc::4 --setup setup.toml": "::4, which does not apply",
     "analyse ring.shadowinv": "received no product, expected at least one: profile [label=TEXT]",
     "analyse ring.shadowinv 'fluxx 1,1 2,2'": "did you mean 'flux'?",
     f"analyse ring.shadowinv {CIRCLE} --unit furlong": "unit is 'furlong', expected one of T m",

@@ -40,6 +40,8 @@ def object_of(
     received = ["--deflector"] if deflector and (file is None or is_grid) else []
     sections = () if is_grid else ("view.", "trace.")
     received += [key for key in settings.values if key.startswith(sections)]
+    if is_grid and (name := split_address(text)[1]):
+        received.append(f"::{name}")
     if received:
         kind = "a 3-D field" if is_grid else "a result" if file else "a phantom"
         raise InputError(
@@ -58,4 +60,8 @@ def _object_of_result(path: Path) -> PlannedObject:
     from napari_shadowinv.io import read_dataset
     from napari_shadowinv.pipeline.experiment_object import object_of_result
 
-    return object_of_result(read_dataset(path))
+    dataset = read_dataset(path)
+    try:
+        return object_of_result(dataset)
+    except InputError as error:
+        raise error.about(path) from error

@@ -77,7 +77,7 @@ class Preconditioner:
         places, images, of_beams = _beam_cosines(scene)
         scales, count = self.others[places], of_beams.shape[1:]
         long = np.s_[..., : count[0], : count[1]]
-        own = np.diag(np.where(scales > 0, scales**2, 1.0))
+        squares = np.diag(np.where(scales > 0, scales**2, 1.0))
         pulls = np.zeros((len(scales), scene.strengths.shape[1], *count))
         # Images whose beams have the same numbers are counted together.
         groups: dict[bytes, list[int]] = {}
@@ -88,10 +88,10 @@ class Preconditioner:
             of_fields = np.einsum("lm,lyx->myx", scene.strengths[group], weights[long][group])
             pulls += of_fields * (laplacian[long] * waves)[:, None]
             waves *= np.sqrt(weights[long][group].sum(axis=0))
-            own += np.einsum("qyx,pyx->qp", waves, waves)
+            squares += np.einsum("qyx,pyx->qp", waves, waves)
         table = np.einsum("nmyx,qmyx->qnyx", self._potentials[long], pulls)
-        own -= np.einsum("qmyx,pmyx->qp", table, table)
-        return _Coupling(long, places, table, np.linalg.inv(np.linalg.cholesky(own)).T)
+        squares -= np.einsum("qmyx,pmyx->qp", table, table)
+        return _Coupling(long, places, table, np.linalg.inv(np.linalg.cholesky(squares)).T)
 
     def _turn(self, waves: FloatArray, others: FloatArray) -> None:
         """Turn scaled values in place: with the beams move the fields that replace them."""

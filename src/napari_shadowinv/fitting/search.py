@@ -201,8 +201,12 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
 def with_finer_knots(
     scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
 ) -> tuple[Scene, Minimum]:
-    """Return the scene with knots as fine as the images determine, its λ and κ, and the minimum."""
-    while scene.knot > 1 and _determines_finest(scene):
+    """Return the scene with knots as fine as the images determine, its λ and κ, and the minimum.
+
+    Fields that the edge cuts are left alone: what a strip beyond it cannot explain passes for
+    roughness.
+    """
+    while scene.knot > 1 and _fades(end.displacement) and _determines_finest(scene):
         if end.bin > 1:
             end = in_recorded_pixels(scene, end)
         else:
@@ -213,6 +217,14 @@ def with_finer_knots(
         scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness)
         end = settle_minimum(scene, end, on_step)
     return scene, end
+
+
+def _fades(displacement: FloatArray, share: float = 0.25) -> bool:
+    """Whether a displacement, (…, H, W), is small along the image's border."""
+    squares = np.square(displacement)
+    inside = squares[..., 1:-1, 1:-1]
+    border = (squares.sum() - inside.sum()) / max(squares.size - inside.size, 1)
+    return bool(border <= share**2 * inside.mean())
 
 
 def _determines_finest(scene: Scene, share: float = 0.5) -> bool:

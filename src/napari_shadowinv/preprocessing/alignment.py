@@ -195,24 +195,24 @@ def measure_shift(
     check_shape("the source", source.shape, image.shape, "the image")
     usable = np.ones(image.shape, bool) if mask is None else mask
     block = -(-max(image.shape) // search.side)
-    whole = complete_blocks(usable, block)
+    complete = complete_blocks(usable, block)
     planes = (complete_block_means(plane, block) for plane in (image, source))
-    if not whole.any():
+    if not complete.any():
         return Shift(np.zeros(2), np.full(2, 1e3))
-    shot, reference = (np.where(whole, p / max(p[whole].mean(), 1e-300), 1.0) for p in planes)
-    value = _coarse_shift(shot, reference, whole, search)
+    shot, reference = (np.where(complete, p / max(p[complete].mean(), 1e-300), 1.0) for p in planes)
+    value = _coarse_shift(shot, reference, complete, search)
     fixed = _Structure.of(shot, search)
     for step in range(search.steps):
         moved = _Structure.of(ndimage.shift(reference, value, mode="mirror"), search)
-        both = fixed, moved, whole
+        both = fixed, moved, complete
         steps = _by_borders(*both, beam, search), _by_finest(*both, search)
         weights = [np.linalg.inv(covariance) for _, covariance in steps]
         covariance = np.linalg.inv(sum(weights))
-        found = covariance @ sum(w @ move for w, (move, _) in zip(weights, steps, strict=True))
+        change = covariance @ sum(w @ move for w, (move, _) in zip(weights, steps, strict=True))
         error = np.sqrt(np.diag(covariance))
-        is_settled = (np.abs(found) < (1.0 if step else 2.0) * error).all()
+        is_settled = (np.abs(change) < (1.0 if step else 2.0) * error).all()
         longest = search.longest / (1 + step)
-        value = value + (found if is_settled else np.clip(found, -longest, longest))
+        value = value + (change if is_settled else np.clip(change, -longest, longest))
         if is_settled or error.max() > search.longest:
             break
     return Shift(block * value, block * error)
@@ -234,11 +234,11 @@ def _coarse_shift(
     if not (np.ptp(shot[border]) > 0 and np.ptp(source[border]) > 0):
         return np.zeros(2)
     correlate: Callable[..., tuple[FloatArray, float, float]] = phase_cross_correlation
-    found, *_ = correlate(
+    found_shift, *_ = correlate(
         shot, source, reference_mask=border, moving_mask=border, overlap_ratio=search.overlap
     )
 
-    shift = np.asarray(found, dtype=np.float64)
+    shift = np.asarray(found_shift, dtype=np.float64)
     both = border & ndimage.shift(border, shift, order=0, cval=False)
 
     def misfit(beam: FloatArray, where: BoolArray) -> float:
@@ -309,11 +309,11 @@ def _by_borders(
     best = _NO_STEP
     places = cell / min(usable.shape) * places
     shifts = _likeliest_shifts(columns, places, counts, noise, beam, search)
-    for found in shifts:
+    for step in shifts:
         # Deeper borders show more, until they reach the object.
         allowed = search.agreeing * np.sqrt(np.diag(best[1]))
-        if best is _NO_STEP or (np.abs(found[0] - best[0]) < allowed).all():
-            best = min(best, found, key=lambda step: float(np.trace(step[1])))
+        if best is _NO_STEP or (np.abs(step[0] - best[0]) < allowed).all():
+            best = min(best, step, key=lambda each: float(np.trace(each[1])))
     return best
 
 
@@ -353,8 +353,8 @@ def _likeliest_shifts(
             normal, square = source.T @ shot, source.T @ source
             if not (np.linalg.cond(normal) < 1e12 and np.linalg.cond(square) < 1e12):
                 continue
-            rest = values - source @ np.linalg.solve(square, source.T @ values)
-            misfit = float((rest**2).sum())
+            residual = values - source @ np.linalg.solve(square, source.T @ values)
+            misfit = float((residual**2).sum())
             evidence = -misfit / 2 - float(logarithms[count - 1])
             if evidence > likeliest[k]:
                 likeliest[k], inverse = evidence, np.linalg.inv(normal)

@@ -74,7 +74,7 @@ class _Repetition(Job):
         inputs = collect_rerun(self.result.content, folder=self.folder)
         return inputs.run(on_progress, should_stop)
 
-    def add_to(self, viewer: Any, again: Rerun) -> None:
+    def add_to(self, viewer: Any, again: Rerun, job: Job) -> None:
         """Add the layers of the repeated result, and report the difference."""
         repeated = about.Result(again.content, self.result.origins)
         add_layers(viewer, about.main_layers(layers_of_result(repeated, self.frame, self.name)))
