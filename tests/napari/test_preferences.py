@@ -46,27 +46,15 @@ def test_new_layers_have_the_preferred_colours(viewer, solved, preferences):
     assert toroid()[-1][1]["colormap"] == "gray_r"
 
 
-@pytest.mark.parametrize(
-    ("choice", "unit", "scale"),
-    [("automatic", "mm", 0.02), ("µm", "um", 20), ("cm", "cm", 2e-3), ("m", "m", 2e-5)],
-)
-def test_axes_have_the_preferred_unit(preferences, choice, unit, scale):
-    preferences.units.length = choice
-    frame = frame_for((600, 400), None, pixel_size=20e-6)  # 12 mm high
+@pytest.mark.parametrize(("rows", "unit", "scale"), [(600, "mm", 0.02), (400, "um", 20)])
+def test_axes_have_a_unit_that_suits_their_length(rows, unit, scale):
+    frame = frame_for((rows, 400), None, pixel_size=20e-6)
     assert frame.units == (unit, unit)
     assert frame.scale == pytest.approx((scale, scale))
 
 
-def test_a_unit_that_napari_must_know(viewer, preferences, proton_setup, solved):
-    preferences.units.length = "mm"
-    (field, *_) = add_to_viewer(viewer, solved, proton_setup)
-    assert {str(unit) for unit in field.units} == {"millimeter"}
-    assert field.scale == pytest.approx([1.5e-3, 1.5e-3])
-
-
 def test_an_older_napari_has_the_defaults(monkeypatch):
     monkeypatch.delattr("napari.settings.get_plugin_settings", raising=False)
-    assert about.preference("units", "length") == "automatic"
     assert about.colour_map("field") == "inferno"
     about.use_preferred_threads()
     assert available_threads(None) >= 1

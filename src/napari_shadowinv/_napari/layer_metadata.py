@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 import numpy as np
 from scipy.ndimage import affine_transform
 
-from napari_shadowinv._napari.preferences import AUTOMATIC, colour_map, preference
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.facts import Level
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 Matrix = tuple[tuple[float, ...], ...]
 
-_MAX_LENGTH_UM = 10_000.0  # longer sides are in mm, unless the user prefers a unit
-_UNITS_PER_M = {"um": 1e6, "mm": 1e3, "cm": 1e2, "m": 1.0}
+_MAX_LENGTH = 0.01  # m; longer sides are in mm
 
 
 @dataclass(frozen=True)
@@ -87,10 +86,8 @@ def frame_for(
     side = pixel_size if setup is None else setup.object_pixel_size
     if side is None:
         return Frame()
-    unit = preference("units", "length").replace("µ", "u")
-    if unit == AUTOMATIC:
-        unit = "mm" if max(shape[-2:]) * side * 1e6 > _MAX_LENGTH_UM else "um"
-    pixel = side * _UNITS_PER_M[unit]
+    unit, per_m = ("mm", 1e3) if max(shape[-2:]) * side > _MAX_LENGTH else ("um", 1e6)
+    pixel = side * per_m
     return Frame(scale=(pixel, pixel), units=(unit, unit))
 
 

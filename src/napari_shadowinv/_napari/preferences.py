@@ -11,10 +11,7 @@ from typing import Any
 
 from napari_shadowinv._system.machine import set_default_threads
 
-AUTOMATIC = "automatic"
-
 DEFAULTS: dict[str, dict[str, Any]] = {
-    "units": {"length": AUTOMATIC},
     "colour_maps": {
         "image": "gray",
         "field": "inferno",

@@ -138,11 +138,6 @@ class Run(QtWidgets.QWidget):
         """The tag of the running work, or None."""
         return None if self._box is None else self._box.tag
 
-    @property
-    def cancelling(self) -> bool:
-        """Whether the work has been asked to stop, with no other work waiting."""
-        return self._box is not None and self._box.stop.is_set() and self._pending is None
-
     def start(self, work: Work, tag: Any = None, *, quiet: bool = False) -> None:
         """Start some work once the running work has stopped; only the latest request waits.
 

@@ -219,12 +219,11 @@ def with_finer_knots(
     return scene, end
 
 
-def _fades(displacement: FloatArray, share: float = 0.25) -> bool:
-    """Whether a displacement, (…, H, W), is small along the image's border."""
-    squares = np.square(displacement)
-    inside = squares[..., 1:-1, 1:-1]
-    border = (squares.sum() - inside.sum()) / max(squares.size - inside.size, 1)
-    return bool(border <= share**2 * inside.mean())
+def _fades(displacement: FloatArray, share: float = 0.5) -> bool:
+    """Whether displacements, (M, 2, H, W), are below a share of their largest along the border."""
+    size = np.hypot(displacement[:, 0], displacement[:, 1])
+    border = max(float(size[:, [0, -1]].max()), float(size[..., [0, -1]].max()))
+    return border <= share * float(size.max())
 
 
 def _determines_finest(scene: Scene, share: float = 0.5) -> bool:

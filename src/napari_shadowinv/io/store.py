@@ -1,7 +1,7 @@
 """Results of many shots in one Zarr store, written shot by shot.
 
 - open the results: `read_stack` (lazy, for everyone), `StackStore` (for a run)
-- the setup of each shot, where shots have different ones: `with_own_setups`, `of_each_setup`
+- the setup of each shot, where shots have different ones: `with_own_setups`
 
 Each variable has one chunk for each shot, each chunk is a file that appears whole or not at
 all, and the last one of a shot is its `status`: a shot that is not marked there is pending and will
@@ -11,7 +11,7 @@ be written again. So workers can write at the same time, and any of them may die
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -253,18 +253,6 @@ def _setups_of_block(reports: AnyArray) -> AnyArray:
     provenances = (json.loads(str(text) or "{}").get("provenance", {}) for text in reports)
     setups = (provenance.get("setup") for provenance in provenances)
     return np.array(["" if setup is None else json.dumps(setup) for setup in setups], object)
-
-
-def of_each_setup(dataset: xarray.Dataset, measure: Callable[[Any], float]) -> Any:
-    """Return a number of each shot's setup, NaN until it is done; None if all share one setup."""
-    if "setup" not in dataset:
-        return None
-    return dataset["setup"].data.map_blocks(_measure_setups, measure, dtype=np.float64)
-
-
-def _measure_setups(texts: AnyArray, measure: Callable[[Any], float]) -> FloatArray:
-    setups = _parse_setups(texts)
-    return np.array([np.nan if setup is None else measure(setup) for setup in setups])
 
 
 def field_in_si(dataset: xarray.Dataset, origin: str, name: str, setup: Any) -> Any:

@@ -5,7 +5,7 @@
 - the grey limits of an image: `intensity_limits`
 - the error of a largest value: `PeakError`
 - the prefix for a number: `prefix_for`; whether a unit takes one: `takes_prefix`
-- attributes of a variable of a dataset: `label`; of places: `place_label`; the places:
+- attributes of a variable of a dataset: `label`; the places:
   `place_coordinates`, `vector_coordinates`; units as figures print them: `display_unit`
 - a variable as an array: `numbers_of`; a dataset that lacks one: `refuse_missing`
 
@@ -290,11 +290,6 @@ FLUX_DENSITY = "1/pixel**2"
 def label(units: str, long_name: str) -> dict[str, str]:
     """Return the attributes of a variable."""
     return {"units": units, "long_name": long_name}
-
-
-def place_label(name: str) -> dict[str, str]:
-    """Return the attributes of pixels' places along y or x in metres."""
-    return label("m", f"{name} in the object plane")
 
 
 def place_coordinates(
