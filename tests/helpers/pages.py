@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -27,7 +28,8 @@ def commands(text: str) -> list[str]:
 
 
 def run_python(text: str) -> dict[str, Any]:
-    """Run all blocks of Python one after the other, and return their names."""
+    """Run all blocks of Python one after the other, without a screen, and return their names."""
+    matplotlib.use("agg")
     names: dict[str, Any] = {"__name__": "page"}
     for block in blocks(text, "python"):
         exec(compile(block, "page", "exec", dont_inherit=True), names)

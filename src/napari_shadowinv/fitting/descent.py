@@ -326,4 +326,4 @@ def between_knots(unknowns: Unknowns) -> Unknowns:
         new[0::2] = (old[:-1] + old[1:]) / 2
         new[1::2] = (old[:-2] + 6 * old[1:-1] + old[2:]) / 8
         potentials = np.moveaxis(new, 0, axis)
-    return unknowns._replace(potentials=potentials)
+    return unknowns._replace(potentials=np.ascontiguousarray(potentials))

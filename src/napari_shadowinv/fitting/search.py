@@ -199,24 +199,29 @@ def in_recorded_pixels(scene: Scene, minimum: Minimum) -> Minimum:
 
 
 def with_finer_knots(
-    scene: Scene, end: Minimum, rng: np.random.Generator, on_step: OnStep
+    scene: Scene,
+    end: Minimum,
+    rng: np.random.Generator,
+    on_step: OnStep,
+    *,
+    explained: float = 1.2,
 ) -> tuple[Scene, Minimum]:
     """Return the scene with knots as fine as the images determine, its λ and κ, and the minimum.
 
-    Fields that the edge cuts are left alone: what a strip beyond it cannot explain passes for
-    roughness.
+    What finer knots do not explain to a χ² of `explained` is no structure of the field, and what
+    the edge of the image cuts passes for structure: both keep their knots.
     """
-    while scene.knot > 1 and _fades(end.displacement) and _determines_finest(scene):
-        if end.bin > 1:
-            end = in_recorded_pixels(scene, end)
-        else:
-            scene = replace(scene, knot=scene.knot // 2, spacing=SPACING_OF_FINE_KNOTS)
-            end = replace(end, unknowns=between_knots(end.unknowns), modes=SoftModes())
-        end = settle_minimum(scene, end, on_step)
-        smoothness, end = _likely_smoothness(scene, end, rng, on_step)
-        scene = replace(scene, smoothness=SMOOTHNESS_RATIO * smoothness)
-        end = settle_minimum(scene, end, on_step)
-    return scene, end
+    if scene.knot == 1 or not (_fades(end.displacement) and _determines_finest(scene)):
+        return scene, end
+    minimum = settle_minimum(scene, in_recorded_pixels(scene, end), on_step)
+    finer = replace(scene, knot=1, spacing=SPACING_OF_FINE_KNOTS)
+    dense = replace(minimum, unknowns=between_knots(minimum.unknowns), modes=SoftModes())
+    dense = settle_minimum(finer, dense, on_step)
+    if finer.chi2(finer.model(dense.unknowns)).max() > explained:
+        return scene, end
+    smoothness, dense = _likely_smoothness(finer, dense, rng, on_step)
+    finer = replace(finer, smoothness=SMOOTHNESS_RATIO * smoothness)
+    return finer, settle_minimum(finer, dense, on_step)
 
 
 def _fades(displacement: FloatArray, share: float = 0.5) -> bool:

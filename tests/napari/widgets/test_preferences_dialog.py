@@ -2,7 +2,7 @@
 
 from qtpy.QtWidgets import QComboBox
 
-from napari_shadowinv._napari.preferences import preference
+from napari_shadowinv._napari.preferences import colour_map
 from napari_shadowinv._napari.run import Run
 from napari_shadowinv._system.machine import available_threads, set_default_threads
 
@@ -15,11 +15,11 @@ def test_the_dialog_of_napari_shows_and_keeps_the_preferences(preferences, windo
     pages = {dialog._list.item(row).text(): row for row in range(dialog._list.count())}
     dialog._list.setCurrentRow(pages["Shadowinv"])
     boxes = dialog._stack.currentWidget().findChildren(QComboBox)
-    (lengths,) = [box for box in boxes if box.findText("cm") >= 0 and box.findText("mm") >= 0]
-    lengths.setCurrentIndex(lengths.findText("mm"))
-    assert preference("units", "length") == "mm"
+    (signed,) = [box for box in boxes if box.findText("PiYG") >= 0]
+    signed.setCurrentIndex(signed.findText("PiYG"))
+    assert colour_map("signed") == "PiYG"
     dialog.reject()
-    assert preference("units", "length") == "automatic"
+    assert colour_map("signed") == "RdBu_r"
 
 
 def test_runs_have_the_preferred_number_of_threads(preferences, qtbot, wait):
