@@ -167,10 +167,9 @@ def test_masked_handwriting_does_not_poison_the_field(phantom, image):
     assert masked.report.converged
     outside = np.broadcast_to(~ink, (2, *SHAPE))
     true = phantom.displacement[outside]
-    assert relative_error(masked.displacement[outside], true) < 0.06
+    assert relative_error(masked.displacement[outside], true) < 0.03
     assert relative_error(poisoned.displacement[outside], true) > 0.25
     assert not masked.residual[ink].any()
-    assert not masked.image[ink].any()
     np.testing.assert_array_equal(masked.mask, ~ink)
 
 

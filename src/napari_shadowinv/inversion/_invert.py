@@ -31,6 +31,7 @@ from napari_shadowinv.inversion.machine_code import loading_kernels
 from napari_shadowinv.inversion.noise import ImageNoise
 from napari_shadowinv.inversion.normalise import (
     Prepared,
+    dark_in,
     margin_around,
     mask_unlit,
     number_of_sites,
@@ -57,7 +58,6 @@ from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, s
 # Steps of the read-out: up to the first number the potential, then the re-projection.
 _READ_STEPS = 30
 _STEPS = 100
-_DARK = 0.05  # of the mean of a source, behind an obstacle
 
 # Of the re-projection, along one axis. For sites 2 px apart, 16 rays per pixel differ from 144 by
 # 0.01 to 0.06 % of the mean (r.m.s.), a fiftieth of the residual that so few sites leave.
@@ -135,9 +135,10 @@ def invert(
         The undisturbed beam. Default: uniform. The image is scaled to its flux, so their units
         need not match.
     mask : array_like of bool, shape (H, W), optional
-        True at usable detector pixels. Others (handwriting, saturation, beyond the edge of the
-        film) carry no flux; the field there is only a smooth continuation. Set opaque obstacles
-        to zero in `source` instead: their shadows move with the rays.
+        True at usable detector pixels. Image and source are continued smoothly into gaps between
+        them (fiducials, handwriting, saturation) that are narrower than a fifth of the image;
+        wider parts (beyond the edge of the film), and those where the source is dark, carry no
+        flux. Set opaque obstacles to zero in `source` instead: their shadows move with the rays.
     options : InversionOptions, optional
         The defaults suit most images.
     instrument : Instrument, optional
@@ -236,7 +237,9 @@ def _prepare(
         source, mask, measured = plan.source, plan.mask, plan.measured
     recorded = source if measured else None
     mask, unlit = mask_unlit(image, recorded, mask)
-    is_dark = _dark_in_source(recorded, mask)
+    is_dark: BoolArray | bool = False
+    if recorded is not None and mask is not None:
+        is_dark = dark_in(np.asarray(recorded), mask)
     if unlit and plan is not None:
         plan, start = plan_over(plan.source, options, mask, plan.measured), None
     prepared = prepare(image, source, options, mask)
@@ -475,14 +478,6 @@ def _ranked(
     of_image = (*cautions, *prepared.cautions, *by_accuracy, *problem.checks())
     registered = inputs.registered.caution
     return tuple(filter(None, (*by_errors, registered, *inputs.unlit, *of_image)))
-
-
-def _dark_in_source(source: ArrayLike | None, mask: BoolArray | None) -> BoolArray | bool:
-    """Return the masked pixels where a recorded source is dark; False if there are none."""
-    if source is None or mask is None:
-        return False
-    beam = np.asarray(source, dtype=np.float64)
-    return np.asarray(~mask & (beam < _DARK * beam[mask].mean()))
 
 
 _checked_sources: WeakKeyDictionary[SitePlan, CheckedImage] = WeakKeyDictionary()

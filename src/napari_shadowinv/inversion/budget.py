@@ -251,8 +251,13 @@ class Budget:
             discretisation = root_of(squares.mean(), (squares * weights).sum() / 2)
         lengths = ErrorEstimate(float(np.sqrt(np.mean(length[lit] ** 2))), float(length.max()))
         effects, sensitivities, sizes, assumed = self._by_effects(response, displacement, estimate)
-        if not lit.all():
-            beside = _beside_dark(length, lit, solved[-1].level.spacing)
+        doubt = self._prepared.doubt
+        if doubt is not None:
+            effects["masked pixels"] = estimate(
+                response.to(response.flux_of_image(doubt[None] / self._prepared.unit))
+            )
+        if not (lit | self._prepared.gaps).all():
+            beside = _beside_dark(length, lit | self._prepared.gaps, solved[-1].level.spacing)
             effects["edges of dark areas"] = ErrorEstimate(
                 float(np.sqrt(np.mean(beside[lit] ** 2))), float(beside[row, column])
             )
@@ -302,10 +307,10 @@ class Budget:
         shot = SolvedShot(
             displacement=displacement,
             source=prepared.source,
-            mask=prepared.mask,
+            mask=prepared.lit,
             sites=response.sites,
             fluxes=(response.flux, response.level.mass),
-            areas=response.areas(prepared.mask),
+            areas=response.areas(prepared.lit),
             diffused=response.diffusion(),
             flux_of_source=response.flux_of_source,
             seed=self.options.seed,

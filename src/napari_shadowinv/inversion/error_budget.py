@@ -44,6 +44,7 @@ _REMEDIES = {
     "solver": "a smaller tolerance",
     "edge": "a larger field",
     "filters": "weaker filters",
+    "masked pixels": "a smaller mask",
 }
 
 

@@ -3,18 +3,22 @@
 - check and normalise: `prepare`; a source alone: `check_source`
 - without pixels that carry no light: `mask_unlit`
 - only normalise, many images of one source: `flooring_for`
+- masked pixels that light reaches: `gaps_in`; where a source is dark: `dark_in`
 - the margin of a free boundary, and how many sites: `margin_around`, `number_of_sites`
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import ndimage
 
 from napari_shadowinv._system.machine import physical_memory
+from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._system.safety import check_memory
 from napari_shadowinv._typing import BoolArray, FloatArray
 from napari_shadowinv.cautions import Caution
@@ -23,6 +27,7 @@ from napari_shadowinv.facts import percent
 from napari_shadowinv.options import MAX_DEFAULT_SITES, InversionOptions
 from napari_shadowinv.physics.arrays import check_mask, check_plane, check_shape, check_usable
 from napari_shadowinv.preprocessing.image_checks import mask_dark, mask_gaps
+from napari_shadowinv.preprocessing.pixels import continued
 
 _SMALLEST_SIDE = 4
 _LEAST_MARGIN = 4
@@ -35,18 +40,25 @@ _NOTABLE_MASK, _MOSTLY_MASKED = 0.2, 0.8  # of the pixels
 _DIMMEST, _BRIGHTEST = 1e-301, 1e301  # sums of a whole image stay within double precision
 _SAMPLE_STEP = 97  # pixels
 _MAX_ROUNDING = 1e-6  # of the mean: difference by rounding to 32 bits
+_DARK = 0.05  # of the mean of a source, behind an obstacle
+_WIDEST_GAP = 0.2  # of the image's shorter side
+_WIDTHS = 2.0, 4.0  # px, of the splines that continue an image into gaps, and that tell how well
 
 
 @dataclass(frozen=True)
 class Prepared:
     """Image and source, shape (H, W), of the same flux unless the image's is known."""
 
-    image: FloatArray  # clipped where asked for, scaled to the flux of the source; 0 where masked
-    source: FloatArray  # 0 where masked
+    # Image clipped where asked for, scaled to the flux of the source; both are continued into
+    # `gaps`, and 0 at other masked pixels.
+    image: FloatArray
+    source: FloatArray
     # As the transport sees them, in units of `unit`: dark and masked pixels at the floor.
     floored_image: FloatArray
     unit: float  # the source's `power_of_two`
     mask: BoolArray  # the pixels that are used
+    gaps: BoolArray  # masked pixels that light reaches
+    doubt: FloatArray | None  # how far another continuation of the image is from it, in the gaps
     clipped_pixels: int
     floored_pixels: int  # the clipped ones included
     flux_scale: float  # divisor of the image
@@ -55,6 +67,11 @@ class Prepared:
     def in_units(self) -> Prepared:
         """Return the same with image and source also in units of `unit`."""
         return replace(self, image=self.image / self.unit, source=self.source / self.unit)
+
+    @property
+    def lit(self) -> BoolArray:
+        """Pixels that are used, or gaps."""
+        return self.mask | self.gaps
 
 
 def prepare(
@@ -81,10 +98,15 @@ def prepare(
         )
     values = _clip_negative(values)
     _check_range(values, "image")
+    gaps, doubt = gaps_in(usable, source), None
+    lit = usable | gaps
+    if gaps.any():
+        values, smoother = (into_gaps(values, usable, gaps, width) for width in _WIDTHS)
+        doubt = smoother - values
     if source is None:
-        beam = np.where(usable, values.sum() / usable.sum(), 0.0)
+        beam = np.where(lit, values.sum() / lit.sum(), 0.0)
     else:
-        beam = np.array(check_source(source, usable))
+        beam = np.array(into_gaps(check_source(source, usable), usable, gaps))
         if are_alike(values, beam, usable):
             raise InputError(
                 "the source is the image itself, so the deflection would be zero: give an image "
@@ -101,8 +123,8 @@ def prepare(
     if flux_scale is None:
         flux_scale = ratio if conserved else 1.0
     values = values / flux_scale
-    least = options.floor * values.sum() / usable.sum()
-    floored_flux = masked_source(beam, usable, options).sum() if conserved else None
+    least = options.floor * values.sum() / lit.sum()
+    floored_flux = masked_source(beam, lit, options).sum() if conserved else None
     floored = _raise_to_floor(values, least, floored_flux)
     below = int(np.count_nonzero(usable & (values < least)))
     shadows = int(np.count_nonzero(usable & ~lit_pixels(beam, usable, options)))
@@ -114,6 +136,8 @@ def prepare(
         floored_image=floored,
         unit=unit,
         mask=usable,
+        gaps=gaps,
+        doubt=None if doubt is None else doubt / flux_scale,
         clipped_pixels=negative,
         floored_pixels=below,
         flux_scale=flux_scale,
@@ -151,6 +175,39 @@ def mask_unlit(
     return lit, [*cautions, *dark]
 
 
+def dark_in(source: FloatArray, mask: BoolArray) -> BoolArray:
+    """Return the masked pixels, (H, W), where a source is dark; values that mark pixels are not."""
+    with np.errstate(invalid="ignore"):
+        dark = (source >= 0) & (source < _DARK * source[mask].mean())
+    return np.asarray(~mask & dark)
+
+
+def gaps_in(mask: BoolArray, source: ArrayLike | None) -> BoolArray:
+    """Return the masked pixels, (H, W), of gaps between used ones that light of the source reaches.
+
+    Image and source are continued into them: without their light, all that an object sends across
+    their edges would seem to be missing. Wider parts, and what lies beyond the used pixels, such as
+    the outside of a round window, stay empty.
+    """
+    if mask.all():
+        return np.zeros_like(mask)
+    side = math.ceil(_WIDEST_GAP * min(mask.shape))
+    padded = np.pad(mask, side, mode="edge").view(np.uint8)
+    closed: BoolArray = ndimage.grey_closing(padded, (side, side)).view(bool)
+    gaps = closed[side:-side, side:-side] & ~mask
+    return gaps if source is None else gaps & ~dark_in(np.asarray(source), mask)
+
+
+def into_gaps(
+    values: FloatArray, mask: BoolArray, gaps: BoolArray, width: float = _WIDTHS[-1]
+) -> FloatArray:
+    """Return values, 0 where masked, continued into gaps by a spline of a width, not negative."""
+    if not gaps.any():
+        return values
+    smooth = continued(values, mask, Reporter(None, None), width, rtol=1e-4)
+    return np.where(gaps, np.maximum(smooth, 0.0), values)
+
+
 def lit_pixels(source: FloatArray, mask: BoolArray, options: InversionOptions) -> BoolArray:
     """Return the used pixels from which rays start: a source behind an obstacle is dark there."""
     return np.asarray(mask & (source > options.floor * source[mask].mean()))
@@ -168,13 +225,16 @@ def flooring_for(
     checking them; quantities of the source are computed once.
     """
     usable = np.ones(source.shape, bool) if mask is None else mask
-    beam = check_source(source, usable)
-    flux, count, unit = beam.sum(), usable.sum(), power_of_two(beam)
+    gaps = gaps_in(usable, source)
+    lit = usable | gaps
+    beam = into_gaps(check_source(source, usable), usable, gaps)
+    flux, count, unit = beam.sum(), lit.sum(), power_of_two(beam)
     conserved = flux_scale is None and options.flux != "known"
-    floored_flux = masked_source(beam, usable, options).sum() if conserved else None
+    floored_flux = masked_source(beam, lit, options).sum() if conserved else None
 
     def apply_floor(image: FloatArray) -> FloatArray:
         values = _clip_negative(np.where(usable, image, 0.0))
+        values = into_gaps(values, usable, gaps, _WIDTHS[0])
         if flux_scale is not None:
             values /= flux_scale
         elif conserved:

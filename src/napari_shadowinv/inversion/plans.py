@@ -20,6 +20,8 @@ from napari_shadowinv.geometry.triangulation import RegularTriangulation
 from napari_shadowinv.inversion.normalise import (
     bytes_per_pixel,
     check_source,
+    gaps_in,
+    into_gaps,
     margin_around,
     masked_source,
     number_of_sites,
@@ -40,6 +42,8 @@ class SpreadBeam(NamedTuple):
     @classmethod
     def of(cls, source: FloatArray, mask: BoolArray | None, options: InversionOptions) -> Self:
         """Return the beam of a source, of which a mask may be known."""
+        if mask is not None:
+            mask = mask | gaps_in(mask, source)
         beam = masked_source(source, mask, options)
         unit = power_of_two(beam)
         beam = beam / unit
@@ -75,7 +79,11 @@ def plan_over(
     """Plan sites over a source without computing any level."""
     usable = None if mask is None else check_mask(mask, np.shape(source))
     check_memory(np.shape(source), bytes_per_pixel(options), "an inversion")
-    checked = masked_source(check_source(source, usable), usable, options)
+    checked, lit = check_source(source, usable), usable
+    if usable is not None:
+        gaps = gaps_in(usable, source)
+        checked, lit = into_gaps(checked, usable, gaps), usable | gaps
+    checked = masked_source(checked, lit, options)
     n_sites = number_of_sites(checked.shape, options)
     beam = SpreadBeam.of(checked, usable, options)
     levels = plan_levels(
@@ -88,9 +96,10 @@ def plan_over(
     ).levels
     pixels = None
     # At the edges of masks the image jumps, and sites in all pixels do not converge.
-    if options.is_adaptive and n_sites == checked.size and (usable is None or usable.all()):
-        lit = beam.lit_pixels(options)
-        pixels = None if lit is None else levels.ending_in_pixels(beam.values, lit, options.threads)
+    if options.is_adaptive and n_sites == checked.size and (lit is None or lit.all()):
+        even = beam.lit_pixels(options)
+        if even is not None:
+            pixels = levels.ending_in_pixels(beam.values, even, options.threads)
     return SitePlan(checked, levels, usable, beam.margin, beam.unit, measured, pixels)
 
 

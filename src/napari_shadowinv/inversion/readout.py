@@ -225,6 +225,16 @@ class LinearResponse:
             row[:] = self._masses(padded, self.level.triangulation)
         return flux
 
+    def flux_of_image(self, changes: FloatArray) -> FloatArray:
+        """Return the flux that changes of the image, (k, H, W), bring to its cells, (k, n)."""
+        flux = np.empty((len(changes), len(self.flux)))
+        padded = np.zeros(self.level.shape)
+        for row, change in zip(flux, changes, strict=True):
+            self._plan.within(padded)[:] = change
+            row[:] = self._masses(padded, self._triangulation)
+        # The image is scaled to the flux of the source.
+        return flux - np.outer(flux.sum(axis=1), self.flux / self.flux.sum())
+
     def areas(self, mask: BoolArray) -> tuple[FloatArray, FloatArray]:
         """Return the used area of each cell in the image and in the source, pixels, (n,) each."""
         used = np.ones(self.level.shape)

@@ -38,7 +38,7 @@ from napari_shadowinv.facts import (
 from napari_shadowinv.instrument.effects import RecordedShot
 from napari_shadowinv.inversion.error_bars import Quantities
 from napari_shadowinv.inversion.error_budget import ErrorBudget, per_pixel_of, share_of
-from napari_shadowinv.inversion.normalise import lit_pixels
+from napari_shadowinv.inversion.normalise import gaps_in, lit_pixels
 from napari_shadowinv.inversion.solution_checks import DECISIVE
 from napari_shadowinv.inversion.variables import (
     DISPLACEMENT_STD,
@@ -489,7 +489,8 @@ class Inversion(Summarised):
         draw, described = resampling.noise_draw(shot, noise, errors, options, correlation, scale)
         draws = None
         if not noise_only:
-            draws = resampling.instrument_draws(shot, self.instrument, errors, measured=measured)
+            lit = replace(shot, mask=self.mask | gaps_in(self.mask, self.source))
+            draws = resampling.instrument_draws(lit, self.instrument, errors, measured=measured)
         sites, weights = self.cells.sites, self.cells.weights
         plan = plans.plan_of(sites, self.source, self.mask, options, measured=measured)
         fitted = scale if options.flux == "fit" else None

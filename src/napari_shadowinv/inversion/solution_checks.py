@@ -150,7 +150,7 @@ class _Planes(NamedTuple):
     @classmethod
     def of(cls, prepared: Prepared, reprojection: FloatArray) -> _Planes:
         # The source is 0 elsewhere.
-        mean = float(prepared.source.sum() / np.count_nonzero(prepared.mask))
+        mean = float(prepared.source.sum() / np.count_nonzero(prepared.lit))
         return cls(prepared.image, reprojection, prepared.source, prepared.mask, mean)
 
 

@@ -296,7 +296,8 @@ def _source(
         doubts.extend(uniform_cautions(shot.setup, shot.shape, recorded, matrix))
     if shot.source is not None:
         usable = np.ones(shot.shape, bool) if shot.mask is None else shot.mask
-        return check_source(shot.source, usable)
+        check_source(shot.source, usable)
+        return np.asarray(shot.source, dtype=np.float64)
     estimate = inputs.estimate_for(shot)
     assert estimate is not None
     report("source", 0, None, estimate.title)

@@ -2,7 +2,7 @@
 
 - values and usable pixels of an image: `checked_pixels`; of a beam, which has flux: `beam_pixels`
 - fit a polynomial: `fit_polynomial`
-- fill in, from the surroundings, the beam under an object: `with_filled_part`
+- continue values smoothly into gaps: `continued`; a beam, under an object: `with_filled_part`
 """
 
 from __future__ import annotations
@@ -28,7 +28,14 @@ from napari_shadowinv.preprocessing.noise import NORMAL_MAD
 def with_filled_part(
     values: FloatArray, usable: BoolArray, report: Reporter, width: float = 5.0
 ) -> FloatArray:
-    """Return a beam whose part that is not usable continues a smoothing spline to the others.
+    """Return a beam, positive, that is `continued` into the part that is not usable."""
+    return with_flux_of(continued(values, usable, report, width), values, usable)
+
+
+def continued(
+    values: FloatArray, usable: BoolArray, report: Reporter, width: float, *, rtol: float = 1e-6
+) -> FloatArray:
+    """Return values whose part that is not usable continues a smoothing spline to the others.
 
     The spline u, a thin plate, minimises ∑(u - value)² over the usable pixels + width⁴ ∑ (Δu)²
     over all, with mirrored borders, by conjugate gradients preconditioned with the discrete cosine
@@ -38,18 +45,20 @@ def with_filled_part(
     # small spots, fields change by 0.4 to 7 noise errors.
     mean = values[usable].mean()
     weighted = np.where(usable, values / mean, 0.0)
-    filling = _spline(weighted, usable.astype(float), width, report) * mean
-    return with_flux_of(np.where(usable, values, filling), values, usable)
+    filling = _spline(weighted, usable.astype(float), width, report, rtol) * mean
+    return np.where(usable, values, filling)
 
 
-def _spline(weighted: FloatArray, share: FloatArray, width: float, report: Reporter) -> FloatArray:
+def _spline(
+    weighted: FloatArray, share: FloatArray, width: float, report: Reporter, rtol: float
+) -> FloatArray:
     """Minimise ∑ share·(u - value)² + width⁴ ∑ (Δu)², `weighted` being share·value."""
     from skimage.transform import resize
 
     if min(weighted.shape) < 32:
         start = np.full(weighted.shape, weighted.sum() / share.sum())
     else:  # from pixels twice as large
-        coarse = _spline(block_means(weighted, 2), block_means(share, 2), width / 2, report)
+        coarse = _spline(block_means(weighted, 2), block_means(share, 2), width / 2, report, rtol)
         sides = [2 * side for side in coarse.shape]
         doubled = resize(coarse, sides, order=1, mode="edge")  # type: ignore[no-untyped-call]
         start = doubled[: weighted.shape[0], : weighted.shape[1]]
@@ -74,7 +83,7 @@ def _spline(weighted: FloatArray, share: FloatArray, width: float, report: Repor
         weighted.ravel(),
         x0=start.ravel(),
         M=scipy.sparse.linalg.LinearOperator(shape, matvec=nearly_inverse, dtype=np.float64),
-        rtol=1e-6,
+        rtol=rtol,
         maxiter=500,
     )
     return np.asarray(solution.reshape(weighted.shape))
