@@ -130,16 +130,6 @@ class Structure:
         used = self.inversion.mask
         return 100 * rms(self.inversion.residual[used]) / float(self.inversion.source[used].mean())
 
-    @property
-    def largest_deflection(self) -> float:
-        """Largest true displacement of a ray that passes, in px."""
-        return float(np.hypot(*self.truth)[self.open_pixels].max())
-
-    @property
-    def light_lost(self) -> float:
-        """Share of the image's light that the mask throws away, in per cent."""
-        return 100 * float(self.image[~self.inversion.mask].sum() / self.image.sum())
-
 
 def structures() -> list[Structure]:
     scenes: tuple[tuple[str, Callable[..., phantoms.Phantom], float], ...] = (
@@ -159,7 +149,7 @@ def structures() -> list[Structure]:
 
 
 def coaxial_structures() -> list[Structure]:
-    """The coaxial line, its shadow ignored, put into the source, or masked."""
+    """The coaxial line, its shadow ignored, or put into the source."""
     phantom, obstructed = phantoms.coaxial_line(SHAPE, SETUP)
     shadow = np.where(obstructed, 0.0, 1.0)
     clean = synthetic_image(phantom.displacement, shadow)
@@ -169,8 +159,6 @@ def coaxial_structures() -> list[Structure]:
         ("e", "coaxial line, uniform source, no mask", image, uniform, None),
         ("e′", "coaxial line, its shadow in the source", image, shadow, None),
         (NOT_DRAWN, "the same, noise-free", clean, shadow, None),
-        ("e″", "coaxial line, uniform source, its shadow masked", image, uniform, seen),
-        (NOT_DRAWN, "the same, noise-free", clean, uniform, seen),
     )
     truth, row = phantom.displacement, SHAPE[0] // 2
     return [

@@ -99,7 +99,7 @@ energies determine every field here. At 600 MG µm and beyond, some rays miss th
 
 ## Fig. 6: other structures
 
-![True field, image, retrieved field, re-projection and cut of seven cases](paper-structures.png)
+![True field, image, retrieved field, re-projection and cut of six cases](paper-structures.png)
 
 {structures}
 
@@ -108,12 +108,8 @@ caustics have just formed. The difference between re-projection and image includ
 In (e) two conductors stop the beam (grey in the cut). Row (e) is the paper's method as published,
 with a uniform source and no mask: the shadows are taken for deflection, so the field is wrong far
 around them. In row (e′) the source is zero where the beam was stopped; most of the remaining error
-comes from noise inside the shadows, which is taken for flux. In row (e″) the same pixels are
-excluded with `mask=~obstructed`. That is better than (e) but far worse than (e′), with and without
-noise, above all along the outer conductor: a mask removes the same pixels from source and image,
-while rays beside the conductors are deflected by up to {deflected:.1f} px. Some land on
-masked pixels, where their flux is lost ({lost:.1f} % of the total, noise-free), and the image
-stays dark beside the conductors, which is taken for deflection. An obstacle in the object plane
+comes from noise inside the shadows, which is taken for flux. A mask is for pixels that light
+reaches, and continues the image across them, so it cannot stand for an obstacle, which
 should therefore be entered as zeros in the source. Errors and correlations of the coaxial line are
 evaluated over the pixels that the beam passes; the shadows contain no information.
 
@@ -299,8 +295,6 @@ def write(
         folded=folded_table(folded),
         misjudged=misjudged(folded),
         structures=structure_table(found),
-        deflected=found[-1].largest_deflection,
-        lost=found[-1].light_lost,
         wave=wave_table(wave),
         wavelength=phantoms.plasma_wavelength(1.65e25) * 1e6,
         wave_shape=f"{PLASMA_SHAPE[0]} × {PLASMA_SHAPE[1]}",
