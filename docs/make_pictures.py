@@ -17,7 +17,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from napari_shadowinv import (
-    FitOptions,
     InversionOptions,
     ProtonSetup,
     fit,
@@ -84,8 +83,7 @@ def fit_picture() -> None:
         synthetic_image(strength * truth, beam) + 0.05 * rng.normal(size=beam.shape)
         for strength in (1, low.momentum / high.momentum)
     ]
-    options = FitOptions(sampling="resolve")
-    found = fit(shots_of(images, setup=[low, high], source="unknown", noise=0.05), options=options)
+    found = fit(shots_of(images, setup=[low, high], source="unknown", noise=0.05))
     save_small(fit_figure(found, title="Two energies, beam unknown"), HERE / "fit.png", 1300)
 
 

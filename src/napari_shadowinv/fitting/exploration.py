@@ -46,8 +46,7 @@ class PosteriorSummary:
 
     posterior: Posterior | None  # for counts alone
     samples: list[Sample]
-    sampling: str  # how samples were found, as in `FitOptions`
-    pairs: Pairs | None  # samples to first order and solved in full
+    pairs: Pairs | None  # samples to first order, where these serve, and solved in full
     errors: FloatArray | None
     by_part: dict[str, FloatArray]
     by_beam: BeamShifts | None
@@ -105,16 +104,16 @@ def explore(
         return Posterior(middle, start.unknowns, rng, lambda: on_step("samples", np.nan), modes)
 
     posterior = posterior_with(scene, best, None if data.single else copy(best.modes))
-    options = data.options
+    options, pairs = data.options, None
     count = options.samples if options.samples > 1 else 0
-    steps = 20 if options.sampling == "resolve" else 0
     if count and "beam_between" in scene.imperfect.keys:
-        count, steps = map(max, (count, steps), solved_of_beams)
-    samples = posterior.draw_samples(count)
-    linear = samples if steps else samples[: checked if scene.imperfect.of_response else 0]
-    solved = posterior.solve(linear, steps=steps or 1)
-    pairs = compare_samples(posterior.scene, linear, solved) if solved else None
-    samples = solved if steps else samples
+        least, steps = solved_of_beams
+        samples = posterior.solve(posterior.draw_samples(max(count, least)), steps)
+    else:
+        samples = posterior.draw_samples(count)
+        linear = samples[: checked if scene.imperfect.of_response else 0]
+        if solved := posterior.solve(linear, steps=1):
+            pairs = compare_samples(posterior.scene, linear, solved)
     changes = [sample.change for sample in samples]
     errors = displacement_errors(scene, changes, data.size) if changes else None
     by_part = errors_by_part(scene, posterior, samples, data.size)
@@ -139,7 +138,6 @@ def explore(
     return PosteriorSummary(
         posterior if data.counted else None,  # its Jacobians are large
         samples,
-        "resolve" if steps else "linear",
         pairs,
         errors=errors,
         by_part=by_part,

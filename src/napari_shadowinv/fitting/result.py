@@ -181,10 +181,9 @@ class FitReport:
     numbers : dict of str to list
         Numbers of the instrument as fitted, by their names in `Instrument`, each with its standard
         deviation, for all images or for each; see `numbers_in_units`.
-    sampling : {"linear", "resolve"}
-        Whether the samples of the error bars respond to first order, or were fitted.
     linearity : Linearity or None
-        Displacements of samples to first order against those that were fitted; None if none was.
+        Displacements of samples to first order against those that were fitted; None if all or none
+        were.
     """
 
     objective: float
@@ -193,7 +192,6 @@ class FitReport:
     seconds: dict[str, float]
     pattern: float | None = None
     numbers: dict[str, list[list[float]]] = dataclasses.field(default_factory=dict)
-    sampling: str = "linear"
     linearity: Linearity | None = None
 
 
@@ -328,9 +326,10 @@ class Fit(Summarised):
             for caution in each.cautions
         )
         linearity = self.report.linearity
-        if linearity is None or self.report.sampling == "resolve":
+        if linearity is None:
             return of_images
-        caution = linearity.caution(FIT_LINEARITY, "noise and instrument", "sampling")
+        remedy = "error bars are as rough, so measure the instrument"
+        caution = linearity.caution(FIT_LINEARITY, "noise and instrument", remedy)
         return of_images if caution is None else (*of_images, caution)
 
     @property

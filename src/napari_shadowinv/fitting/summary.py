@@ -173,7 +173,6 @@ def report_of(
             instrument.adapt(unknowns, refined.scene.imperfect),
             [sample.change for sample in summary.samples],
         ),
-        sampling=summary.sampling,
         linearity=None if pairs is None else pairs.linearity,
     )
 

@@ -164,8 +164,8 @@ class Linearity:
     spread_ratio: float  # of the solved changes to the linear ones, r.m.s.
     mean_shift: float  # relative to the r.m.s. standard deviation
 
-    def caution(self, check: LinearityCheck, cause: str, option: str) -> Caution | None:
-        """Warn if the response to a cause is not linear; `option` lets all samples be solved."""
+    def caution(self, check: LinearityCheck, cause: str, remedy: str) -> Caution | None:
+        """Warn if the response to a cause is not linear, and say what to do."""
         is_spread = abs(self.spread_ratio - 1) > check.spread
         if not (is_spread or self.nonlinearity > check.nonlinearity):
             return None
@@ -173,7 +173,7 @@ class Linearity:
             "samples",
             f"the response to {cause} is not linear: linear samples differ from solved ones by "
             f"{percent(self.nonlinearity)} of their change, and solved ones scatter "
-            f"{to_figures(self.spread_ratio)} times as far; use the {option} 'resolve'",
+            f"{to_figures(self.spread_ratio)} times as far; {remedy}",
         )
 
 

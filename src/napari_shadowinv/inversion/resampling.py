@@ -240,7 +240,7 @@ class Sampler:
         if self.resampling.instrument is None:
             check, cause = NOISE_LINEARITY, "noise"
         if samples.linearity is not None:
-            caution = samples.linearity.caution(check, cause, "method")
+            caution = samples.linearity.caution(check, cause, "use the method 'resolve'")
             yield from [] if caution is None else [caution]
 
 

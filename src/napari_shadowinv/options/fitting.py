@@ -118,13 +118,6 @@ class FitOptions(CheckedModel, allow_inf_nan=False):
         description="Number of random fields for the error bars, at least 16 where the beams of "
         "energies differ; 0 for no error bars.",
     )
-    sampling: Literal["linear", "resolve"] = Field(
-        default="linear",
-        description="'linear': random fields respond to noise and instrument to first order. "
-        "'resolve': each is fitted to images with other noise and another instrument, which takes "
-        "2 to 5 times as long as a linear one; for strong folds and instruments that are known "
-        "poorly; always used where the beams of energies differ.",
-    )
     spacing: float | None = Field(
         default=None,
         ge=0.05,
