@@ -28,7 +28,6 @@ WAYS: dict[str, dict[str, Any]] = {
     "closed": {},
     "free, known": {"boundary": "free", "flux": "known"},
     "free, conserve": {"boundary": "free", "flux": "conserve"},
-    "free, fit": {"boundary": "free", "flux": "fit"},
 }
 
 FloatArray = NDArray[np.float64]

@@ -166,8 +166,6 @@ class ResampledInversion(SampledField):
             return None
         changes: dict[str, Any] = {"n_sites": count}
         # The image of a result is scaled to the flux of its source.
-        if inversion.options.flux == "fit":
-            changes["flux"] = "known"
         for name in ("noise_level", "units_per_quantum"):
             if (stated := getattr(inversion.options, name)) is not None:
                 changes[name] = stated / inversion.report.flux_scale

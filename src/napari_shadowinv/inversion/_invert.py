@@ -53,7 +53,7 @@ from napari_shadowinv.physics.poisson import border_mean
 from napari_shadowinv.preprocessing.alignment import RegisteredSource, register_source
 from napari_shadowinv.preprocessing.image_checks import CheckedImage, image_cautions
 from napari_shadowinv.transport.sites import RATIO, Levels, SitePlan, are_middles, edge_flux
-from napari_shadowinv.transport.solvers import LevelSolution, fit_flux_factor, solve
+from napari_shadowinv.transport.solvers import LevelSolution, solve
 
 # Steps of the read-out: up to the first number the potential, then the re-projection.
 _READ_STEPS = 30
@@ -256,18 +256,6 @@ def _prepare(
     )
 
 
-def _with_fitted_flux(
-    inputs: _Inputs, plan: SitePlan, levels: Levels, options: InversionOptions, report: Reporter
-) -> Prepared:
-    """Return the prepared image, with its flux as fitted at a free boundary if that is chosen."""
-    prepared = inputs.prepared
-    if plan.margin is None or options.flux != "fit":
-        return prepared
-    flux = fit_flux_factor(levels, prepared.floored_image, plan.margin, options, report)
-    scale = prepared.flux_scale / flux
-    return prepare(inputs.image, inputs.source, options, inputs.mask, flux_scale=scale)
-
-
 @dataclass(frozen=True, eq=False)
 class _Problem:
     """An inversion's plan and image, its error budget, and checks in threads beside the transport.
@@ -278,10 +266,14 @@ class _Problem:
     inputs: _Inputs
     plan: SitePlan
     levels: Levels  # to be solved, at most
-    prepared: Prepared  # with the flux that is solved
     options: InversionOptions
     noise: Callable[[], ImageNoise]
     budget: Budget
+
+    @property
+    def prepared(self) -> Prepared:
+        """The image and its source."""
+        return self.inputs.prepared
 
     @property
     def is_adaptive(self) -> bool:
@@ -310,12 +302,11 @@ def _pose(
     inputs: _Inputs, options: InversionOptions, report: Reporter, seconds: dict[str, float]
 ) -> _Problem:
     """Place the sites, and begin to estimate the noise, which does not depend on the transport."""
+    prepared = inputs.prepared
     with measure_time("sites", seconds):
-        source = inputs.prepared.source
-        plan = inputs.plan or plan_over(source, options, inputs.mask, inputs.measured)
+        plan = inputs.plan or plan_over(prepared.source, options, inputs.mask, inputs.measured)
         levels = plan.levels.with_reporter(report)
     with measure_time("transport", seconds):
-        prepared = _with_fitted_flux(inputs, plan, levels, options, report)
         correlation = inputs.instrument.noise_correlation
         noise = begin(
             lambda: ImageNoise(prepared.in_units(), options, correlation), options.threads
@@ -323,7 +314,7 @@ def _pose(
         assumed = inputs.registered.is_assumed
         budget = Budget(plan, prepared, noise, options, inputs.instrument, is_shift_assumed=assumed)
         levels = _levels_to_solve(plan, levels, inputs.start, options)
-    return _Problem(inputs, plan, levels, prepared, options, noise, budget)
+    return _Problem(inputs, plan, levels, options, noise, budget)
 
 
 def _check_image(

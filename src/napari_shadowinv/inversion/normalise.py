@@ -79,10 +79,8 @@ def prepare(
     source: ArrayLike | None,
     options: InversionOptions,
     mask: ArrayLike | None = None,
-    *,
-    flux_scale: float | None = None,
 ) -> Prepared:
-    """Check an image and its source, and bring them to the same flux, or divide by `flux_scale`."""
+    """Check an image and its source, and bring them to the same flux unless that is known."""
     shape = check_plane(image, "image", _SMALLEST_SIDE).shape
     check_memory(shape, bytes_per_pixel(options), "an inversion")
     usable = check_mask(mask, shape)
@@ -119,9 +117,8 @@ def prepare(
             f"image has {values.sum():.3g} units of flux and source {beam.sum():.3g}: expected a "
             "ratio that double precision can hold; divide each by its mean"
         )
-    conserved = flux_scale is None and options.flux != "known"
-    if flux_scale is None:
-        flux_scale = ratio if conserved else 1.0
+    conserved = options.flux != "known"
+    flux_scale = ratio if conserved else 1.0
     values = values / flux_scale
     least = options.floor * values.sum() / lit.sum()
     floored_flux = masked_source(beam, lit, options).sum() if conserved else None
@@ -214,30 +211,24 @@ def lit_pixels(source: FloatArray, mask: BoolArray, options: InversionOptions) -
 
 
 def flooring_for(
-    source: FloatArray,
-    options: InversionOptions,
-    mask: BoolArray | None,
-    flux_scale: float | None = None,
+    source: FloatArray, options: InversionOptions, mask: BoolArray | None
 ) -> Callable[[FloatArray], FloatArray]:
     """Return a function from an image to the `floored_image` of `prepare`, for one source and mask.
 
-    It divides by `flux_scale`, or brings the image to the source's flux. It clips images instead of
-    checking them; quantities of the source are computed once.
+    It clips images instead of checking them; quantities of the source are computed once.
     """
     usable = np.ones(source.shape, bool) if mask is None else mask
     gaps = gaps_in(usable, source)
     lit = usable | gaps
     beam = into_gaps(check_source(source, usable), usable, gaps)
     flux, count, unit = beam.sum(), lit.sum(), power_of_two(beam)
-    conserved = flux_scale is None and options.flux != "known"
+    conserved = options.flux != "known"
     floored_flux = masked_source(beam, lit, options).sum() if conserved else None
 
     def apply_floor(image: FloatArray) -> FloatArray:
         values = _clip_negative(np.where(usable, image, 0.0))
         values = into_gaps(values, usable, gaps, _WIDTHS[0])
-        if flux_scale is not None:
-            values /= flux_scale
-        elif conserved:
+        if conserved:
             values /= values.sum() / flux
         return _raise_to_floor(values, options.floor * values.sum() / count, floored_flux) / unit
 

@@ -258,23 +258,21 @@ def noise_draw(
     errors: ErrorBudget,
     options: InversionOptions,
     correlation: float | None,
-    flux_scale: float,
 ) -> tuple[Draw, str]:
     """Return a function that draws a noisy image, and a text that describes the noise.
 
     Noise of None is as in the error budget: counting noise if the options state units per
     quantum, else the deviation in each pixel, as `ImageNoise` estimates it for a stated
     `correlation`, px, or None. Gaussian noise is correlated as in the budget.
-    Images are divided by `flux_scale` for the transport.
     """
     if noise is None and options.units_per_quantum is not None:
         noise = "poisson"
     if noise is None:
-        prepared = prepare(shot.image, shot.source, options, shot.mask, flux_scale=flux_scale)
+        prepared = prepare(shot.image, shot.source, options, shot.mask)
         of_image = ImageNoise(prepared.in_units(), options, correlation)
         mean = shot.source[shot.mask].mean()
         deviation = mean * np.sqrt(of_image.variance(prepared.image / mean))
-        noise = flux_scale * np.maximum(deviation, 1e-9 * float(prepared.image.max()))
+        noise = prepared.flux_scale * np.maximum(deviation, 1e-9 * float(prepared.image.max()))
     # Structure that hides the noise does not correlate noise that is stated.
     is_hidden = errors.noise_is_bound and np.ndim(noise) == 0
     width = 0.0 if is_hidden else errors.noise_correlation

@@ -484,17 +484,15 @@ class Inversion(Summarised):
                 "the inversion did not converge, so its errors are not known: invert the image "
                 "with more iterations or another source first"
             )
-        shot, scale = self.recorded, self.report.flux_scale
-        correlation = self.instrument.noise_correlation
-        draw, described = resampling.noise_draw(shot, noise, errors, options, correlation, scale)
+        shot, correlation = self.recorded, self.instrument.noise_correlation
+        draw, described = resampling.noise_draw(shot, noise, errors, options, correlation)
         draws = None
         if not noise_only:
             lit = replace(shot, mask=self.mask | gaps_in(self.mask, self.source))
             draws = resampling.instrument_draws(lit, self.instrument, errors, measured=measured)
         sites, weights = self.cells.sites, self.cells.weights
         plan = plans.plan_of(sites, self.source, self.mask, options, measured=measured)
-        fitted = scale if options.flux == "fit" else None
-        images = samples.FullResampling(plan, weights, shot.image, draw, options, draws, fitted)
+        images = samples.FullResampling(plan, weights, shot.image, draw, options, draws)
         fields = np.stack([self.potential, *self.displacement])
         by_edge = resampling.changes_by_edge(errors, fields, self.mask)
         sampler = resampling.Sampler.of(images, int(n), fields, by_edge, quantities)

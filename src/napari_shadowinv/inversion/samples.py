@@ -154,7 +154,6 @@ class FullResampling:
     draw: Draw
     options: InversionOptions
     instrument: InstrumentDraws | None = None
-    flux_scale: float | None = None  # divisor of images, if it was fitted
     numbers: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # of all samples
 
     def sample(self, seeds: list[Seed], report: Reporter) -> tuple[FloatArray, LevelSolution]:
@@ -216,7 +215,7 @@ class FullResampling:
 
     def flooring(self, source: FloatArray) -> Callable[[FloatArray], FloatArray]:
         """Return that function for another source."""
-        return flooring_for(source, self.options, self.plan.mask, self.flux_scale)
+        return flooring_for(source, self.options, self.plan.mask)
 
 
 @dataclass(frozen=True)

@@ -138,11 +138,10 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         description="Free boundary only: distance over which the potential decays beyond the edge; "
         "use roughly the size of the object there. Default: the margin.",
     )
-    flux: Literal["conserve", "known", "fit"] = Field(
+    flux: Literal["conserve", "known"] = Field(
         default="conserve",
         description="Free boundary only. 'conserve': inflow equals outflow, so image and source "
-        "may have different units. 'known': image and source have the same exposure and units. "
-        "'fit': find the exposure that minimises the movement of flux at the edge.",
+        "may have different units. 'known': image and source have the same exposure and units.",
     )
     caustic_jacobian: float = Field(
         default=0.2,

@@ -3,7 +3,6 @@
 - with the solver, tolerance and limits of the options: `solve`
 - an answer of one level, with a smooth potential everywhere: `LevelSolution`
 - the problem of one level: `Target`
-- the factor on an image of unknown exposure: `fit_flux_factor`
 
 References
 ----------
@@ -199,39 +198,6 @@ def _restart(
     if stalled is not None and stalled.residual < solution.residual:
         solution = replace(stalled, iterations=solution.iterations)
     return LevelSolution.of_level(level, target.objective(level), solution)
-
-
-def fit_flux_factor(
-    levels: Levels,
-    image: FloatArray,
-    margin: Margin,
-    options: InversionOptions,
-    report: Reporter,
-    *,
-    sites: int = 1500,
-    steps: tuple[float, ...] = (0.03, 0.01),
-) -> float:
-    """Find the factor on an image of unknown exposure that moves the flux at the edge least.
-
-    A wrong factor drives flux across the whole edge: it adds a displacement there in
-    proportion to the error. Few `sites` suffice to see it. Parabolas through three factors, `steps`
-    apart, have their minimum within four steps. The image must have the flux of the source.
-    """
-    few = levels[: max(1, sum(count <= sites for count in levels.counts))]
-    at_edge = np.abs(margin.edge_distance(few[-1].sites).min(axis=-1)) < few[-1].spacing
-
-    def move_at_edge(trial: FloatArray) -> float:
-        solution = solve(few, Target.of(trial, options, margin), report)[-1]
-        return float((solution.displacement[at_edge] ** 2).sum(axis=1).mean())
-
-    factor = 1.0
-    for step in steps:
-        trials = factor * (1 - step), factor, factor * (1 + step)
-        moves = [move_at_edge(trial * image) for trial in trials]
-        curvature = moves[0] - 2 * moves[1] + moves[2]
-        lowest = 0.5 * (moves[0] - moves[2]) / curvature if curvature > 0 else 0.0
-        factor *= 1 + step * float(np.clip(lowest, -4.0, 4.0))
-    return factor
 
 
 def _solve_from(
