@@ -50,10 +50,10 @@ default values, with one site per pixel. Seconds are for a whole inversion.
 
 ![Twelve steps from the source to the deflection potential](paper-algorithm.png)
 
-As in the paper: L-BFGS from zero weights ({iterations} iterations), centroids, natural-neighbour
-interpolation and integration, selected by the options `solver="lbfgs"`, `stages="single"` and
-`readout="centroid"`. Everything below uses the defaults instead: Newton's method on several levels,
-and the potential taken from the weights.
+As in the paper: L-BFGS from zero weights ({iterations} iterations), centroids, interpolation
+between them (linear, the paper's is by natural neighbours) and integration, selected by the options
+`solver="lbfgs"`, `stages="single"` and `readout="centroid"`. Everything below uses the defaults
+instead: Newton's method on several levels, and the potential taken from the weights.
 
 ## Fig. 3: the set-up
 

@@ -67,16 +67,6 @@ def test_a_constant_displacement_integrates_to_a_plane(level):
     np.testing.assert_allclose(displacement[1], -0.25, atol=1e-12)
 
 
-def test_the_mean_integration_lies_between_the_two_orders(level):
-    rng = np.random.default_rng(0)
-    turning = rng.normal(size=level.sites.shape)  # not curl-free: the orders disagree
-    by_order = {
-        order: read_centroids(level, turning, integration=order)[0] for order in ("y", "x", "mean")
-    }
-    assert np.ptp(by_order["y"] - by_order["x"]) > 0.1
-    np.testing.assert_allclose(by_order["mean"], (by_order["y"] + by_order["x"]) / 2, atol=1e-12)
-
-
 def test_reading_tile_by_tile_is_reading_pixel_by_pixel(level):
     larger = replace(level, shape=(300, 90))
     surface = surface_of(larger)

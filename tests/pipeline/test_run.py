@@ -269,7 +269,7 @@ def test_quotes_keep_a_space_in_a_value() -> None:
 
 OTHER = {
     "n_sites": 77, "floor": 0.3, "tolerance": 0.05, "lloyd_iterations": 0, "lloyd_tolerance": 1.0,
-    "readout": "centroid", "integration": "y", "solver": "lbfgs", "stages": "single",
+    "readout": "centroid", "solver": "lbfgs", "stages": "single",
     "max_iterations": 9, "negative": "clip", "boundary": "free", "margin": 9, "decay_length": 3.0,
     "flux": "known", "caustic_jacobian": 0.5, "seed": 4, "threads": 1, "accuracy": 0.3,
     "noise_level": 0.1, "units_per_quantum": 2.0, "max_error": 0.2,

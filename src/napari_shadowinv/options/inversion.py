@@ -82,20 +82,14 @@ class InversionOptions(CheckedModel, allow_inf_nan=False):
         default="dual",
         title="Read-out",
         description="'dual': the potential is half the weight of each site. 'centroid': as in the "
-        "paper, natural-neighbour interpolation of the centroid displacements, then integration.",
+        "paper, interpolation of the centroid displacements, then integration: the mean of both "
+        "orders of the axes.",
         json_schema_extra=_RARE,
     )
-    integration: Literal["mean", "y", "x"] = Field(
-        default="mean",
-        description="Centroid read-out only: integrate along 'y' first, along 'x' first, or take "
-        "the 'mean' of both.",
-        json_schema_extra=_RARE,
-    )
-    solver: Literal["newton", "lbfgs", "quasi-newton"] = Field(
+    solver: Literal["newton", "lbfgs"] = Field(
         default="newton",
         description="'newton': damped Newton steps. 'lbfgs': limited-memory BFGS, as in the paper; "
-        "slow, for comparison. 'quasi-newton': BFGS with a dense n × n matrix, for small numbers "
-        "of sites.",
+        "slow, for comparison.",
         json_schema_extra=_RARE,
     )
     stages: Literal["multi", "single"] = Field(

@@ -24,7 +24,7 @@ References
 ----------
 Paper, Eqs. 5 and 6, section III.A; F. Aurenhammer, F. Hoffmann and B. Aronov, Algorithmica 20, 61
 (1998); J. Kitagawa, Q. Mérigot and B. Thibert, J. Eur. Math. Soc. 21, 2603 (2019); D. C. Liu and
-J. Nocedal, Math. Prog. 45, 503 (1989); A. G. Buckley, Math. Prog. 15, 200 (1978).
+J. Nocedal, Math. Prog. 45, 503 (1989).
 """
 
 from __future__ import annotations
@@ -40,10 +40,9 @@ from scipy.fft import dctn, idctn
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
-from napari_shadowinv._system.machine import available_threads, physical_memory
+from napari_shadowinv._system.machine import available_threads
 from napari_shadowinv._system.progress import Reporter
 from napari_shadowinv._typing import FloatArray
-from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.density import Density, side_of_squares, split_pixels
 from napari_shadowinv.geometry.power_diagram import PowerDiagram
 from napari_shadowinv.geometry.triangulation import RegularTriangulation
@@ -158,13 +157,6 @@ class OpenObjective(TransportObjective):
     def in_gauge(self, weights: FloatArray) -> FloatArray:
         """Return the weights as they are: far outside they are zero."""
         return weights
-
-
-_METHODS: dict[str, tuple[str, dict[str, float]]] = {
-    # maxcor: pairs of steps and gradients that it keeps
-    "lbfgs": ("L-BFGS-B", {"maxcor": 20, "ftol": 0.0, "gtol": 0.0, "maxfun": 10**9}),
-    "quasi-newton": ("BFGS", {"gtol": 0.0}),
-}
 
 
 def newton(
@@ -324,20 +316,13 @@ def with_full_cells(
 def descend(
     objective: TransportObjective,
     start: FloatArray,
-    solver: str,
     tolerance: float,
     max_iterations: int,
     report: Reporter | None = None,
+    *,
+    kept: int = 20,
 ) -> Solution:
-    """Minimise by one of scipy's methods; cells may be empty at the start."""
-    memory, needed = physical_memory(), 32 * len(start) ** 2  # of four matrices
-    if solver == "quasi-newton" and memory is not None and needed > memory:
-        most = int((memory / 32) ** 0.5)
-        raise InputError(
-            f"quasi-newton keeps n × n matrices: {len(start):,} sites need {needed / 1e9:.3g} GB, "
-            f"this machine has {memory / 1e9:.3g} GB: use lbfgs, or at most {most:,} sites"
-        )
-    method, options = _METHODS[solver]
+    """Minimise by L-BFGS, from `kept` pairs of steps and gradients; cells may be empty at first."""
     mass = objective.mass
     flux = float(mass.mean())
     # weights in units of the cells' area and flux in units of a cell's make a well-scaled problem
@@ -364,14 +349,20 @@ def descend(
         scaled_problem,
         start / area,
         jac=True,
-        method=method,
+        method="L-BFGS-B",
         callback=after_step,
-        options={"maxiter": max_iterations, **options},
+        options={
+            "maxiter": max_iterations,
+            "maxfun": 10**9,
+            "maxcor": kept,
+            "ftol": 0.0,
+            "gtol": 0.0,
+        },
     )
     weights = area * result.x
     residual = objective.residual(objective.diagram(weights))
     converged = residual <= tolerance
-    reason = "" if converged else f"{method} ended after {steps} iterations: {result.message}"
+    reason = "" if converged else f"L-BFGS ended after {steps} iterations: {result.message}"
     return Solution(weights - weights.mean(), residual, steps, converged, reason)
 
 

@@ -292,4 +292,4 @@ def _solve_level(
         weights = np.zeros(len(objective.mass))
     if options.solver == "newton":
         return newton(objective, weights, tolerance, most, report, fill=True)
-    return descend(objective, weights, options.solver, tolerance, most, report)
+    return descend(objective, weights, tolerance, most, report)
