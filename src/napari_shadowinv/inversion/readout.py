@@ -47,62 +47,10 @@ from napari_shadowinv.transport.sites import SiteLevel, SitePlan
 from napari_shadowinv.transport.solvers import LevelSolution, Target
 
 
-@njit(nogil=True, cache=True)
-def _add_rows(
-    start: int,
-    stop: int,
-    corners: Indices,
-    weights: FloatArray,
-    values: FloatArray,
-    sums: FloatArray,
-    squares: FloatArray,
-) -> None:
-    """Add to the sums over samples of potential and displacement in rows `start` to `stop`."""
-    width = corners.shape[1]
-    potential = np.empty((3, width, WIDTH))  # of three rows, in turns
-    for row in range(start, stop + 2):
-        current = potential[row % 3]
-        for column in range(width):
-            for s in range(WIDTH):
-                current[column, s] = 0.0
-            for k in range(3):
-                corner = corners[row, column, k]
-                of_value, of_y, of_x = weights[row, column, k]
-                for s in range(WIDTH):
-                    current[column, s] += (
-                        of_value * values[corner, 0, s]
-                        + of_y * values[corner, 1, s]
-                        + of_x * values[corner, 2, s]
-                    )
-        y = row - 2
-        if y < start:
-            continue
-        above, level, below = potential[y % 3], potential[(y + 1) % 3], current
-        for x in range(width - 2):
-            p = p2 = dy = dy2 = dx = dx2 = 0.0
-            for s in range(WIDTH):
-                at = level[x + 1, s]
-                along_y = 0.5 * (above[x + 1, s] - below[x + 1, s])
-                along_x = 0.5 * (level[x, s] - level[x + 2, s])
-                p += at
-                p2 += at * at
-                dy += along_y
-                dy2 += along_y * along_y
-                dx += along_x
-                dx2 += along_x * along_x
-            sums[0, y, x] += p
-            sums[1, y, x] += dy
-            sums[2, y, x] += dx
-            squares[0, y, x] += p2
-            squares[1, y, x] += dy2
-            squares[2, y, x] += dx2
-
-
 class LinearReadout:
     """Read-out of a level at the pixels of a plan's image."""
 
     def __init__(self, plan: SitePlan, level: SiteLevel, threads: int | None = None) -> None:
-        n = len(level.sites)
         self._triangulation = level.triangulation
         self._is_of_pixels = level.is_of_pixels
         reach = self._reach = 3 if self._is_of_pixels else 1
@@ -118,14 +66,16 @@ class LinearReadout:
         queries = pixels.reshape(-1, 2).astype(np.float64)
         corners, weights = corner_weights(mirrored.triangulation, queries, threads)
         weights[..., 1:] *= mirrored.sense[corners]
-        self._corners = mirrored.origin[corners].reshape(*pixels.shape[:2], 3)
-        self._weights = weights.reshape(*pixels.shape[:2], 3, 3)
+        # From value and gradient at each site to the potential.
+        columns = 3 * mirrored.origin[corners][..., None] + np.arange(3)
+        starts = np.arange(0, columns.size + 1, columns[0].size)
+        size = len(queries), 3 * len(level.sites)
+        self._matrix = csr_array((weights.ravel(), columns.ravel(), starts), shape=size)
+        self._shape = pixels.shape[:2]
         border = np.ones(plan.source.shape, bool)
         border[1:-1, 1:-1] = False
-        border = np.pad(border, reach)
-        columns = 3 * self._corners[border][..., None] + np.arange(3)
-        mean = np.bincount(columns.ravel(), self._weights[border].ravel(), 3 * n) / border.sum()
-        self._border_mean = csr_array(mean[None])
+        is_border = np.flatnonzero(np.pad(border, reach))
+        self._border_mean = csr_array(self._matrix[is_border].mean(axis=0)[None])
 
     def at_sites(self, weights: FloatArray) -> FloatArray:
         """Return the potential's values and gradients, (n, 3, WIDTH), for weights (n, WIDTH)."""
@@ -139,25 +89,23 @@ class LinearReadout:
     ) -> None:
         """Add potential and displacement, and their squares, to sums (3, H, W) in some rows."""
         stop = min(start + rows, sums.shape[1])
-        if self._is_of_pixels:
-            for sample in range(WIDTH):
-                field = self.field(values[..., sample], slice(start, stop))
-                sums[:, start:stop] += field
-                squares[:, start:stop] += field**2
-            return
-        _add_rows(start, stop, self._corners, self._weights, values, sums, squares)
+        fields = self.field(values, slice(start, stop))
+        sums[:, start:stop] += fields.sum(axis=-1)
+        squares[:, start:stop] += (fields**2).sum(axis=-1)
 
     def field(self, values: FloatArray, rows: slice = slice(None)) -> FloatArray:
-        """Return potential and displacement in some rows, (3, h, W), of values at sites, (n, 3)."""
-        if rows.stop is not None:
-            rows = slice(rows.start, rows.stop + 2 * self._reach)
-        weights, corners = self._weights[rows], self._corners[rows]
-        padded = np.einsum("yxkc,yxkc->yx", weights, values[corners])
+        """Return potential and displacement in some rows, (3, h, W, ...), of values (n, 3, ...)."""
+        height, width = self._shape
+        start, stop, _ = rows.indices(height - 2 * self._reach)
+        matrix = self._matrix[start * width : (stop + 2 * self._reach) * width]
+        numbers = values.reshape(matrix.shape[1], *values.shape[2:])
+        padded = (matrix @ numbers).reshape(-1, width, *values.shape[2:])
         if self._is_of_pixels:
             potential = _softened(padded)
             down, right = first_derivative(potential, 0), first_derivative(potential, 1)
             return np.stack([potential[2:-2, 2:-2], -down[:, 2:-2], -right[2:-2]])
-        return np.stack([padded, *-np.array(np.gradient(padded))])[:, 1:-1, 1:-1]
+        slopes = np.gradient(padded, axis=(0, 1))
+        return np.stack([padded, *-np.array(slopes)])[:, 1:-1, 1:-1]
 
 
 _SQUARES_PER_SPACING = 8
