@@ -166,12 +166,11 @@ def test_the_source_of_rows_without_one_may_be_estimated(pack: Path, out: Path) 
 def test_what_changed_in_a_table_is_noticed(pack: Path, out: Path) -> None:
     inverted(pack, out)
     table("film0.npy,5", "film1.npy,14.7", "film2.npy,31")
-    message = r"row of shot 2 \(film2.npy\) \(energy: 30.0 there, 31.0 now\) has changed"
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match=r"shot 2 \(film2.npy\) has changed since .* row"):
         inverted(pack, out)
     table(*ROWS)
     nearer = SETUP.model_copy(update={"object_image_distance": 0.2})
-    with pytest.raises(InputError, match=r"object_image_distance: 0.3 there, 0.2 now"):
+    with pytest.raises(InputError, match=r"shot 0 \(film0.npy\) .* or its setup"):
         inverted(pack, out, setup=nearer)
     with pytest.raises(InputError, match="different table of shots"):
         inverted([f"film{k}.npy" for k in range(3)], out)

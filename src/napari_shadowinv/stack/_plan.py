@@ -71,13 +71,6 @@ class Stack:
             return f"estimated from each shot: {estimate.model_dump_json()}"
         return "uniform"
 
-    def changed(self, index: int, origin: dict[str, Any]) -> str:
-        """Name the part of a shot that differs from its report; empty if none does."""
-        shot, label = self.shots.items[index], self.shots.label(index)
-        if isinstance(shot, RowExposure) and (difference := shot.difference(origin)):
-            return f"the row of {label} ({difference})"
-        return "" if shot.unchanged(origin) else label
-
 
 def describe_stack(
     shots: Any, recipe: Recipe | None, reader: Reader, options: RunOptions | WatchOptions

@@ -342,11 +342,10 @@ def resume(store: StackStore, stack: Stack) -> Stack:
     stack = replace(stack, shots=shots)
     match_store(store, stack)
     for index in np.flatnonzero(store.statuses() == DONE):
-        changed = stack.changed(int(index), store.report(int(index)))
-        if changed:
+        if not shots.items[index].unchanged(store.report(int(index))):
             raise InputError(
-                f"{changed} has changed since it was inverted into {store.path}: overwrite the "
-                "store or choose another name"
+                f"{shots.label(index)} has changed since it was inverted into {store.path}, or its "
+                "row in a table or its setup: overwrite the store or choose another name"
             )
     return stack
 

@@ -213,26 +213,16 @@ class RowExposure(Exposure):
         return read_shot(self.row.file, channel=self.channel).shape
 
     def unchanged(self, origin: dict[str, Any]) -> bool:
-        """Compare the row, and existing files by size and time or checksum."""
+        """Compare the row, its setup, and existing files by size and time or checksum."""
         before = origin.get("files", {})
-        return self.row.summary == origin.get("row") and all(
-            _agrees(path, before.get(name, {})) for name, path in self._files().items()
-        )
-
-    def difference(self, origin: dict[str, Any]) -> str:
-        """Describe the difference from the row, or its setup, in a report."""
-        before = origin.get("row", {})
-        if before != self.row.summary:
-            return differences(before, self.row.summary)
-        entries = origin.get("provenance", {}).get("recipe", {}).get("setup")
-        setup_before = None if entries is None else setup_from_dict(entries)
+        setup = origin.get("provenance", {}).get("recipe", {}).get("setup")
         # The setup of a row may have been in an image that was removed.
-        if setup_before == self.setup or (
-            self.setup is None and not split_address(self.row.file)[0].exists()
-        ):
-            return ""
-        setups = (setup_before, self.setup)
-        return differences(*({} if setup is None else setup.model_dump() for setup in setups))
+        is_lost = self.setup is None and not split_address(self.row.file)[0].exists()
+        return (
+            self.row.summary == origin.get("row")
+            and (is_lost or self.setup == (setup and setup_from_dict(setup)))
+            and all(_agrees(path, before.get(name, {})) for name, path in self._files().items())
+        )
 
     def _files(self) -> dict[str, Path]:
         """Return the files by the names of their columns."""
