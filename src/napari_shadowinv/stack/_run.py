@@ -341,8 +341,8 @@ def resume(store: StackStore, stack: Stack) -> Stack:
     shots = stack.shots.reordered(_order(store, stack.shots.names))
     stack = replace(stack, shots=shots)
     match_store(store, stack)
-    for index in np.flatnonzero(store.statuses() == DONE):
-        if not shots.items[index].unchanged(store.report(int(index))):
+    for index in np.flatnonzero(store.statuses() == DONE).tolist():
+        if not shots.items[index].unchanged(store.report(index)):
             raise InputError(
                 f"{shots.label(index)} has changed since it was inverted into {store.path}, or its "
                 "row in a table or its setup: overwrite the store or choose another name"
