@@ -214,7 +214,5 @@ def demo(
 
 def _error_text(estimate: FloatArray, truth: FloatArray) -> str:
     true_peak, peak = (float(np.hypot(*field).max()) for field in (truth, estimate))
-    if not true_peak:
-        return f"peak {peak:.3g} px where the truth is zero"
     distance = float(np.linalg.norm(estimate - truth) / np.linalg.norm(truth))
     return f"peak {100 * (peak / true_peak - 1):+.1f} %, L2 {percent(distance)}"
