@@ -182,8 +182,8 @@ class FitImages(inputs.ImagePanel):
         """Return the setup of an image, its own or the reference's, with the beam of its row."""
         if image is self.images.reference:
             return setup
-        own, beam = about.setup_of(image), self.images.beam
-        base = own if own is not None and own.kind == setup.kind else setup
+        of_image, beam = about.setup_of(image), self.images.beam
+        base = of_image if of_image is not None and of_image.kind == setup.kind else setup
         values = {**base.model_dump(), beam.name: self.images.beam_value(image)}
         model_class = SETUPS[setup.kind]
         names = labels_of(model_class) | {beam.name: f"'{beam.noun.capitalize()}'"}
