@@ -83,11 +83,11 @@ class Scene(PriorTerms):
 
     def strengths_with(self, unknowns: Unknowns) -> FloatArray:
         """Return the displacement in image l by each field's, with that by another field."""
-        other = self.imperfect.other_strengths
-        if other is None:
+        added = self.imperfect.other_strengths
+        if added is None:
             return self.strengths
         place = self.imperfect.parts["other_field"].places
-        return self.strengths + unknowns.common[place] * other
+        return self.strengths + unknowns.common[place] * added
 
     def potentials(self, unknowns: Unknowns) -> FloatArray:
         """Return the coefficients of each image's own potential, shape (L, …)."""
@@ -475,8 +475,9 @@ class Linear:
         strengths = self.scene.strengths_with(self.unknowns)
         changes = _sums_of_fields(strengths, change.potentials)
         if imperfect.other_strengths is not None:
-            other = change.common[imperfect.parts["other_field"].places] * imperfect.other_strengths
-            changes += _sums_of_fields(other, self.unknowns.potentials)
+            share = change.common[imperfect.parts["other_field"].places]
+            added = share * imperfect.other_strengths
+            changes += _sums_of_fields(added, self.unknowns.potentials)
         return changes
 
     @property

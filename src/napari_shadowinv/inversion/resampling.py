@@ -1,7 +1,7 @@
 """Random samples of an inversion by its noise and its instrument.
 
 - what is drawn: noise, `noise_draw`; the instrument, `instrument_draws`; objects beyond the edge,
-  `changes_by_edge`
+  `assumed_changes`
 - draw and invert samples, and sum them up: `Sampler`
 
 Each sample is the image with another draw of noise, inverted on the same sites. The scatter of the
@@ -36,7 +36,7 @@ import numpy as np
 
 from napari_shadowinv._system.machine import available_threads, physical_memory
 from napari_shadowinv._system.progress import Reporter
-from napari_shadowinv._typing import BoolArray, FloatArray
+from napari_shadowinv._typing import FloatArray
 from napari_shadowinv.cautions import Caution
 from napari_shadowinv.errors import InputError
 from napari_shadowinv.geometry.interpolation import WIDTH
@@ -66,6 +66,7 @@ from napari_shadowinv.inversion.samples import (
 )
 from napari_shadowinv.options import BeamPrior, Instrument, InversionOptions
 from napari_shadowinv.physics.edge import edge_changes
+from napari_shadowinv.physics.poisson import poisson_invert
 
 Result = TypeVar("Result")
 
@@ -90,7 +91,9 @@ class Sampler:
 
     resampling: FullResampling
     fields: FloatArray  # potential and displacement of the inversion, (3, H, W)
-    by_edge: FloatArray  # (k, 3, H, W)
+    assumed: Mapping[
+        str, FloatArray
+    ]  # changes by what is assumed of the edge and gaps, (k, 3, H, W)
     seeds: list[Seed]
     workers: int
     threads: int | None
@@ -103,7 +106,7 @@ class Sampler:
         resampling: FullResampling,
         n: int,
         fields: FloatArray,
-        by_edge: FloatArray,
+        assumed: Mapping[str, FloatArray],
         quantities: Quantities | None,
     ) -> Sampler:
         """Share the threads among `n` samples, draw their instruments, and choose a tolerance."""
@@ -119,13 +122,14 @@ class Sampler:
             numbers = stratified_numbers(rng, n, resampling.instrument.count)
             resampling = replace(resampling, numbers=numbers)
         choose = None if quantities is None else _quantity_choice(quantities)
-        return cls(resampling, fields, by_edge, seeds, workers, options.threads, choose)
+        return cls(resampling, fields, assumed, seeds, workers, options.threads, choose)
 
     def measure(self, change: FloatArray, seed: Seed) -> dict[str, FloatArray]:
-        """Return the quantities of a sample, with objects beyond the edge."""
+        """Return the quantities of a sample, with objects beyond the edge and in gaps."""
         rng = np.random.default_rng([self.resampling.options.seed, *b"edge", *seed.spawn_key])
-        beyond = np.tensordot(rng.normal(size=len(self.by_edge)), self.by_edge, 1)
-        return _measure(self.functions, self.fields, change + beyond)
+        for changes in self.assumed.values():
+            change = change + np.tensordot(rng.normal(size=len(changes)), changes, 1)
+        return _measure(self.functions, self.fields, change)
 
     @property
     def asked(self) -> Callable[[FloatArray, Seed], dict[str, FloatArray]] | None:
@@ -194,7 +198,8 @@ class Sampler:
             for name, exact in _joined(samples.of_solved).items():
                 of_samples[name] = correct(of_samples[name], exact.astype(np.float64))
         mean = self.fields + mean
-        std = np.sqrt(std**2 + (self.by_edge**2).sum(axis=0))
+        squares = sum((changes**2).sum(axis=0) for changes in self.assumed.values())
+        std = np.sqrt(std**2 + squares)
         values = _measure(self.functions, self.fields, np.zeros_like(self.fields))
         iterations, residuals, converged = zip(*samples.solutions, strict=True)
         return ErrorSamples(
@@ -225,7 +230,7 @@ class Sampler:
         return (
             "noise",
             *(() if draws is None else draws.names),
-            *("edge",) * bool(len(self.by_edge)),
+            *self.assumed,
         )
 
     def cautions(self, samples: ErrorSamples) -> Iterator[Caution]:
@@ -279,14 +284,27 @@ def noise_draw(
     return noise_of(shot.image, noise, options.units_per_quantum, shot.mask, width)
 
 
-def changes_by_edge(errors: ErrorBudget, fields: FloatArray, mask: BoolArray) -> FloatArray:
-    """Return `edge_changes` of the size in the error budget, (k, 3, H, W); k is 0 without."""
-    part = errors.parts.get("edge")
-    if part is None:
-        return np.empty((0, 3, *mask.shape))
-    changes = edge_changes(fields[0], fields[1:])
-    squares = (changes[:, 1:, mask] ** 2).sum(axis=(0, 1)).mean()
-    return np.asarray(changes * part.rms / np.sqrt(squares))
+def assumed_changes(
+    errors: ErrorBudget, fields: FloatArray, shot: RecordedShot, options: InversionOptions
+) -> dict[str, FloatArray]:
+    """Return changes of the fields by what is assumed, (k, 3, H, W) each, by parts of the budget.
+
+    Of the edge they are `edge_changes`; of gaps in the mask the linear inversion of how far two
+    continuations differ. Their size is that in the budget.
+    """
+    changes = {}
+    if "edge" in errors.parts:
+        changes["edge"] = edge_changes(fields[0], fields[1:])
+    prepared = prepare(shot.image, shot.source, options, shot.mask)
+    if prepared.doubt is not None:
+        mean = prepared.source[shot.mask].mean()
+        beam = np.where(prepared.lit, np.maximum(prepared.source, options.floor * mean), mean)
+        potential = poisson_invert(np.maximum(beam + prepared.doubt, 0.0), source=beam)
+        changes["masked pixels"] = np.stack([potential, *-np.array(np.gradient(potential))])[None]
+    for name, each in changes.items():
+        rms = np.sqrt((each[:, 1:, shot.mask] ** 2).sum(axis=(0, 1)).mean())
+        changes[name] = each * errors.parts[name].rms / max(rms, 1e-300)
+    return changes
 
 
 def instrument_draws(

@@ -384,9 +384,9 @@ class Inversion(Summarised):
     def recorded(self) -> RecordedShot:
         """The image in its own units, whole numbers if it was counts, with its source."""
         image = self.image * self.report.flux_scale
-        counts = np.rint(image)
+        counts, used = np.rint(image), self.mask
         return RecordedShot(
-            image=counts if np.allclose(image, counts, rtol=1e-12, atol=0) else image,
+            image=counts if np.allclose(image[used], counts[used], rtol=1e-12, atol=0) else image,
             source=self.source,
             displacement=self.displacement,
             mask=self.mask,
@@ -494,8 +494,8 @@ class Inversion(Summarised):
         plan = plans.plan_of(sites, self.source, self.mask, options, measured=measured)
         images = samples.FullResampling(plan, weights, shot.image, draw, options, draws)
         fields = np.stack([self.potential, *self.displacement])
-        by_edge = resampling.changes_by_edge(errors, fields, self.mask)
-        sampler = resampling.Sampler.of(images, int(n), fields, by_edge, quantities)
+        assumed = resampling.assumed_changes(errors, fields, shot, options)
+        sampler = resampling.Sampler.of(images, int(n), fields, assumed, quantities)
         error_samples = sampler.draw(method, described, Reporter(on_progress, should_stop))
         std, causes = error_samples.displacement_std, sampler.causes
         errors = replace(errors, per_pixel=std, causes=causes, samples=error_samples)
