@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from pathlib import Path
 
 import dask.array as da
@@ -120,3 +121,13 @@ def test_a_shot_has_the_mask_of_its_own_file_and_that_of_all(images, tmp_path):
     again = rerun(read(out).isel(shot=1), tmp_path / "shot_1.tif").dataset
     np.testing.assert_array_equal(again["mask"], stored["mask"][1])
     assert_close(again["potential"].values, stored["potential"][1].values, stored["mask"][1].values)
+
+
+@pytest.mark.parametrize("kind", ["numpy", "dask"])
+def test_a_shot_of_an_array_is_sent_to_a_process_without_the_others(images, kind):
+    """The bytes of one image, which is the same there."""
+    array = images if kind == "numpy" else da.from_array(images, chunks=(1, *SHAPE))
+    for number, shot in enumerate(find_shots(array).items):
+        sent = pickle.dumps(shot)
+        assert len(sent) < 2 * images[0].nbytes
+        np.testing.assert_array_equal(pickle.loads(sent).load()[0].image, images[number])
