@@ -19,8 +19,6 @@ choice decides most of the error on large scales: Kasim et al., arXiv:1607.04179
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import partial
 from typing import ClassVar, Literal, Self
 
 import numpy as np
@@ -156,7 +154,7 @@ class LowPassEstimate(Estimate):
     width: float = width_field(
         30.0,
         "Standard deviation of the Gaussian blur in px; use a few times the object's size.",
-        1.0,
+        2.0,
         200.0,
     )
 
@@ -176,13 +174,10 @@ def _blur_masked(
     values: FloatArray, usable: BoolArray, width: float, report: Reporter, least: float = 1e-6
 ) -> tuple[FloatArray, BoolArray]:
     """Blur the usable pixels; return also where at least a share of them is within reach."""
-    blur: Callable[[FloatArray], FloatArray] = partial(filters.blur, width=width)
-    if width < 2:  # px, with waves too short for the pixels; its time depends on the width
-        blur = partial(scipy.ndimage.gaussian_filter, sigma=width, mode="reflect")
     report("source", 0, 2)
-    support = blur(usable.astype(np.float64))
+    support = filters.blur(usable.astype(np.float64), width)
     report("source", 1, 2)
-    blurred = blur(np.where(usable, values, 0.0))
+    blurred = filters.blur(np.where(usable, values, 0.0), width)
     return blurred / np.maximum(support, least), support >= least
 
 
