@@ -32,7 +32,6 @@ class Hard:
     name: str
     image: FloatArray
     source: FloatArray | None = None
-    mask: NDArray[np.bool_] | None = None
     changes: dict[str, Any] = field(default_factory=dict)
 
 
@@ -74,7 +73,6 @@ def hard_images() -> list[Hard]:
     left, right = near(middle, 50, 24), near(middle, 150, 24)
     bright = np.ones((SIDE, SIDE))
     bright.ravel()[rng.choice(SIDE**2, SIDE**2 // 100, replace=False)] = 1e4
-    blob = 1 + 1.5 * np.exp(-((y - middle) ** 2 + (x - middle) ** 2) / (2 * 15**2))
     free = {"boundary": "free"}
     return [
         Hard("one bright pixel, the others dark", pixel),
@@ -88,11 +86,6 @@ def hard_images() -> list[Hard]:
         Hard("source an island on the right, image one on the left", left, right),
         Hard("two discs, radius 24 px", left + right),
         Hard("1 % of the pixels 10,000 times brighter", bright),
-        Hard(
-            "a blob, 2 % of the pixels usable (mask), scattered",
-            blob,
-            mask=rng.random((SIDE, SIDE)) < 0.02,
-        ),
         Hard("the disc, free boundary", disc, changes=free),
         Hard("the corner, free boundary", corner, changes=free),
     ]
@@ -102,7 +95,7 @@ def inverted(hard: Hard, n_sites: int) -> tuple[Inversion, float]:
     """Invert on one thread, and the seconds of processor time that took."""
     options = InversionOptions(n_sites=n_sites, threads=1, **hard.changes)
     start = time.process_time()
-    inversion = invert(hard.image, source=hard.source, mask=hard.mask, options=options)
+    inversion = invert(hard.image, source=hard.source, options=options)
     return inversion, time.process_time() - start
 
 
