@@ -15,7 +15,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 ON_SCREEN := xvfb-run -a -s "-screen 0 2560x1440x24"
-ON_BOTH_CORES := -n 2 --dist loadfile
+ON_BOTH_CORES := -n 2 --dist loadfile --no-loadscope-reorder
 CORE_PYTHON ?= $(BIN)/python
 CORE_TOOLS := "pytest>=8.2" "pytest-xdist>=3.6" "hypothesis>=6.100" "shapely>=2.0" "pyamg>=5.1" \
 	"pyyaml>=6.0" "pooch>=1.8"

@@ -55,6 +55,14 @@ def pytest_collection() -> Iterator[None]:
         gc.enable()
 
 
+LONG_FILES = ("test_tutorials.py", "test_tutorials_clicked.py", "test_examples.py", "test_pages.py")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest, so that no process waits for them at the end."""
+    items.sort(key=lambda item: item.path.name not in LONG_FILES)
+
+
 _HOOKS: list[object] = []  # an audit hook cannot be removed
 _opened_paths: list[str] | None = None
 

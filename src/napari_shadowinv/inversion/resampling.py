@@ -91,9 +91,8 @@ class Sampler:
 
     resampling: FullResampling
     fields: FloatArray  # potential and displacement of the inversion, (3, H, W)
-    assumed: Mapping[
-        str, FloatArray
-    ]  # changes by what is assumed of the edge and gaps, (k, 3, H, W)
+    # Changes of the fields by what is assumed of the edge and of gaps, (k, 3, H, W) each.
+    assumed: Mapping[str, FloatArray]
     seeds: list[Seed]
     workers: int
     threads: int | None
@@ -296,7 +295,7 @@ def assumed_changes(
     if "edge" in errors.parts:
         changes["edge"] = edge_changes(fields[0], fields[1:])
     prepared = prepare(shot.image, shot.source, options, shot.mask)
-    if prepared.doubt is not None:
+    if prepared.doubt is not None and "masked pixels" in errors.parts:
         mean = prepared.source[shot.mask].mean()
         beam = np.where(prepared.lit, np.maximum(prepared.source, options.floor * mean), mean)
         potential = poisson_invert(np.maximum(beam + prepared.doubt, 0.0), source=beam)
